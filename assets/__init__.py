@@ -1,0 +1,1 @@
+"""Meshes with a card each; data only."""
