@@ -1,0 +1,90 @@
+import pathlib
+
+import numpy as np
+import pytest
+
+from biotac_mj.geometry.skin_geometry import SkinGeometry
+
+REPO = pathlib.Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def repo():
+    """The root of the repository."""
+    return REPO
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """../shared, where it is."""
+    folder = REPO.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("needs ../shared (real meshes, references, measurements), which is not here")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shell():
+    """A small closed shell of a finger's size with 19 electrodes along a helix: for what needs a skin's topology, not its physics."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
+    outer = ball.vertices * [13e-3, 7e-3, 7e-3] + center
+    inner = ball.vertices * [11.5e-3, 5.5e-3, 5.5e-3] + center
+    f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
+    elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)])  # fmt: skip
+    vert = np.concatenate([outer, inner])
+    edge = vert[elem[:, 1:]] - vert[elem[:, :1]]
+    elem[np.linalg.det(edge) < 0] = elem[np.linalg.det(edge) < 0][:, [0, 1, 3, 2]]
+    core = ball.vertices * [10e-3, 4.5e-3, 4.5e-3] + center
+    angle = np.linspace(-1.0, 1.0, 19)
+    normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
+    electrode = np.stack([np.linspace(-16e-3, -2e-3, 19), 5e-3 * normal[:, 1], 5e-3 * normal[:, 2]], 1)
+    empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
+    return SkinGeometry("synthetic", vert, elem, ball.faces, ball.faces[:, ::-1] + n, np.flatnonzero(vert[:, 0] > 3e-3),
+                        core, ball.faces, empty, no_face, empty, no_face, electrode, normal)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def synthetic_press(shell):
+    """A recorded press that nobody simulated: a sphere of 3.5 mm radius leaves its print in the shell, Hertz's force, made-up counts."""
+    import trimesh
+
+    from biotac_mj.press_record import PressRecord
+
+    n, radius = 12, 3.5e-3
+    depth = np.concatenate([[-5e-6], np.linspace(1e-4, 1.5e-3, n - 1)])
+    first_touch = np.array([-8e-3, -7e-3, 0])
+    xpos = np.repeat(shell.vert[None], n, 0)
+    indenter_pos = first_touch + depth[:, None] * [0, 1, 0]
+    for step in range(n):
+        center = indenter_pos[step] - [0, radius, 0]
+        away = xpos[step] - center
+        distance = np.linalg.norm(away, axis=1)
+        inside = distance < radius
+        xpos[step, inside] = center + radius * away[inside] / distance[inside, None]
+    force = np.zeros((n, 3))
+    force[:, 1] = -4 / 3 * 1.7e6 * np.sqrt(radius) * np.clip(depth, 0, None) ** 1.5
+    near = np.exp(-(np.linalg.norm(shell.electrode_pos - first_touch, axis=1) / 4e-3) ** 2)
+    counts = np.full((n, 23), 3000.0)
+    counts[:, :19] += np.round(np.clip(depth, 0, None)[:, None] / 1.5e-3 * (150 - 900 * near))
+    counts[:, 19] += np.round(2e5 * np.clip(depth, 0, None))
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    return PressRecord(
+        geometry=shell,
+        parameters={"indenter": "synthetic sphere", "depth": 1.5e-3},
+        time=4e-3 * np.arange(n),
+        depth=depth,
+        force=force,
+        counts=counts,
+        nonconverged=np.repeat([0, 1], n // 2),
+        vert_xpos=xpos.astype(np.float32),
+        indenter_pos=indenter_pos,
+        indenter_quat=np.tile([1.0, 0, 0, 0], (n, 1)),
+        indenter_vert=sphere.vertices - [0, radius, 0],
+        indenter_face=sphere.faces,
+        seconds=0.5,
+    )
