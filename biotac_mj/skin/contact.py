@@ -1,0 +1,245 @@
+"""Contact of a skin surface with geoms: linear pressure-overclosure sampled inside the faces, Coulomb friction with stick and slip.
+
+Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too (as surface-to-surface
+contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that
+stays put on the geom, returned radially to mu times the normal force where it slips.
+"""
+
+import numpy as np
+import warp as wp
+
+from .shapes import Grids, distance
+from .types import mat33, real, vec3
+
+__all__ = ["Geoms", "contact_force", "contact_product", "contact_wrench", "face_samples", "rest_gap"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Geoms:
+    """Touching geoms in the BioTac frame; arrays over worlds are [geom, world]."""
+
+    count: int
+    kind: wp.array(dtype=int)
+    size: wp.array(dtype=vec3)
+    rounding: wp.array(dtype=real)
+    grid: wp.array(dtype=int)
+    group: wp.array(dtype=int)
+    friction: wp.array2d(dtype=real)
+    pos: wp.array2d(dtype=vec3)
+    mat: wp.array2d(dtype=mat33)
+    grids: Grids
+
+
+def face_samples(order: int) -> np.ndarray:
+    """Barycentric coordinates (order^2, 3) of the centroids of the order^2 equal triangles that subdivide a face."""
+    points = []
+    for i in range(order):
+        for j in range(order - i):
+            points.append((i + 1 / 3, j + 1 / 3))
+            if j < order - i - 1:
+                points.append((i + 2 / 3, j + 2 / 3))
+    ab = np.array(points) / order
+    return np.column_stack([ab, 1 - ab.sum(axis=1)])
+
+
+@wp.kernel
+def rest_gap(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    gap_out: wp.array(dtype=real),
+):
+    """Distance of every sample to the first geom."""
+    f, s = wp.tid()
+    t = face[f]
+    b = sample[s]
+    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0]
+    dn = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], p)
+    gap_out[f * sample.shape[0] + s] = dn[3]
+
+
+@wp.kernel
+def contact_force(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    offset: wp.array(dtype=real),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    force_out: wp.array2d(dtype=vec3),
+):
+    f, w = wp.tid()
+    nsample = sample.shape[0]
+    t = face[f]
+    x0 = x[t[0], w]
+    x1 = x[t[1], w]
+    x2 = x[t[2], w]
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+    near = int(0)
+    # most faces are far from every geom: one distance each tells
+    for g in range(geoms.count):
+        R = geoms.mat[g, w]
+        dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], wp.transpose(R) * (center - geoms.pos[g, w]))
+        if dn[3] < radius + real(1.0e-4):
+            near = 1
+    touching = int(0)
+    f0 = vec3()
+    f1 = vec3()
+    f2 = vec3()
+    b00 = mat33()
+    b01 = mat33()
+    b02 = mat33()
+    b11 = mat33()
+    b12 = mat33()
+    b22 = mat33()
+    k = stiffness * area[f] / real(nsample)
+    kt = k * stick_ratio
+    for s in range(nsample):
+        i = f * nsample + s
+        touched = int(-1)
+        if near == 1:
+            b = sample[s]
+            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+            gap = real(0.0)
+            normal = vec3()
+            local = vec3()
+            for g in range(geoms.count):
+                R = geoms.mat[g, w]
+                y = wp.transpose(R) * (p - geoms.pos[g, w])
+                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                d = dn[3] - offset[i]
+                if d < gap:
+                    gap = d
+                    touched = g
+                    normal = vec3(dn[0], dn[1], dn[2])
+                    local = y
+            if touched >= 0:
+                touching = 1
+                fn = -k * gap
+                force = fn * normal
+                nn = wp.outer(normal, normal)
+                K = k * nn
+                mu = geoms.friction[touched, w]
+                stick = local
+                if mu > real(0.0) and anchor_geom[i, w] == touched:
+                    stick = anchor[i, w]
+                    slip = local - stick
+                    slip = slip - wp.dot(slip, normal) * normal
+                    length = wp.length(slip)
+                    tangent = wp.identity(n=3, dtype=real) - nn
+                    if kt * length <= mu * fn:
+                        force = force - kt * slip
+                        K = K + kt * tangent
+                    else:
+                        along = slip / length
+                        force = force - mu * fn * along
+                        K = K + mu * fn / length * (tangent - wp.outer(along, along))
+                        stick = local - mu * fn / kt * along
+                anchor_out[i, w] = stick
+                R = geoms.mat[touched, w]
+                force = R * force
+                K = R * K * wp.transpose(R)
+                force_out[i, w] = force
+                f0 += b[0] * force
+                f1 += b[1] * force
+                f2 += b[2] * force
+                b00 += (b[0] * b[0]) * K
+                b01 += (b[0] * b[1]) * K
+                b02 += (b[0] * b[2]) * K
+                b11 += (b[1] * b[1]) * K
+                b12 += (b[1] * b[2]) * K
+                b22 += (b[2] * b[2]) * K
+        geom_out[i, w] = touched
+    touching_out[f, w] = touching
+    corner_out[3 * f, w] = f0
+    corner_out[3 * f + 1, w] = f1
+    corner_out[3 * f + 2, w] = f2
+    if touching == 1:
+        block_out[6 * f, w] = b00
+        block_out[6 * f + 1, w] = b01
+        block_out[6 * f + 2, w] = b02
+        block_out[6 * f + 3, w] = b11
+        block_out[6 * f + 4, w] = b12
+        block_out[6 * f + 5, w] = b22
+
+
+@wp.kernel
+def contact_product(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    touching: wp.array2d(dtype=int),
+    block: wp.array2d(dtype=mat33),
+    p: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+):
+    f, w = wp.tid()
+    q0 = vec3()
+    q1 = vec3()
+    q2 = vec3()
+    if touching[f, w] == 1:
+        t = face[f]
+        p0 = p[t[0], w]
+        p1 = p[t[1], w]
+        p2 = p[t[2], w]
+        b01 = block[6 * f + 1, w]
+        b02 = block[6 * f + 2, w]
+        b12 = block[6 * f + 4, w]
+        q0 = block[6 * f, w] * p0 + b01 * p1 + b02 * p2
+        q1 = b01 * p0 + block[6 * f + 3, w] * p1 + b12 * p2
+        q2 = b02 * p0 + b12 * p1 + block[6 * f + 5, w] * p2
+    corner_out[3 * f, w] = q0
+    corner_out[3 * f + 1, w] = q1
+    corner_out[3 * f + 2, w] = q2
+
+
+@wp.kernel
+def contact_wrench(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    wrench_out: wp.array3d(dtype=real),
+):
+    """Force and torque about the origin of the surface ON each group of geoms [group, world, 6]."""
+    group, w = wp.tid()
+    nsample = sample.shape[0]
+    total = vec3()
+    torque = vec3()
+    for f in range(face.shape[0]):
+        if touching[f, w] == 1:
+            t = face[f]
+            for s in range(nsample):
+                i = f * nsample + s
+                g = geom[i, w]
+                if g >= 0:
+                    if geoms.group[g] == group:
+                        b = sample[s]
+                        p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+                        total -= force[i, w]
+                        torque -= wp.cross(p, force[i, w])
+    for c in range(3):
+        wrench_out[group, w, c] = total[c]
+        wrench_out[group, w, 3 + c] = torque[c]

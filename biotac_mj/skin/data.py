@@ -1,0 +1,142 @@
+"""SkinData: everything about a skin that changes, for every world."""
+
+import numpy as np
+import warp as wp
+
+from .model import SkinModel
+from .types import mat33, real, vec3
+
+__all__ = ["ContactState", "SkinData", "view"]
+
+
+def view(array: wp.array):
+    """The array's memory as numpy (CPU) or torch (CUDA), not copied: (item, nworld, ...)."""
+    return wp.to_torch(array) if array.device.is_cuda else array.numpy()
+
+
+class ContactState:
+    """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote."""
+
+    def __init__(self, surface, nsample, nvert, nworld):
+        nface = len(surface.face)
+        self.surface = surface
+        self.anchor_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
+        self.anchor = wp.zeros((nface * nsample, nworld), dtype=vec3)
+        self.trial_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
+        self.trial_anchor = wp.zeros((nface * nsample, nworld), dtype=vec3)
+        self.sample_force = wp.zeros((nface * nsample, nworld), dtype=vec3)
+        self.corner = wp.zeros((3 * nface, nworld), dtype=vec3)
+        self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
+        self.touching = wp.zeros((nface, nworld), dtype=int)
+        self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
+
+    def reset(self):
+        self.anchor_geom.fill_(-1)
+        for array in (self.trial_geom, self.touching, self.node_force, self.sample_force):
+            array.zero_()
+        self.trial_geom.fill_(-1)
+
+    def commit(self):
+        wp.copy(self.anchor_geom, self.trial_geom)
+        wp.copy(self.anchor, self.trial_anchor)
+
+
+class SkinData:
+    """State and outputs of `nworld` skins.
+
+    Args:
+      model: the SkinModel.
+      nworld: number of worlds.
+      material: None, or one Material of the model's law for each world.
+
+    Attributes (all arrays lead with nworld, on the host):
+      vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
+      contact_force: (nworld, nvert, 3) nodal forces of the touching geoms on the skin [N].
+      core_force: (nworld, nvert, 3) nodal forces of the core on the inner surface [N].
+      reaction: (nworld, 3) force of core, nail and clamp on the fixed nodes [N].
+      wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin [N, N m].
+      pressure: (nworld,) of the liquid above its rest value [Pa].
+      volume: (nworld,) of the liquid [m^3].
+      converged: (nworld,) whether the last step converged.
+      nonconverged: (nworld,) number of steps that did not, since reset.
+      iterations: (nworld,) Newton iterations of the last step.
+      error: (nworld,) estimated relative error of the last step in the energy norm.
+    """
+
+    def __init__(self, model: SkinModel, nworld: int = 1, material=None):
+        materials = [model.material] * nworld if material is None else list(material)
+        if len(materials) != nworld or any(m.law != model.material.law for m in materials):
+            raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
+        self.nworld, self.model = nworld, model
+        second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
+        nsample = len(model.sample)
+        with wp.ScopedDevice(model.device):
+            self.mu = wp.array([m.mu for m in materials], dtype=real)
+            self.lam = wp.array(second, dtype=real)
+            self.x = wp.array(np.repeat(model.geometry.vert[:, None], nworld, 1), dtype=vec3, ndim=2)
+            self.x_last = wp.clone(self.x)
+            self.velocity = wp.zeros_like(self.x)  # of implicit dynamics, world frame
+            self.force = wp.zeros_like(self.x)
+            self.direction = wp.zeros_like(self.x)
+            self.product = wp.zeros_like(self.x)
+            self.gradient = wp.zeros_like(self.x)
+            self.rotation = wp.zeros((model.nelem, nworld), dtype=mat33)
+            self.jacobian = wp.zeros((model.nelem, nworld), dtype=real)
+            self.corner = wp.zeros((4 * model.nelem, nworld), dtype=vec3)
+            self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
+            self.inner = ContactState(model.inner, nsample, model.nvert, nworld) if model.inner else None
+            self.face_volume = wp.zeros((len(model.inner.face) if model.inner else 0, nworld), dtype=real)
+        self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
+        self.core_pos = np.zeros((nworld, 3))
+        self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
+        self.reset()
+
+    def reset(self):
+        """Puts every world back to rest."""
+        rest = np.repeat(self.model.geometry.vert[:, None], self.nworld, 1)
+        for array in (self.x, self.x_last):
+            wp.copy(array, wp.array(rest, dtype=vec3, ndim=2, device=array.device))
+        self.velocity.zero_()
+        self.force.zero_()
+        self.outer.reset()
+        if self.inner:
+            self.inner.reset()
+        self.wrench = np.zeros((self.nworld, 0, 6))
+        self.pressure = np.zeros(self.nworld)
+        self.volume = np.full(self.nworld, self.model.liquid_volume)
+        self.converged = np.ones(self.nworld, bool)
+        self.nonconverged = np.zeros(self.nworld, int)
+        self.iterations = np.zeros(self.nworld, int)
+        self.error = np.zeros(self.nworld)
+        self._moved = False
+
+    @property
+    def vert_xpos(self):
+        return _leading(self.x)
+
+    @property
+    def contact_force(self):
+        return _leading(self.outer.node_force)
+
+    @property
+    def core_force(self):
+        return _leading(self.inner.node_force) if self.inner else np.zeros((self.nworld, self.model.nvert, 3))
+
+    @property
+    def reaction(self):
+        return -self.force.numpy()[self.model.fixed].sum(0)
+
+    def stress(self):
+        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
+        from .elasticity import tet_stress
+
+        m = self.model
+        cauchy = wp.zeros((m.nelem, self.nworld), dtype=mat33, device=m.device)
+        mises = wp.zeros((m.nelem, self.nworld), dtype=real, device=m.device)
+        wp.launch(tet_stress, dim=mises.shape, inputs=[m.law, self.mu, self.lam, m.elem, m.inverse_edges, self.x],
+                  outputs=[cauchy, mises], device=m.device)  # fmt: skip
+        return _leading(cauchy), _leading(mises)
+
+
+def _leading(array: wp.array) -> np.ndarray:
+    return np.ascontiguousarray(np.swapaxes(array.numpy(), 0, 1))

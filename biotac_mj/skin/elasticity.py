@@ -1,0 +1,191 @@
+"""Elastic forces of linear tetrahedra. Arrays are [item, world], so that neighbouring threads read neighbouring worlds."""
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from . import material as mat
+from .types import mat33, real, vec3
+
+__all__ = ["elastic_energy", "elastic_force", "gather", "hessian_product", "rest_shape", "rest_stiffness", "tet_stress"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+def rest_shape(vert: np.ndarray, elem: np.ndarray):
+    """Inverse rest edge matrices (nelem, 3, 3) [1/m] and volumes (nelem,) [m^3].
+
+    Raises:
+      ValueError: a tetrahedron is inverted or degenerate.
+    """
+    edges = np.moveaxis(vert[elem[:, 1:]] - vert[elem[:, :1]], 1, 2)
+    volume = np.linalg.det(edges) / 6
+    scale = np.abs(edges).max(axis=(1, 2)) ** 3
+    bad = np.flatnonzero(~(volume > 1e-9 * scale))
+    if len(bad):
+        raise ValueError(
+            f"{len(bad)} of {len(elem)} tetrahedra are inverted or degenerate (first: {bad[0]}, volume {volume[bad[0]]:.3g} m^3): "
+            "repair the mesh or swap two nodes of each inverted tetrahedron"
+        )
+    return np.linalg.inv(edges), volume
+
+
+def rest_stiffness(nvert: int, elem: np.ndarray, inverse_edges: np.ndarray, volume: np.ndarray, mu: float, lame: float) -> sp.csc_matrix:
+    """Stiffness matrix at rest (3 nvert, 3 nvert) [N/m]; every law here has the same linearisation."""
+    grad = np.empty((len(elem), 4, 3))  # shape function gradients
+    grad[:, 1:] = inverse_edges
+    grad[:, 0] = -inverse_edges.sum(axis=1)
+    outer = np.einsum("eai,ebj->eabij", grad, grad)
+    dot = np.einsum("eabkk->eab", outer)
+    block = lame * outer + mu * np.swapaxes(outer, 3, 4) + mu * dot[..., None, None] * np.eye(3)
+    block *= volume[:, None, None, None, None]
+    dof = 3 * elem[:, :, None] + np.arange(3)
+    rows = np.broadcast_to(dof[:, :, None, :, None], block.shape)
+    cols = np.broadcast_to(dof[:, None, :, None, :], block.shape)
+    return sp.coo_matrix((block.ravel(), (rows.ravel(), cols.ravel())), shape=(3 * nvert, 3 * nvert)).tocsc()
+
+
+@wp.func
+def edge_matrix(x: wp.array2d(dtype=vec3), t: wp.vec4i, w: int):
+    x0 = x[t[0], w]
+    return wp.matrix_from_cols(x[t[1], w] - x0, x[t[2], w] - x0, x[t[3], w] - x0)
+
+
+@wp.kernel
+def elastic_force(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    rotation_out: wp.array2d(dtype=mat33),
+    corner_out: wp.array2d(dtype=vec3),
+    jacobian_out: wp.array2d(dtype=real),
+):
+    e, w = wp.tid()
+    t = elem[e]
+    F = edge_matrix(x, t, w) * inverse_edges[e]
+    R = mat33()
+    if law == 0:
+        R = mat.polar_rotation(F)
+        rotation_out[e, w] = R
+    jacobian_out[e, w] = wp.determinant(F)
+    H = -volume[e] * mat.stress(law, mu[w], lam[w], F, R) * wp.transpose(inverse_edges[e])
+    f1 = vec3(H[0, 0], H[1, 0], H[2, 0])
+    f2 = vec3(H[0, 1], H[1, 1], H[2, 1])
+    f3 = vec3(H[0, 2], H[1, 2], H[2, 2])
+    corner_out[4 * e, w] = -f1 - f2 - f3
+    corner_out[4 * e + 1, w] = f1
+    corner_out[4 * e + 2, w] = f2
+    corner_out[4 * e + 3, w] = f3
+
+
+@wp.kernel
+def hessian_product(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    rotation: wp.array2d(dtype=mat33),
+    p: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+):
+    e, w = wp.tid()
+    t = elem[e]
+    B = inverse_edges[e]
+    F = edge_matrix(x, t, w) * B
+    dF = edge_matrix(p, t, w) * B
+    R = mat33()
+    if law == 0:
+        R = rotation[e, w]
+    H = volume[e] * mat.stress_derivative(law, mu[w], lam[w], F, R, dF) * wp.transpose(B)
+    f1 = vec3(H[0, 0], H[1, 0], H[2, 0])
+    f2 = vec3(H[0, 1], H[1, 1], H[2, 1])
+    f3 = vec3(H[0, 2], H[1, 2], H[2, 2])
+    corner_out[4 * e, w] = -f1 - f2 - f3
+    corner_out[4 * e + 1, w] = f1
+    corner_out[4 * e + 2, w] = f2
+    corner_out[4 * e + 3, w] = f3
+
+
+@wp.kernel
+def elastic_energy(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    energy_out: wp.array2d(dtype=real),
+):
+    e, w = wp.tid()
+    F = edge_matrix(x, elem[e], w) * inverse_edges[e]
+    R = mat33()
+    if law == 0:
+        R = mat.polar_rotation(F)
+    energy_out[e, w] = volume[e] * mat.energy_density(law, mu[w], lam[w], F, R)
+
+
+@wp.kernel
+def tet_stress(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    cauchy_out: wp.array2d(dtype=mat33),
+    von_mises_out: wp.array2d(dtype=real),
+):
+    e, w = wp.tid()
+    F = edge_matrix(x, elem[e], w) * inverse_edges[e]
+    R = mat.polar_rotation(F)
+    sigma = mat.stress(law, mu[w], lam[w], F, R) * wp.transpose(F) / wp.determinant(F)
+    deviator = sigma - wp.trace(sigma) / real(3.0) * wp.identity(n=3, dtype=real)
+    cauchy_out[e, w] = sigma
+    von_mises_out[e, w] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
+
+
+@wp.kernel
+def gather(
+    # In:
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    corner: wp.array2d(dtype=vec3),
+    scale: real,
+    add: int,
+    # Out:
+    node_out: wp.array2d(dtype=vec3),
+):
+    """Sums what the corners of elements (or faces) hold into their nodes: no atomics, so the sum's order is fixed."""
+    i, w = wp.tid()
+    total = vec3()
+    for k in range(start[i], start[i + 1]):
+        total += corner[slot[k], w]
+    if add != 0:
+        node_out[i, w] = node_out[i, w] + scale * total
+    else:
+        node_out[i, w] = scale * total
+
+
+def incidence(nvert: int, cells: np.ndarray):
+    """CSR lists of the corner slots (cell * ncorner + corner) that belong to each node: start (nvert+1,), slot (ncell * ncorner,)."""
+    flat = cells.ravel()
+    slot = np.argsort(flat, kind="stable").astype(np.int32)
+    start = np.zeros(nvert + 1, np.int32)
+    np.cumsum(np.bincount(flat, minlength=nvert), out=start[1:])
+    return start, slot

@@ -1,0 +1,94 @@
+"""The geoms that touch a skin: what MuJoCo says of them, on the skin's device."""
+
+import numpy as np
+import warp as wp
+
+from .contact import Geoms
+from .shapes import GEOM_TYPES, DistanceGrid, pack_grids
+from .types import mat33, real, vec3
+
+__all__ = ["GeomSet"]
+
+
+class GeomSet:
+    """Geoms in the BioTac frame.
+
+    Args:
+      types: names of MuJoCo geom types, (ngeom,).
+      sizes: MuJoCo sizes, (ngeom, 3) [m]; shorter ones are filled with zeros.
+      friction: Coulomb coefficients (ngeom,).
+      groups: body number of each geom, 0..ngroup-1; None makes one group of all.
+      rounding: fillet radius of boxes and cylinders (ngeom,) [m].
+      grids: one DistanceGrid for each mesh, in the order in which the meshes appear.
+      nworld: number of worlds.
+      device: Warp device.
+
+    Raises:
+      ValueError: unknown type, a size that is not positive, NaN, or a mesh without a grid.
+    """
+
+    def __init__(self, types, sizes, friction=None, groups=None, rounding=None, grids=(), nworld=1, device="cpu"):
+        count = len(types)
+        for kind in types:
+            if kind not in GEOM_TYPES:
+                raise ValueError(f"geom type {kind!r} cannot touch the skin: use one of {', '.join(GEOM_TYPES)}")
+        if sum(kind == "mesh" for kind in types) != len(grids) or not all(isinstance(g, DistanceGrid) for g in grids):
+            raise ValueError("every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)")
+        size = np.zeros((count, 3))
+        for row, given in zip(size, sizes, strict=True):
+            row[: len(given)] = given
+        used = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0}
+        for kind, row in zip(types, size, strict=True):
+            if not np.isfinite(row).all() or (row[: used[kind]] <= 0).any():
+                raise ValueError(f"a {kind} of size {row.tolist()} is not a solid: sizes must be positive and finite")
+        friction = np.zeros(count) if friction is None else np.asarray(friction, float)
+        rounding = np.zeros(count) if rounding is None else np.asarray(rounding, float)
+        groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
+        if not (np.isfinite(friction).all() and (friction >= 0).all()):
+            raise ValueError(f"friction {friction.tolist()} must be finite and not negative")
+        mesh_number = np.cumsum([kind == "mesh" for kind in types]) - 1 if count else np.zeros(0)
+        self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
+        self.ngroup = int(groups.max()) + 1 if count else 0
+        self.groups = groups
+        struct = Geoms()
+        struct.count = count
+        with wp.ScopedDevice(self.device):
+            struct.kind = wp.array([GEOM_TYPES[k] for k in types], dtype=int)
+            struct.size = wp.array(size.reshape(-1, 3), dtype=vec3)
+            struct.rounding = wp.array(rounding, dtype=real)
+            struct.grid = wp.array(np.maximum(mesh_number, 0).astype(np.int32), dtype=int)
+            struct.group = wp.array(groups.astype(np.int32), dtype=int)
+            struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
+            struct.pos = wp.zeros((count, nworld), dtype=vec3)
+            struct.mat = wp.array(np.tile(np.eye(3), (count, nworld, 1, 1)), dtype=mat33) if count else wp.zeros((0, nworld), dtype=mat33)
+        struct.grids = pack_grids(grids, self.device)
+        self.struct = struct
+
+    def set_pose(self, pos, mat=None):
+        """Poses of the geoms in the BioTac frame.
+
+        Args:
+          pos: (ngeom, 3) or (nworld, ngeom, 3) [m].
+          mat: rotation matrices (ngeom, 3, 3) or (nworld, ngeom, 3, 3); None leaves them.
+
+        Raises:
+          ValueError: NaN or a wrong shape.
+        """
+        self._assign(self.struct.pos, pos, (3,), "positions")
+        if mat is not None:
+            self._assign(self.struct.mat, mat, (3, 3), "rotations")
+
+    def set_friction(self, friction):
+        """Coulomb coefficients (ngeom,) or (nworld, ngeom)."""
+        self._assign(self.struct.friction, friction, (), "friction coefficients")
+
+    def _assign(self, target, value, item, what):
+        value = np.asarray(value, float)
+        if value.shape == (self.count, *item):
+            value = np.broadcast_to(value, (self.nworld, *value.shape))
+        if value.shape != (self.nworld, self.count, *item):
+            raise ValueError(f"geom {what} have shape {value.shape}: expected {(self.count, *item)} or {(self.nworld, self.count, *item)}")
+        if not np.isfinite(value).all():
+            raise ValueError(f"geom {what} contain NaN or infinite numbers: the simulation has diverged or a pose was never set")
+        if self.count:
+            wp.copy(target, wp.array(np.ascontiguousarray(np.swapaxes(value, 0, 1)), dtype=target.dtype, ndim=2, device=self.device))

@@ -1,0 +1,191 @@
+"""Hyperelastic materials of the skin: energy density, first Piola-Kirchhoff stress and its directional derivative.
+
+The four laws take the same two Lame-like constants and differ in the energy W(F):
+
+  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar decomposition
+  svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2       Saint Venant-Kirchhoff
+  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and CalculiX have it
+  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not invariant to rotation
+"""
+
+import dataclasses
+import math
+
+import warp as wp
+
+from .types import mat33, real
+
+__all__ = ["LAWS", "PRESETS", "Material", "material"]
+
+wp.set_module_options({"enable_backward": False})
+
+LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """What the skin is made of.
+
+    Attributes:
+      law: "corotational", "svk", "neo_hookean" or "linear".
+      youngs_modulus: E [Pa].
+      poissons_ratio: nu, inside (-1, 0.5).
+      friction: Coulomb coefficient against the touching geoms.
+      density: [kg/m^3]; used by implicit dynamics only.
+      liquid: whether the preset fills the space between skin and core with the liquid.
+
+    Raises:
+      ValueError: unknown law, or a constant out of its range or not finite.
+    """
+
+    law: str = "corotational"
+    youngs_modulus: float = 1.55223093e6
+    poissons_ratio: float = 0.31645428
+    friction: float = 0.783414394
+    density: float = 1000.0
+    liquid: bool = True
+
+    def __post_init__(self):
+        if self.law not in LAWS:
+            raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
+        for name in ("youngs_modulus", "poissons_ratio", "friction", "density"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
+        if self.youngs_modulus <= 0 or self.density <= 0:
+            raise ValueError(f"Young's modulus {self.youngs_modulus} Pa and density {self.density} kg/m^3 must be positive")
+        if not -1 < self.poissons_ratio < 0.5:
+            raise ValueError(
+                f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber needs nu below 0.5, "
+                "the liquid's volume constraint does the rest"
+            )
+        if self.friction < 0:
+            raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poissons_ratio))
+
+    @property
+    def lame(self) -> float:
+        """Lame's first constant lambda [Pa]."""
+        return self.youngs_modulus * self.poissons_ratio / ((1 + self.poissons_ratio) * (1 - 2 * self.poissons_ratio))
+
+    @property
+    def bulk(self) -> float:
+        """Bulk modulus kappa [Pa]."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poissons_ratio))
+
+
+# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("rubber"; nu 0.5 there: linear
+# tetrahedra lock, so 0.45 here, the value of the reference solutions).
+PRESETS = {
+    "default": Material(),
+    "paper": Material(liquid=False),
+    "rubber": Material("neo_hookean", 2.80e5, 0.45, 0.186),
+}
+
+
+def material(choice) -> Material:
+    """A preset's name or a Material, as a Material; ValueError names the presets."""
+    if isinstance(choice, Material):
+        return choice
+    if choice not in PRESETS:
+        raise ValueError(f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, or pass a Material")
+    return PRESETS[choice]
+
+
+@wp.func
+def polar_rotation(F: mat33):
+    """Rotation of the polar decomposition F = R S (Newton's iteration; by SVD where F is inverted or nearly flat)."""
+    if wp.determinant(F) < real(1.0e-3):
+        U = mat33()
+        s = wp.vec3d()
+        V = mat33()
+        wp.svd3(F, U, s, V)
+        R = U * wp.transpose(V)
+        if wp.determinant(R) < real(0.0):
+            # svd3 sorts the singular values: the reflection goes to the smallest
+            c = wp.vec3d(U[0, 2], U[1, 2], U[2, 2])
+            d = wp.vec3d(V[0, 2], V[1, 2], V[2, 2])
+            R = R - real(2.0) * wp.outer(c, d)
+        return R
+    X = F
+    for _ in range(20):
+        Y = real(0.5) * (X + wp.transpose(wp.inverse(X)))
+        change = wp.ddot(Y - X, Y - X)
+        X = Y
+        if change < real(1.0e-14):
+            break
+    return X
+
+
+@wp.func
+def axial(A: mat33):
+    """Twice the axial vector of the skew part of A."""
+    return wp.vec3d(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+
+
+@wp.func
+def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
+    """W(F) [J/m^3]; for neo_hookean `lam` is the bulk modulus."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        tr = wp.trace(wp.transpose(R) * F) - real(3.0)
+        return mu * wp.ddot(F - R, F - R) + real(0.5) * lam * tr * tr
+    if law == 1:
+        E = real(0.5) * (wp.transpose(F) * F - eye)
+        return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
+    if law == 2:
+        J = wp.determinant(F)
+        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(0.5) * lam * (J - real(1.0)) * (J - real(1.0))
+    e = real(0.5) * (F + wp.transpose(F)) - eye
+    return real(0.5) * lam * wp.trace(e) * wp.trace(e) + mu * wp.ddot(e, e)
+
+
+@wp.func
+def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
+    """First Piola-Kirchhoff stress P = dW/dF [Pa]."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        return real(2.0) * mu * (F - R) + lam * (wp.trace(wp.transpose(R) * F) - real(3.0)) * R
+    if law == 1:
+        E = real(0.5) * (wp.transpose(F) * F - eye)
+        return F * (lam * wp.trace(E) * eye + real(2.0) * mu * E)
+    if law == 2:
+        J = wp.determinant(F)
+        G = wp.transpose(wp.inverse(F))
+        return mu * wp.pow(J, -real(2.0) / real(3.0)) * (F - wp.ddot(F, F) / real(3.0) * G) + lam * (J - real(1.0)) * J * G
+    e = real(0.5) * (F + wp.transpose(F)) - eye
+    return lam * wp.trace(e) * eye + real(2.0) * mu * e
+
+
+@wp.func
+def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33):
+    """Directional derivative of the stress, dP = (d2W/dF2) : dF [Pa]."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        Rt = wp.transpose(R)
+        S = Rt * F
+        A = Rt * dF
+        trace_s = wp.trace(S)
+        w = wp.inverse(trace_s * eye - S) * axial(A)
+        dR = R * wp.skew(w)
+        return real(2.0) * mu * (dF - dR) + lam * (wp.trace(A) * R + (trace_s - real(3.0)) * dR)
+    if law == 1:
+        Ft = wp.transpose(F)
+        E = real(0.5) * (Ft * F - eye)
+        A = Ft * dF
+        dE = real(0.5) * (A + wp.transpose(A))
+        return dF * (lam * wp.trace(E) * eye + real(2.0) * mu * E) + F * (lam * wp.trace(dE) * eye + real(2.0) * mu * dE)
+    if law == 2:
+        J = wp.determinant(F)
+        G = wp.transpose(wp.inverse(F))
+        a = wp.pow(J, -real(2.0) / real(3.0))
+        GdF = wp.ddot(G, dF)
+        dG = -G * wp.transpose(dF) * G
+        I1 = wp.ddot(F, F) / real(3.0)
+        iso = a * (dF - real(2.0) / real(3.0) * wp.ddot(F, dF) * G - I1 * dG) - real(2.0) / real(3.0) * a * GdF * (F - I1 * G)
+        return mu * iso + lam * J * ((real(2.0) * J - real(1.0)) * GdF * G + (J - real(1.0)) * dG)
+    de = real(0.5) * (dF + wp.transpose(dF))
+    return lam * wp.trace(de) * eye + real(2.0) * mu * de

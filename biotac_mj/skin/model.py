@@ -1,0 +1,207 @@
+"""SkinModel: everything about a skin that does not change while it moves, shared by all worlds."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import warp as wp
+
+from ..geometry.skin_geometry import SkinGeometry
+from . import contact, elasticity, liquid
+from .factor import DenseFactor, SparseFactor
+from .geoms import GeomSet
+from .material import LAWS, Material, material
+from .shapes import bake_distance_grid
+from .types import mat33, real, vec3
+
+__all__ = ["SkinModel", "SkinOptions", "Surface"]
+
+
+@dataclasses.dataclass(frozen=True)
+class SkinOptions:
+    """How the skin is solved.
+
+    Attributes:
+      dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
+      liquid: fills the space between skin and core; None takes the material preset's choice.
+      bulk_modulus: of the liquid [Pa]; water has 2.2e9.
+      core_contact: whether the inner surface can touch the rigid core.
+      contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference solutions' ratio.
+      stick_ratio: tangential stiffness of sticking contact relative to k.
+      samples: contact is sampled at samples^2 points per face.
+      mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
+      tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below this fraction of the energy
+        norm of the load.
+      max_newton, max_cg: iteration limits of a step and of each linear solve.
+
+    Raises:
+      ValueError: an option is out of its range.
+    """
+
+    dynamics: str = "quasistatic"
+    liquid: bool | None = None
+    bulk_modulus: float = 2.2e9
+    core_contact: bool = True
+    contact_stiffness: float | None = None
+    stick_ratio: float = 0.1
+    samples: int = 4
+    mass_damping: float = 0.0
+    stiffness_damping: float = 0.0
+    tolerance: float = 1e-3
+    max_newton: int = 30
+    max_cg: int = 40
+
+    def __post_init__(self):
+        if self.dynamics not in ("quasistatic", "implicit"):
+            raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
+        for name in ("bulk_modulus", "stick_ratio", "tolerance"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: pass a positive finite number")
+        if self.contact_stiffness is not None and not (math.isfinite(self.contact_stiffness) and self.contact_stiffness > 0):
+            raise ValueError(f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None")
+        if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
+            raise ValueError("samples, max_newton and max_cg must be at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], offsets of the samples' gaps [m], node incidence."""
+
+    face: wp.array
+    area: wp.array
+    offset: wp.array
+    start: wp.array
+    slot: wp.array
+    face_np: np.ndarray
+
+    @classmethod
+    def create(cls, vert, face, samples, device):
+        edge = vert[face[:, 1:]] - vert[face[:, :1]]
+        area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
+        start, slot = elasticity.incidence(len(vert), face)
+        return cls(
+            wp.array(face, dtype=wp.vec3i, device=device),
+            wp.array(area, dtype=real, device=device),
+            wp.zeros(len(face) * samples, dtype=real, device=device),
+            wp.array(start, dtype=int, device=device),
+            wp.array(slot, dtype=int, device=device),
+            face,
+        )
+
+
+class SkinModel:
+    """Constants of a skin on one device.
+
+    Args:
+      geometry: the skin.
+      material: a preset's name or a Material.
+      options: SkinOptions.
+      device: "cpu" or a CUDA device of Warp.
+      fixed: (n,) nodes that do not move, instead of the geometry's.
+
+    Raises:
+      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed.
+    """
+
+    def __init__(self, geometry: SkinGeometry, material_choice="default", options: SkinOptions | None = None, device="cpu", fixed=None):
+        self.geometry = geometry
+        self.material: Material = material(material_choice)
+        self.options = options or SkinOptions()
+        self.device = wp.get_device(device)
+        self._cores = {}
+        self.law = LAWS[self.material.law]
+        vert, elem = geometry.vert, geometry.elem
+        if not np.isfinite(vert).all():
+            raise ValueError(f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh")
+        self.nvert, self.nelem = len(vert), len(elem)
+        self.fixed = np.asarray(geometry.fixed if fixed is None else fixed, int)
+        if not len(self.fixed):
+            raise ValueError(f"skin {geometry.name!r} has no fixed nodes: it would float away; fix those on core, nail and clamp")
+        self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
+        self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
+        self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
+
+        inverse_edges, volume = elasticity.rest_shape(vert, elem)
+        mass = np.zeros(self.nvert)
+        np.add.at(mass, elem.ravel(), np.repeat(volume / 4, 4))
+        start, slot = elasticity.incidence(self.nvert, elem)
+        mask = np.zeros(self.nvert)
+        mask[self.free] = 1
+        with wp.ScopedDevice(self.device):
+            self.vert = wp.array(vert[:, None], dtype=vec3)
+            self.elem = wp.array(elem, dtype=wp.vec4i)
+            self.inverse_edges = wp.array(inverse_edges, dtype=mat33)
+            self.volume = wp.array(volume, dtype=real)
+            self.node_volume = wp.array(mass, dtype=real)
+            self.start = wp.array(start, dtype=int)
+            self.slot = wp.array(slot, dtype=int)
+            self.free_mask = wp.array(mask, dtype=real)
+            self.sample = wp.array(contact.face_samples(self.options.samples), dtype=vec3)
+            nsample = len(self.sample)
+            self.outer = Surface.create(vert, geometry.outer_face, nsample, self.device)
+            self.inner = Surface.create(vert, geometry.inner_face, nsample, self.device) if len(geometry.inner_face) else None
+        self.has_liquid = bool(self.has_liquid and self.inner is not None)
+        self.has_core = bool(self.options.core_contact and self.inner is not None and len(geometry.core_face))
+        if self.has_core:
+            self._offset_core()
+        self.rest_volume, self.liquid_volume = self._volumes()
+        stiffness = elasticity.rest_stiffness(self.nvert, elem, inverse_edges, volume, self.material.mu, self.material.lame)
+        dof = (3 * self.free[:, None] + np.arange(3)).ravel()
+        self._stiffness = stiffness[dof][:, dof]
+
+    def core(self, nworld: int) -> GeomSet:
+        """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
+        if nworld not in self._cores:
+            grid = _core_grid(self.geometry)
+            self._cores[nworld] = GeomSet(["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device)
+        return self._cores[nworld]
+
+    def _offset_core(self):
+        """A skin that starts slightly inside the core (bonded areas, faceted surfaces) starts without force: its gap counts from there."""
+        gap = wp.zeros(len(self.inner.offset), dtype=real, device=self.device)
+        wp.launch(contact.rest_gap, dim=(len(self.inner.face), len(self.sample)),
+                  inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert], outputs=[gap], device=self.device)  # fmt: skip
+        wp.copy(self.inner.offset, wp.array(np.minimum(gap.numpy(), 0.0), dtype=real, device=self.device))
+
+    def _volumes(self):
+        if self.inner is None:
+            return 0.0, 0.0
+        share = wp.zeros((len(self.inner.face), 1), dtype=real, device=self.device)
+        wp.launch(liquid.cavity_volume, dim=share.shape, inputs=[self.inner.face, self.vert], outputs=[share], device=self.device)
+        cavity = float(share.numpy().sum())
+        a, b, c = np.moveaxis(self.geometry.core_vert[self.geometry.core_face], 1, 0)
+        core = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6) if len(a) else 0.0
+        if cavity - core <= 0:
+            raise ValueError(f"the core ({core * 1e9:.0f} mm^3) does not fit into the cavity ({cavity * 1e9:.0f} mm^3): check the meshes' frames and units")
+        return cavity, cavity - core
+
+    @functools.cached_property
+    def factor(self):
+        """Inverse of the rest stiffness of the free nodes, as an operator."""
+        return (DenseFactor if self.device.is_cuda else SparseFactor)(self._stiffness, self.free, self.nvert, self.device)
+
+
+@functools.lru_cache(maxsize=8)
+def _cached_core_grid(key, spacing):
+    vert, face = key.arrays
+    return bake_distance_grid(vert, face, spacing=spacing, margin=3e-3)
+
+
+class _Key:
+    """Makes a pair of arrays hashable by content, so that models of one geometry share the core's distance grid."""
+
+    def __init__(self, *arrays):
+        self.arrays = arrays
+        self.digest = hash(tuple(a.tobytes() for a in arrays))
+
+    def __hash__(self):
+        return self.digest
+
+    def __eq__(self, other):
+        return all(np.array_equal(a, b) for a, b in zip(self.arrays, other.arrays, strict=True))
+
+
+def _core_grid(geometry: SkinGeometry):
+    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 1.5e-4)

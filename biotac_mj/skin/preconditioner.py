@@ -1,0 +1,138 @@
+"""Preconditioner of the linear solves: the rest stiffness' inverse, corrected exactly for contact and liquid.
+
+Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume. With U = [unit vectors of T, g] and
+the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's identity gives
+
+  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T and g).
+"""
+
+import numpy as np
+
+__all__ = ["Preconditioner"]
+
+
+class Preconditioner:
+    """For all worlds of one SkinData; `update` after each evaluation of the forces, then `apply`."""
+
+    def __init__(self, model, scale):
+        self.factor = model.factor
+        self.free_mask = np.zeros(model.nvert, bool)
+        self.free_mask[model.free] = True
+        self.free = model.free
+        self.scale = scale
+        self.cuda = model.device.is_cuda
+        self._rows = {}
+
+    def update(self, contacts, gradient, kappa):
+        """Takes the tangents of contact and liquid.
+
+        Args:
+          contacts: list of (faces (nface, 3) host, touching (nface, nworld) host, blocks (6 nface, nworld, 3, 3)) of the surfaces.
+          gradient: (nvert, nworld, 3) of the liquid's volume, zero at fixed nodes [m^2], or None.
+          kappa: K / V0 [Pa/m^3].
+        """
+        self.gradient, self.kappa = gradient, kappa
+        self.along = self.factor.solve(gradient) if gradient is not None else None
+        nworld = contacts[0][1].shape[1]
+        self.worlds = [self._small(w, contacts) for w in range(nworld)]
+
+    def _small(self, w, contacts):
+        faces, blocks = [], []
+        for face, touching, block in contacts:
+            active = np.flatnonzero(touching[:, w])
+            faces.append(face[active])
+            index = 6 * active[:, None] + np.arange(6)
+            blocks.append(_host(block[index, w]))
+        faces, blocks = np.concatenate(faces), np.concatenate(blocks)
+        nodes = np.unique(faces)
+        nodes = nodes[self.free_mask[nodes]]
+        m = 3 * len(nodes)
+        size = m + (self.gradient is not None)
+        if size == 0:
+            return None
+        position = np.full(len(self.free_mask), -1)
+        position[nodes] = np.arange(len(nodes))
+        dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
+        for (a, b), k in zip([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)], range(6), strict=True):
+            pa, pb = position[faces[:, a]], position[faces[:, b]]
+            np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
+            if a != b:
+                np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
+        D = np.zeros((size, size))
+        D[:m, :m] = dense[:-1, :, :-1].reshape(m, m)
+        rows, W = self._compliance(w, nodes)
+        compliance = np.zeros((size, size))
+        compliance[:m, :m] = W / self.scale[w]
+        if self.gradient is not None:
+            D[m, m] = self.kappa
+            along = _host(self.along[:, w]) / self.scale[w]
+            compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
+            compliance[m, m] = np.vdot(_host(self.gradient[:, w]), along)
+        solver = _Solver(np.eye(size) + D @ compliance, D, self.cuda, rows)
+        return nodes, rows, solver, compliance, D
+
+    def _compliance(self, w, nodes):
+        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes stays the same."""
+        key = nodes.tobytes()
+        if w not in self._rows or self._rows[w][0] != key:
+            rows = self.factor.rows(nodes)
+            self._rows[w] = key, rows, _host(rows[:, self.factor.dof(nodes)]).astype(float)
+        return self._rows[w][1:]
+
+    def apply(self, r):
+        """Approximate inverse of the tangent times r: (nvert, nworld, 3), zero at fixed nodes."""
+        z = self.factor.solve(r)
+        for w, small in enumerate(self.worlds):
+            z[:, w] /= self.scale[w]
+            if small is None:
+                continue
+            nodes, rows, solver, _, _ = small
+            m = 3 * len(nodes)
+            u = z[:, w][nodes].reshape(-1)
+            if self.gradient is not None:
+                total = (self.gradient[:, w] * z[:, w]).sum().reshape(1)
+                u = _concatenate(u, total)
+            q = solver(u) / self.scale[w]
+            if m:
+                z[self.free, w] -= (rows.T @ _single(q[:m])).reshape(-1, 3)
+            if self.gradient is not None:
+                z[:, w] -= q[m] * self.along[:, w]
+        return z
+
+
+class _Solver:
+    """q = (I + D W)^-1 D u on the device of the rows."""
+
+    def __init__(self, matrix, D, cuda, rows):
+        if cuda:
+            import torch
+
+            self._solution = torch.as_tensor(np.linalg.solve(matrix, D), device=rows.device)
+        else:
+            from scipy.linalg import lu_factor
+
+            self._lu, self._D = lu_factor(matrix, check_finite=False), D
+        self._cuda = cuda
+
+    def __call__(self, u):
+        if self._cuda:
+            return self._solution @ u
+        from scipy.linalg import lu_solve
+
+        return lu_solve(self._lu, self._D @ u, check_finite=False)
+
+
+def _host(array):
+    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+
+
+def _single(array):
+    return array.astype(np.float32) if isinstance(array, np.ndarray) else array.float()
+
+
+def _concatenate(a, b):
+    if isinstance(a, np.ndarray):
+        return np.concatenate([a, b])
+    import torch
+
+    return torch.cat([a, b])

@@ -1,0 +1,250 @@
+"""Signed distance to MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane and meshes as distance grids.
+
+A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: its edges become fillets of radius r, its faces stay.
+"""
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from .types import real, vec3
+
+__all__ = ["GEOM_TYPES", "DistanceGrid", "Grids", "bake_distance_grid", "distance", "pack_grids"]
+
+wp.set_module_options({"enable_backward": False})
+
+# MuJoCo's mjtGeom
+GEOM_TYPES = {"plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
+_FAR = wp.constant(wp.float64(1.0e3))
+
+
+@wp.struct
+class Grids:
+    """Distance grids of all meshes, one after another."""
+
+    value: wp.array(dtype=wp.float32)
+    first: wp.array(dtype=int)
+    shape: wp.array(dtype=wp.vec3i)
+    origin: wp.array(dtype=vec3)
+    spacing: wp.array(dtype=real)
+
+
+@dataclasses.dataclass(frozen=True)
+class DistanceGrid:
+    """Signed distance of a closed mesh on a regular grid.
+
+    Attributes:
+      value: (nx, ny, nz) float32, negative inside [m].
+      origin: (3,) position of value[0, 0, 0] [m].
+      spacing: of the grid, the same along the three axes [m].
+    """
+
+    value: np.ndarray
+    origin: np.ndarray
+    spacing: float
+
+
+@wp.kernel
+def _bake(mesh: wp.uint64, origin: wp.vec3, spacing: float, ny: int, nz: int, reach: float, value_out: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    p = origin + spacing * wp.vec3(float(i // (ny * nz)), float((i // nz) % ny), float(i % nz))
+    query = wp.mesh_query_point_sign_winding_number(mesh, p, reach)
+    q = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+    value_out[i] = query.sign * wp.length(p - q)
+
+
+def bake_distance_grid(vert: np.ndarray, face: np.ndarray, cells: int = 64, margin: float = 2e-3, spacing: float | None = None) -> DistanceGrid:
+    """Distance grid of a closed triangle mesh.
+
+    Args:
+      vert: (n, 3) [m].
+      face: (m, 3), outward orientation.
+      cells: grid cells along the longest side of the mesh.
+      margin: how far the grid reaches beyond the mesh [m].
+      spacing: of the grid [m], instead of `cells`.
+
+    Raises:
+      ValueError: the mesh is open (its inside is not defined) or empty.
+    """
+    vert, face = np.asarray(vert, float), np.asarray(face, np.int32)
+    if not len(vert) or not len(face):
+        raise ValueError("a mesh geom without faces has no distance field: give it a triangle mesh")
+    _, merged = np.unique(vert.round(9), axis=0, return_inverse=True)
+    welded = merged.reshape(-1)[face]
+    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    if {tuple(e) for e in edges} != {tuple(e[::-1]) for e in edges}:
+        raise ValueError("the mesh is open: its inside is not defined; close its holes")
+    low, high = vert.min(0), vert.max(0)
+    if spacing is None:
+        spacing = float((high - low).max() / cells)
+    # millimetres: single-precision queries drop triangles that are tiny in metres
+    scale = 1e3
+    mesh = wp.Mesh(wp.array(vert * scale, dtype=wp.vec3, device="cpu"), wp.array(face.ravel(), dtype=int, device="cpu"), support_winding_number=True)
+    shape = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
+    origin = low - margin
+    value = wp.zeros(int(shape.prod()), dtype=wp.float32, device="cpu")
+    reach = float(np.linalg.norm(high - low) + 4 * margin) * scale
+    wp.launch(_bake, dim=len(value), inputs=[mesh.id, wp.vec3(*(origin * scale)), spacing * scale, int(shape[1]), int(shape[2]), reach],
+              outputs=[value], device="cpu")  # fmt: skip
+    return DistanceGrid((value.numpy() / scale).reshape(shape), origin, spacing)
+
+
+def pack_grids(grids, device) -> Grids:
+    """The grids as one Warp struct; an empty list gives one grid of a single far value."""
+    grids = list(grids) or [DistanceGrid(np.full((2, 2, 2), 1e3, np.float32), np.zeros(3), 1.0)]
+    packed = Grids()
+    packed.value = wp.array(np.concatenate([g.value.ravel() for g in grids]).astype(np.float32), device=device)
+    packed.first = wp.array(np.cumsum([0] + [g.value.size for g in grids[:-1]]).astype(np.int32), device=device)
+    packed.shape = wp.array(np.array([g.value.shape for g in grids], np.int32), dtype=wp.vec3i, device=device)
+    packed.origin = wp.array(np.array([g.origin for g in grids]), dtype=vec3, device=device)
+    packed.spacing = wp.array(np.array([g.spacing for g in grids]), dtype=real, device=device)
+    return packed
+
+
+@wp.func
+def _grid_value(grids: Grids, k: int, p: vec3):
+    """Trilinear; far outside the grid a lower bound of the distance is not needed, only 'far'."""
+    s = (p - grids.origin[k]) / grids.spacing[k]
+    n = grids.shape[k]
+    if (
+        s[0] < real(0.0) or s[1] < real(0.0) or s[2] < real(0.0)
+        or s[0] > real(n[0] - 1) or s[1] > real(n[1] - 1) or s[2] > real(n[2] - 1)
+    ):  # fmt: skip
+        return _FAR
+    i = wp.min(int(s[0]), n[0] - 2)
+    j = wp.min(int(s[1]), n[1] - 2)
+    l = wp.min(int(s[2]), n[2] - 2)
+    a = s[0] - real(i)
+    b = s[1] - real(j)
+    c = s[2] - real(l)
+    base = grids.first[k] + (i * n[1] + j) * n[2] + l
+    row = n[2]
+    slab = n[1] * n[2]
+    one = real(1.0)
+    v00 = real(grids.value[base]) * (one - c) + real(grids.value[base + 1]) * c
+    v01 = real(grids.value[base + row]) * (one - c) + real(grids.value[base + row + 1]) * c
+    v10 = real(grids.value[base + slab]) * (one - c) + real(grids.value[base + slab + 1]) * c
+    v11 = real(grids.value[base + slab + row]) * (one - c) + real(grids.value[base + slab + row + 1]) * c
+    return (v00 * (one - b) + v01 * b) * (one - a) + (v10 * (one - b) + v11 * b) * a
+
+
+@wp.func
+def _grid_distance(grids: Grids, k: int, p: vec3):
+    d = _grid_value(grids, k, p)
+    if d >= _FAR:
+        return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
+    # differences over half a cell each way: unlike the trilinear gradient they are continuous from cell to cell
+    h = real(0.5) * grids.spacing[k]
+    ex = vec3(h, real(0.0), real(0.0))
+    ey = vec3(real(0.0), h, real(0.0))
+    ez = vec3(real(0.0), real(0.0), h)
+    n = vec3(
+        wp.min(_grid_value(grids, k, p + ex), real(1.0)) - wp.min(_grid_value(grids, k, p - ex), real(1.0)),
+        wp.min(_grid_value(grids, k, p + ey), real(1.0)) - wp.min(_grid_value(grids, k, p - ey), real(1.0)),
+        wp.min(_grid_value(grids, k, p + ez), real(1.0)) - wp.min(_grid_value(grids, k, p - ez), real(1.0)),
+    )
+    n = wp.normalize(n)
+    return wp.vec4d(n[0], n[1], n[2], d)
+
+
+@wp.func
+def _signs(p: vec3):
+    s = vec3(real(1.0), real(1.0), real(1.0))
+    for i in range(3):
+        if p[i] < real(0.0):
+            s[i] = real(-1.0)
+    return s
+
+
+@wp.func
+def _rounded_box(half: vec3, r: real, p: vec3):
+    q = wp.cw_mul(_signs(p), p) - (half - vec3(r, r, r))
+    n = vec3()
+    d = real(0.0)
+    if wp.max(q) > real(0.0):
+        out = wp.max(q, vec3())
+        d = wp.length(out)
+        n = out / d
+    else:
+        d = wp.max(q)
+        axis = int(wp.argmax(q))
+        n[axis] = real(1.0)
+    n = wp.cw_mul(_signs(p), n)
+    return wp.vec4d(n[0], n[1], n[2], d - r)
+
+
+@wp.func
+def _rounded_cylinder(radius: real, half: real, r: real, p: vec3):
+    rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+    e = vec3(real(1.0), real(0.0), real(0.0))
+    if rho > real(0.0):
+        e = vec3(p[0] / rho, p[1] / rho, real(0.0))
+    side = wp.sign(p[2])
+    a = rho - (radius - r)
+    b = wp.abs(p[2]) - (half - r)
+    n = vec3()
+    d = real(0.0)
+    if a > real(0.0) and b > real(0.0):
+        d = wp.sqrt(a * a + b * b)
+        n = (a * e + vec3(real(0.0), real(0.0), b * side)) / d
+    elif a > b:
+        d = a
+        n = e
+    else:
+        d = b
+        n = vec3(real(0.0), real(0.0), side)
+    return wp.vec4d(n[0], n[1], n[2], d - r)
+
+
+@wp.func
+def _ellipsoid(radii: vec3, p: vec3):
+    """Closest point p_i r_i^2 / (t + r_i^2), t the largest root of sum (r_i p_i / (t + r_i^2))^2 = 1 (Eberly): Newton from the left."""
+    q = wp.cw_mul(_signs(p), p) + vec3(real(1.0e-12), real(1.0e-12), real(1.0e-12))
+    r2 = wp.cw_mul(radii, radii)
+    t = wp.max(wp.cw_mul(radii, q) - r2)
+    for _ in range(50):
+        g = real(-1.0)
+        dg = real(0.0)
+        for i in range(3):
+            s = radii[i] * q[i] / (t + r2[i])
+            g += s * s
+            dg -= real(2.0) * s * s / (t + r2[i])
+        step = -g / dg
+        t += step
+        if wp.abs(step) < real(1.0e-14) * r2[0]:
+            break
+    c = vec3()
+    n = vec3()
+    for i in range(3):
+        c[i] = r2[i] * q[i] / (t + r2[i])
+        n[i] = c[i] / r2[i]
+    d = wp.length(q - c)
+    if t < real(0.0):
+        d = -d
+    n = wp.cw_mul(_signs(p), wp.normalize(n))
+    return wp.vec4d(n[0], n[1], n[2], d)
+
+
+@wp.func
+def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
+    """Outward unit normal (x, y, z) and signed distance (w) [m] of point p in the geom's frame."""
+    if kind == 0:
+        return wp.vec4d(real(0.0), real(0.0), real(1.0), p[2])
+    if kind == 2 or kind == 3:
+        q = p
+        if kind == 3:
+            q = vec3(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
+        r = wp.length(q)
+        n = vec3(real(0.0), real(0.0), real(1.0))
+        if r > real(0.0):
+            n = q / r
+        return wp.vec4d(n[0], n[1], n[2], r - size[0])
+    if kind == 4:
+        return _ellipsoid(size, p)
+    if kind == 5:
+        return _rounded_cylinder(size[0], size[1], rounding, p)
+    if kind == 6:
+        return _rounded_box(size, rounding, p)
+    return _grid_distance(grids, grid, p)

@@ -1,0 +1,226 @@
+"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate gradients."""
+
+import numpy as np
+import warp as wp
+
+from . import contact, elasticity, liquid
+from .data import SkinData, view
+from .geoms import GeomSet
+from .model import SkinModel
+from .preconditioner import Preconditioner
+from .types import vec3
+
+__all__ = ["step"]
+
+
+def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None) -> None:
+    """Advances every world to the balance of forces with the geoms where they are now.
+
+    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted in `data.nonconverged` and
+    flagged in `data.converged`.
+
+    Args:
+      model, data: the skin.
+      geoms: touching geoms, poses in the BioTac frame at the end of the step.
+      dt: time step [s]; needed by implicit dynamics.
+      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of the step, for the inertia of
+        implicit dynamics; None means that it does not move.
+
+    Raises:
+      ValueError: geoms of another number of worlds, or implicit dynamics without a positive dt.
+    """
+    if geoms.nworld != data.nworld:
+        raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
+    _Step(model, data, geoms, dt, core_pos, core_mat).run()
+
+
+class _Step:
+    def __init__(self, model, data, geoms, dt, core_pos, core_mat):
+        self.m, self.d, self.geoms = model, data, geoms
+        self.x = view(data.x)
+        self.start = _copy(self.x)
+        self.force = view(data.force)
+        self.mask = view(model.free_mask)[:, None, None]
+        self.gradient = view(data.gradient)
+        self.kappa = model.options.bulk_modulus / model.liquid_volume if model.has_liquid else 0.0
+        if not hasattr(data, "preconditioner"):
+            data.preconditioner = Preconditioner(model, data.stiffness_scale)
+        self.M = data.preconditioner
+        self.inertia = None
+        if model.options.dynamics == "implicit":
+            self._prepare_inertia(dt, core_pos, core_mat)
+
+    def _prepare_inertia(self, dt, core_pos, core_mat):
+        if dt is None or not dt > 0:
+            raise ValueError("implicit dynamics needs the time step: pass dt > 0")
+        d = self.d
+        pos = d.core_pos if core_pos is None else np.asarray(core_pos, float)
+        mat = d.core_mat if core_mat is None else np.asarray(core_mat, float)
+        was, velocity = d.x.numpy(), d.velocity.numpy()  # where free flight would take the nodes, seen from the moved frame
+        world = np.einsum("wij,nwj->nwi", d.core_mat, was) + d.core_pos
+        target = np.einsum("wji,nwj->nwi", mat, world + dt * velocity - pos)
+        coefficient = self.m.material.density * self.m.node_volume.numpy()[:, None, None] / dt**2
+        self.pose, self.world, self.dt = (pos, mat), world, dt
+        like = self.x if isinstance(self.x, np.ndarray) else None
+        self.target = target if like is not None else self.x.new_tensor(target)
+        self.inertia = coefficient if like is not None else self.x.new_tensor(coefficient)
+
+    def run(self):
+        d, options = self.d, self.m.options
+        active = np.ones(d.nworld, bool)
+        d.iterations[:] = 0
+        for iteration in range(options.max_newton + 1):
+            self._evaluate()
+            residual = self.force * self.mask
+            finite = np.isfinite(_host(residual.sum((0, 2))))
+            self.M.update(self._tangents(), self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
+            z = self.M.apply(residual)
+            error = _host((residual * z).sum((0, 2)))
+            load = view(d.outer.node_force) + (view(d.inner.node_force) if d.inner else 0)
+            work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
+            d.error = np.sqrt(np.maximum(error, 0) / work)
+            active = finite & ~(error <= options.tolerance**2 * work)
+            if not active.any() or iteration == options.max_newton:
+                break
+            d.iterations += active
+            self.x += self._conjugate_gradients(residual, z, active)
+        self._finish(finite & ~active)
+
+    def _evaluate(self):
+        """Forces at x: elastic, contact, core, liquid, inertia."""
+        m, d = self.m, self.d
+        n, w = m.nvert, d.nworld
+        launch = _launcher(m.device)
+        launch(elasticity.elastic_force, (m.nelem, w), [m.law, d.mu, d.lam, m.elem, m.inverse_edges, m.volume, d.x], [d.rotation, d.corner, d.jacobian])
+        launch(elasticity.gather, (n, w), [m.start, m.slot, d.corner, 1.0, 0], [d.force])
+        self._contact(d.outer, self.geoms)
+        if m.has_core:
+            self._contact(d.inner, m.core(w))
+        if m.inner is not None:
+            launch(liquid.cavity_volume, d.face_volume.shape, [m.inner.face, d.x], [d.face_volume])
+            d.volume = m.liquid_volume + _host(view(d.face_volume).sum(0)) - m.rest_volume
+        if m.has_liquid:
+            launch(liquid.volume_gradient, d.face_volume.shape, [m.inner.face, d.x], [d.inner.corner])
+            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.inner.corner, 1.0, 0], [d.gradient])
+            d.pressure = -self.kappa * (d.volume - m.liquid_volume)
+            self.force += _like(self.x, d.pressure)[:, None] * self.gradient
+        if self.inertia is not None:
+            self.force -= self.inertia * (self.x - self.target) + m.options.mass_damping * self.dt * self.inertia * (self.x - self.start)
+            if m.options.stiffness_damping:
+                self.force -= m.options.stiffness_damping / self.dt * self._elastic_product(self.x - self.start)
+
+    def _contact(self, state, geoms):
+        m, d = self.m, self.d
+        surface, launch = state.surface, _launcher(m.device)
+        launch(
+            contact.contact_force, state.touching.shape,
+            [surface.face, surface.area, m.sample, surface.offset, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, state.anchor_geom, state.anchor],
+            [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
+        )  # fmt: skip
+        launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
+        self.force += view(state.node_force)
+
+    def _tangents(self):
+        states = [self.d.outer] + ([self.d.inner] if self.m.has_core else [])
+        return [(s.surface.face_np, s.touching.numpy(), view(s.block)) for s in states]
+
+    def _elastic_product(self, p):
+        m, d = self.m, self.d
+        view(d.direction)[...] = p
+        launch = _launcher(m.device)
+        launch(
+            elasticity.hessian_product, (m.nelem, d.nworld),
+            [m.law, d.mu, d.lam, m.elem, m.inverse_edges, m.volume, d.x, d.rotation, d.direction], [d.corner],
+        )  # fmt: skip
+        launch(elasticity.gather, (m.nvert, d.nworld), [m.start, m.slot, d.corner, 1.0, 0], [d.product])
+        return view(d.product)
+
+    def _product(self, p):
+        """Tangent of all forces times p."""
+        m, d = self.m, self.d
+        q = self._elastic_product(p)
+        if self.inertia is not None:
+            q *= 1 + m.options.stiffness_damping / self.dt
+            q += (1 + m.options.mass_damping * self.dt) * self.inertia * p
+        launch = _launcher(m.device)
+        for s in [d.outer] + ([d.inner] if m.has_core else []):
+            launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
+            launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
+        if m.has_liquid:
+            q += self.kappa * (self.gradient * p).sum((0, 2))[:, None] * self.gradient
+        return q * self.mask
+
+    def _conjugate_gradients(self, residual, z, active):
+        """Solves tangent dx = residual until the preconditioned residual has fallen by ten; worlds that are not active get zero."""
+        r, p = residual, _copy(z)
+        dx = 0 * z
+        rz = (r * z).sum((0, 2))
+        first = rz
+        running = _like(self.x, active.astype(float))
+        for _ in range(self.m.options.max_cg):
+            q = self._product(p)
+            curvature = (p * q).sum((0, 2))
+            # negative curvature: the tangent is not positive definite there; what has been found so far is a descent direction
+            running = running * (curvature > 0)
+            if not running.any():
+                break
+            alpha = running * rz / (curvature + (running == 0))
+            dx += alpha[:, None] * p
+            r = r - alpha[:, None] * q
+            z = self.M.apply(r)
+            rz_next = (r * z).sum((0, 2))
+            running = running * (rz_next > 1e-2 * first)
+            if not running.any():
+                break
+            p = z + (rz_next / (rz + (rz == 0)))[:, None] * p
+            rz = rz_next
+        else:
+            pass
+        untouched = _host((dx * dx).sum((0, 2))) == 0
+        if (untouched & active).any():  # negative curvature at once: the preconditioner's step
+            chosen = _like(self.x, (untouched & active).astype(float))
+            dx += chosen[:, None] * p
+        return dx
+
+    def _finish(self, good):
+        d = self.d
+        d.converged = good
+        d.nonconverged += ~good
+        if not good.all():
+            for w in np.flatnonzero(~good):
+                self.x[:, w] = self.start[:, w]
+            self._evaluate()
+        groups = self.geoms.ngroup
+        wrench = wp.zeros((groups, d.nworld, 6), dtype=wp.float64, device=self.m.device)
+        if groups:
+            o = d.outer
+            _launcher(self.m.device)(
+                contact.contact_wrench, (groups, d.nworld),
+                [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force], [wrench],
+            )  # fmt: skip
+        d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
+        d.outer.commit()
+        if self.inertia is not None:
+            pos, mat = self.pose
+            world = np.einsum("wij,nwj->nwi", mat, d.x.numpy()) + pos
+            wp.copy(d.velocity, wp.array((world - self.world) / self.dt, dtype=vec3, ndim=2, device=self.m.device))
+            d.core_pos, d.core_mat = pos.copy(), mat.copy()
+
+
+def _launcher(device):
+    def launch(kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
+
+    return launch
+
+
+def _copy(array):
+    return array.copy() if isinstance(array, np.ndarray) else array.clone()
+
+
+def _host(array):
+    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+
+
+def _like(array, host):
+    return host if isinstance(array, np.ndarray) else array.new_tensor(host)
