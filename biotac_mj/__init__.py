@@ -20,6 +20,8 @@ except (AttributeError, ImportError, OSError, RuntimeError) as error:
     os.environ["MUJOCO_GL"] = "disable"
     import mujoco as _mujoco  # noqa: F401
 
+from . import plugin  # registers the engine plugin  # noqa: E402
+
 __version__ = "0.1.0"
 
 _HOME = {
@@ -32,7 +34,7 @@ _HOME = {
     "attach": "coupling",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", "plugin", *_HOME]
 
 
 def __getattr__(name):
