@@ -1,0 +1,72 @@
+"""The settings of one BioTac, as they travel in a model: strings in the plugin instance's configuration."""
+
+import dataclasses
+import json
+
+__all__ = ["COUPLINGS", "Config"]
+
+COUPLINGS = ("two-way", "one-way")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of one BioTac.
+
+    Attributes:
+      skin: name or file of the `SkinGeometry`.
+      stepper: what solves the skin: a name known to `biotac_mj.coupling.stepper`.
+      readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
+      material: name of the skin's material or a dict of its parameters; None is the default one.
+      liquid: whether the space between skin and core is filled.
+      coupling: "two-way" (the touching bodies and the BioTac feel the skin) or "one-way" (readings only).
+      geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own links.
+      rounding: geom name -> radius of its rounded edges [m].
+      friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with the geom's. Default: the paper's 0.783.
+      priority: contact priority of the skin.
+      seed: of the sensor's noise.
+      device: Warp device of the skin.
+      options: further settings of the stepper and the readings.
+    """
+
+    skin: str = "default"
+    stepper: str = "fem"
+    readings: str = "biotac"
+    material: str | dict | None = None
+    liquid: bool = True
+    coupling: str = "two-way"
+    geoms: tuple | None = None
+    rounding: dict = dataclasses.field(default_factory=dict)
+    friction: float = 0.783414394
+    priority: int = 0
+    seed: int = 0
+    device: str = "cpu"
+    options: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.coupling not in COUPLINGS:
+            raise ValueError(f"unknown coupling {self.coupling!r}: choose one of {', '.join(COUPLINGS)}")
+        if not self.friction >= 0:
+            raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
+        if self.geoms is not None:
+            object.__setattr__(self, "geoms", tuple(self.geoms))
+
+    def strings(self) -> dict:
+        """Attribute name -> JSON text; `parse` reads it back."""
+        return {f.name: json.dumps(getattr(self, f.name)) for f in dataclasses.fields(self)}
+
+    @classmethod
+    def parse(cls, read) -> "Config":
+        """Settings from read(attribute) -> text, "" where the model gives none.
+
+        Raises:
+          ValueError: a text is not JSON, or a value is not allowed.
+        """
+        values = {}
+        for field in dataclasses.fields(cls):
+            text = read(field.name)
+            if text:
+                try:
+                    values[field.name] = json.loads(text)
+                except json.JSONDecodeError as error:
+                    raise ValueError(f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, as in '\"default\"'") from error
+        return cls(**values)

@@ -1,0 +1,222 @@
+"""One BioTac in one mjData: poses in, skin solved, wrenches and readings out.
+
+What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from it, so that mj_getState, mj_copyData,
+mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
+"""
+
+import ctypes
+import functools
+import threading
+
+import mujoco
+import numpy as np
+
+from . import skins
+from .config import Config
+from .metric import Metric
+from .stepper import make_readings, make_stepper
+from .touching import Touching
+
+__all__ = ["Instance", "Setup", "reset_state", "state_size"]
+
+# head of the plugin state: steps that did not converge, then how the last committed step went
+_HEAD = 4
+_FAILED, _CONVERGED, _ITERATIONS, _RESIDUAL = range(_HEAD)
+STATUS = ("converged", "failed_steps", "iterations", "residual")
+
+
+class _Skin:
+    """A stepper and readings with the lock that lets one thread at a time use them (their constants are shared, their scratch memory too)."""
+
+    def __init__(self, config, geoms):
+        self.geometry = skins.load(config.skin)
+        self.stepper = make_stepper(config, self.geometry, geoms)
+        self.readings = make_readings(config, self.geometry)
+        self.lock = threading.Lock()
+
+
+class _SkinKey:
+    def __init__(self, config, touching):
+        self.config, self.geoms = config, touching.geoms
+        self.key = (tuple(config.strings().items()), touching.key())
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return self.key == other.key
+
+
+@functools.lru_cache(maxsize=8)
+def _cached_skin(key):
+    return _Skin(key.config, key.geoms)
+
+
+_cache_lock = threading.RLock()
+
+
+def _skin(config, touching):
+    with _cache_lock:  # lru_cache alone would let two threads build the same skin
+        return _cached_skin(_SkinKey(config, touching))
+
+
+class Setup:
+    """What a plugin instance's model says: settings, bodies, geoms, sensors. The same for every mjData of the model.
+
+    Raises:
+      ValueError: no body refers to the instance, or its settings do not fit the model.
+    """
+
+    def __init__(self, model, index):
+        self.model, self.index = model, index
+        cores = np.flatnonzero(model.body_plugin == index)
+        if len(cores) != 1:
+            raise ValueError(f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with biotac_mj.attach")
+        self.core = int(cores[0])
+        self.config = Config.parse(lambda attribute: model.config(index, attribute))
+        self.touching = Touching(model, self.core, self.config)
+        self.skin = _skin(self.config, self.touching)
+        self.ngroup = len(self.touching.body)
+
+    @property
+    def nstate(self):
+        return _HEAD + 6 * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
+
+    def parts(self, state):
+        """Head, last wrenches (ngroup, 6), the skin's and the readings' parts of a plugin state, as views."""
+        a = _HEAD + 6 * self.ngroup
+        b = a + self.skin.stepper.nstate
+        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, 6), state[a:b], state[b:]
+
+    def reset(self, state):
+        head, wrench, skin, readings = self.parts(state)
+        head[:], wrench[:] = 0.0, 0.0
+        head[_CONVERGED] = 1.0
+        with self.skin.lock:
+            self.skin.stepper.reset(skin)
+            self.skin.readings.reset(readings)
+
+    def named(self, kind):
+        """{name inside the BioTac: id} of the model's objects of a kind, whatever prefixes and suffixes later attachments added."""
+        before, _, after = self.model.name("body", self.core).rpartition("core")
+        count = getattr(self.model, {"sensor": "nsensor", "site": "nsite", "skin": "nskin", "eq": "neq"}[kind])
+        names = (self.model.name(kind, i) for i in range(count))
+        return {n[len(before) : len(n) - len(after)]: i for i, n in enumerate(names) if n.startswith(before) and n.endswith(after)}
+
+
+def state_size(model, index):
+    """Doubles of plugin state that instance `index` needs."""
+    return Setup(model, index).nstate
+
+
+def reset_state(model, address, index):
+    """Writes the rest state at an address, as mj_resetData asks."""
+    setup = Setup(model, index)
+    buffer = (ctypes.c_double * setup.nstate).from_address(address)
+    setup.reset(np.frombuffer(buffer, np.float64))
+
+
+class Instance:
+    """The BioTac `index` of a model in one mjData."""
+
+    def __init__(self, model, data, index):
+        self.setup = setup = Setup(model, index)
+        self.model, self.data = model, data
+        sensors = setup.named("sensor")
+        self.sensor = {
+            name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
+            for name, i in sensors.items()
+            if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
+        }
+        self.two_way = setup.config.coupling == "two-way"
+        if self.two_way:
+            slots = sorted((int(n[6:]), i) for n, i in setup.named("eq").items() if n.startswith("couple") and n[6:].isdigit())
+            self.metric = Metric(model, setup.touching, [i for _, i in slots])
+        start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
+        if size != setup.nstate:
+            raise ValueError(f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec")
+        self._state = slice(start, start + size)
+        self._key = self._result = self._reading = None
+        self._error = False
+        self._shown = None
+
+    @property
+    def state(self):
+        """(nstate,) view of the plugin state."""
+        return self.data.plugin_state[self._state]
+
+    def _horizon(self):
+        # Runge-Kutta evaluates forces at the poses it sets itself: the skin is then explicit
+        return 0.0 if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else self.model.opt.timestep
+
+    def passive(self):
+        """Solves the skin for the end of this step and, two-way, gives MuJoCo its wrenches and stiffness."""
+        self._error = False
+        horizon = self._horizon()
+        if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
+            raise ValueError("the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or Euler, or coupling='one-way'")
+        pos, mat = self.setup.touching.predict(self.data, horizon)
+        dt = self.model.opt.timestep
+        key = (pos.tobytes(), mat.tobytes(), dt, self.state.tobytes())
+        if key != self._key:  # solving is a function of the key, so a second mj_forward costs nothing
+            skin = self.setup.skin
+            with skin.lock:
+                result = skin.stepper.solve(self.setup.parts(self.state)[2], pos, mat, dt)
+            if not result.converged:  # go on with what was last known to be good
+                result.state = self.setup.parts(self.state)[2].copy()
+                result.wrench = self.setup.parts(self.state)[1].copy()
+                result.tangent = np.zeros((self.setup.ngroup, 6, 6))
+            self._key, self._result, self._reading = key, result, None
+        if self.two_way:
+            self.metric.apply(self.data, self._result.wrench, self._result.tangent, horizon)
+
+    def _counts(self):
+        if self._reading is None:
+            skin, result = self.setup.skin, self._result
+            state = self.setup.parts(self.state)[3].copy()
+            with skin.lock:
+                counts = skin.readings.advance(state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure)
+            self._reading = state, counts
+        return self._reading
+
+    def sense(self):
+        """Writes the readings into sensordata."""
+        out, result = self.data.sensordata, self._result
+        if self._error or result is None:
+            return self._flag()
+        for name, counts in self._counts()[1].items():
+            if name in self.sensor:
+                out[self.sensor[name]] = counts
+        if "contact_force" in self.sensor:
+            out[self.sensor["contact_force"]] = -result.wrench.sum(axis=0)
+        if "status" in self.sensor:
+            failed = self.state[_FAILED] + (not result.converged)
+            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual)
+
+    def failed(self):
+        """After an exception: the step's skin is unknown; the status sensor says -1."""
+        self._error, self._key, self._result, self._reading = True, None, None, None
+        self._flag()
+
+    def _flag(self):
+        if "status" in self.sensor:
+            self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan)
+
+    def advance(self):
+        """Commits the solved step."""
+        result = self._result
+        if self._error or result is None:
+            return
+        readings, _ = self._counts()
+        head, wrench, skin, readings_state = self.setup.parts(self.state)
+        head[:] = head[_FAILED] + (not result.converged), result.converged, result.iterations, result.residual
+        wrench[:], skin[:], readings_state[:] = result.wrench, result.state, readings
+        self._key = None
+
+    def visualize(self):
+        """Shows the deformed outer surface and colours the electrodes; MuJoCo calls it while it updates a scene."""
+        from .show import Shown
+
+        if self._shown is None:
+            self._shown = Shown(self)
+        self._shown.update()

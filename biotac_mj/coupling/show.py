@@ -1,0 +1,41 @@
+"""What a renderer sees: the deformed outer surface as a MuJoCo skin, the electrodes coloured by their change from rest."""
+
+import numpy as np
+
+__all__ = ["Shown", "electrode_colors"]
+
+_FULL_SCALE = 300.0  # change of an electrode at full colour [counts]
+_NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]), np.array([0.1, 0.3, 0.85])
+
+
+def electrode_colors(change):
+    """(n, 4) RGBA of (n,) changes in counts: red where the film gets thinner (counts fall), blue where it bulges, grey at rest."""
+    amount = np.clip(np.abs(change) / _FULL_SCALE, 0.0, 1.0)[:, None]
+    end = np.where(np.asarray(change)[:, None] < 0, _LESS, _MORE)
+    return np.concatenate([_NEUTRAL + amount * (end - _NEUTRAL), np.ones_like(amount)], axis=1)
+
+
+class Shown:
+    """The visible parts of one `Instance`."""
+
+    def __init__(self, instance):
+        self.instance = instance
+        setup, model = instance.setup, instance.model
+        self.node = np.unique(setup.skin.geometry.outer_face)
+        skins, sites = setup.named("skin"), setup.named("site")
+        self.vert = None
+        if "skin" in skins and model.skin_vertnum[skins["skin"]] == len(self.node):
+            start = int(model.skin_vertadr[skins["skin"]])
+            self.vert = slice(start, start + len(self.node))
+        self.site = np.array([sites[f"e{i}"] for i in range(1, 20) if f"e{i}" in sites], dtype=np.int64)
+        self.rest = setup.skin.readings.rest.get("electrodes")
+
+    def update(self):
+        instance = self.instance
+        skin, state = instance.setup.skin, instance.setup.parts(instance.state)[2]
+        if self.vert is not None:
+            with skin.lock:
+                instance.model.skin_vert[self.vert] = skin.stepper.vert_xpos(state)[self.node]
+        if self.rest is not None and len(self.site) == 19 and "electrodes" in instance.sensor:
+            counts = instance.data.sensordata[instance.sensor["electrodes"]]
+            instance.model.site_rgba[self.site] = electrode_colors(counts - self.rest if counts.any() else np.zeros(19))

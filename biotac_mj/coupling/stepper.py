@@ -1,0 +1,142 @@
+"""The two doors of the coupling: a skin that takes poses and gives wrenches, and readings that take the deformed skin and give counts."""
+
+import dataclasses
+import importlib
+from typing import Protocol
+
+import numpy as np
+
+__all__ = ["Geom", "Readings", "SkinResult", "SkinStepper", "make_readings", "make_stepper", "register_readings", "register_stepper"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Geom:
+    """A shape that can touch the skin.
+
+    Attributes:
+      name: its name in the model ("" where it has none).
+      type: "plane", "sphere", "capsule", "ellipsoid", "cylinder", "box" or "mesh".
+      size: (3,) MuJoCo's sizes [m].
+      friction: sliding friction coefficient between it and the skin, combined by MuJoCo's rule.
+      group: index of the touching body it belongs to, 0..ngroup-1.
+      rounding: radius of its rounded edges [m].
+      vert, face: (n, 3) [m], (m, 3) of a mesh in the geom's frame; None for the others.
+    """
+
+    name: str
+    type: str
+    size: np.ndarray
+    friction: float
+    group: int
+    rounding: float = 0.0
+    vert: np.ndarray | None = None
+    face: np.ndarray | None = None
+
+
+@dataclasses.dataclass
+class SkinResult:
+    """A skin solved for the poses at the end of a step, in the BioTac frame.
+
+    Attributes:
+      state: (nstate,) the new state, committed by the caller.
+      wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin [N, N m].
+      tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric positive semi-definite.
+      vert_xpos: (nvert, 3) deformed nodes [m].
+      pressure: of the liquid [Pa].
+      converged, iterations, residual: how the solve went.
+    """
+
+    state: np.ndarray
+    wrench: np.ndarray
+    tangent: np.ndarray
+    vert_xpos: np.ndarray
+    pressure: float = 0.0
+    converged: bool = True
+    iterations: int = 0
+    residual: float = 0.0
+
+
+class SkinStepper(Protocol):
+    """A skin. Making one must be cheap (MuJoCo asks for `nstate` while it compiles); heavy work belongs into the first `reset`."""
+
+    nstate: int
+
+    def reset(self, state: np.ndarray) -> None:
+        """Writes the rest state into state (nstate,)."""
+
+    def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
+        """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step. A function of its arguments alone; keeps `state` as it is."""
+
+    def vert_xpos(self, state: np.ndarray) -> np.ndarray:
+        """(nvert, 3) nodes [m] of a state, for showing."""
+
+
+class Readings(Protocol):
+    """Counts of the sensor's channels."""
+
+    nstate: int
+    rest: dict  # channel -> counts at rest; {} where unknown
+
+    def reset(self, state: np.ndarray) -> None:
+        """Writes the state at time zero into state (nstate,)."""
+
+    def advance(self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float) -> dict:
+        """Advances state in place over [time, time + dt] and returns channel -> counts."""
+
+
+class _NoReadings:
+    """Leaves the channels at zero."""
+
+    nstate = 0
+    rest = {}
+
+    def __init__(self, config, geometry):
+        pass
+
+    def reset(self, state):
+        pass
+
+    def advance(self, state, time, dt, vert_xpos, pressure):
+        return {}
+
+
+# A name, or where to find the factory the first time the name is used.
+_steppers = {"fem": "biotac_mj.coupling.fem:FemStepper"}
+_readings = {"biotac": "biotac_mj.coupling.readings:SensorReadings", "none": _NoReadings}
+
+
+def register_stepper(name, factory):
+    """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)` takes."""
+    _steppers[name] = factory
+
+
+def register_readings(name, factory):
+    """Makes factory(config, geometry) -> Readings known under a name that `attach(readings=...)` takes."""
+    _readings[name] = factory
+
+
+def _factory(table, name, what):
+    if name not in table:
+        raise ValueError(f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper")
+    if isinstance(table[name], str):
+        module, attribute = table[name].split(":")
+        return getattr(importlib.import_module(module), attribute)
+    return table[name]
+
+
+def make_stepper(config, geometry, geoms) -> SkinStepper:
+    """The skin that `config.stepper` names.
+
+    Raises:
+      ValueError: the name is unknown.
+    """
+    return _factory(_steppers, config.stepper, "stepper")(config, geometry, geoms)
+
+
+def make_readings(config, geometry) -> Readings:
+    """The readings that `config.readings` names.
+
+    Raises:
+      ValueError: the name is unknown.
+    """
+    return _factory(_readings, config.readings, "readings")(config, geometry)

@@ -1,0 +1,153 @@
+"""Which geoms of a model can touch a BioTac, and where they will be at the end of the step."""
+
+import mujoco
+import numpy as np
+
+from .stepper import Geom
+
+__all__ = ["Touching", "rotation"]
+
+_TYPES = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+}
+
+
+class Touching:
+    """The geoms that can touch the BioTac fixed to body `core`, grouped by body.
+
+    Attributes:
+      core: id of the BioTac's body.
+      geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
+      body: (ngroup,) ids of the touching bodies.
+
+    Raises:
+      ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the skin cannot touch.
+    """
+
+    def __init__(self, model, core, config):
+        self.core = core
+        ids = _select(model, core, config.geoms)
+        bodies = model.geom_bodyid[ids]
+        self.geom = ids
+        self.body, group = np.unique(bodies, return_inverse=True)
+        rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
+        self.geoms = [_describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)]
+        # rows of the stacked bodies (core first) whose motion is predicted
+        self._owner = np.concatenate([[core], bodies]).astype(np.int64)
+        self._root = model.body_rootid[self._owner]
+
+    def key(self) -> bytes:
+        """Bytes that differ whenever the skin would see other geoms."""
+        parts = []
+        for g in self.geoms:
+            parts.append(repr((g.type, g.size.tolist(), g.friction, g.group, g.rounding)).encode())
+            if g.vert is not None:
+                parts.append(g.vert.tobytes() + g.face.tobytes())
+        return b"|".join(parts)
+
+    def predict(self, data, horizon):
+        """Poses in the BioTac frame when every body goes on at its present velocity for `horizon` [s].
+
+        Returns:
+          (ngeom, 3) positions [m], (ngeom, 3, 3) rotations.
+
+        Raises:
+          ValueError: a pose is not finite.
+        """
+        n = len(self._owner)
+        pos, mat = np.empty((n, 3)), np.empty((n, 3, 3))
+        pos[0], mat[0] = data.xpos[self.core], data.xmat[self.core].reshape(3, 3)
+        pos[1:], mat[1:] = data.geom_xpos[self.geom], data.geom_xmat[self.geom].reshape(-1, 3, 3)
+        if horizon:
+            velocity = data.cvel[self._owner]  # rotation, then translation of the point at the tree's centre of mass
+            spin = velocity[:, :3]
+            arm = pos - data.subtree_com[self._root]
+            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, arm))
+            mat = rotation(horizon * spin) @ mat
+        frame = mat[0]
+        relative_pos, relative_mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
+        if not (np.isfinite(relative_pos.sum()) and np.isfinite(relative_mat.sum())):
+            bad = [g.name or f"#{i}" for g, i, p, r in zip(self.geoms, self.geom, relative_pos, relative_mat) if not np.isfinite(p.sum() + r.sum())]
+            raise ValueError(f"NaN in the pose of the BioTac or of geom {', '.join(bad)}: check mocap_pos, qpos and qvel at time {data.time:g} s")
+        return relative_pos, relative_mat
+
+
+def _cross(a, b):
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+
+
+def rotation(vector):
+    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors (Rodrigues)."""
+    angle2 = np.einsum("ij,ij->i", vector, vector)
+    angle = np.sqrt(angle2)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5, (1 - np.cos(safe)) / (safe * safe))
+    k = np.zeros((len(vector), 3, 3))
+    k[:, 0, 1], k[:, 0, 2], k[:, 1, 2] = -vector[:, 2], vector[:, 1], -vector[:, 0]
+    k -= k.transpose(0, 2, 1)
+    return np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+
+
+def _select(model, core, names):
+    weld = model.body_weldid
+    own = weld[core]
+    if names is not None:
+        ids = [_resolve(model, name) for name in names]
+        for i in ids:
+            if weld[model.geom_bodyid[i]] == own and own:
+                raise ValueError(f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: leave it out of geoms")
+        return np.array(sorted(ids), dtype=np.int64)
+    parent = model.body_weldid[model.body_parentid]  # as in MuJoCo's filter: links joined by one joint do not collide
+    out = []
+    for i in range(model.ngeom):
+        body = model.geom_bodyid[i]
+        if not (model.geom_contype[i] or model.geom_conaffinity[i]) or weld[body] == own:
+            continue
+        if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own) or _excluded(model, body, core):
+            continue
+        out.append(i)
+    return np.array(out, dtype=np.int64)
+
+
+def _excluded(model, body, core):
+    a, b = sorted((int(body), int(core)))
+    return bool(np.any(model.exclude_signature == (a << 16) + b)) if model.nexclude else False
+
+
+def _resolve(model, name):
+    names = [model.name("geom", i) for i in range(model.ngeom)]
+    matches = [i for i, n in enumerate(names) if n == name] or [i for i, n in enumerate(names) if n.endswith(name)]  # after a further attach
+    if len(matches) != 1:
+        found = "none" if not matches else ", ".join(names[i] for i in matches)
+        raise ValueError(f"geom {name!r} of the BioTac's settings matches {found}: the model has {', '.join(n for n in names if n) or 'no named geom'}")
+    return matches[0]
+
+
+def _describe(model, index, group, rounding, config):
+    name, kind = model.name("geom", index), int(model.geom_type[index])
+    if kind not in _TYPES:
+        label = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+        raise ValueError(
+            f"geom {name or index!r} is of type {label}, which a BioTac cannot touch: it knows {', '.join(_TYPES.values())}; "
+            "name the geoms that may touch with attach(geoms=[...]) or clear its contype and conaffinity"
+        )
+    other, priority = float(model.geom_friction[index, 0]), int(model.geom_priority[index])
+    friction = max(other, config.friction) if priority == config.priority else (other if priority > config.priority else config.friction)
+    vert = face = None
+    if _TYPES[kind] == "mesh":
+        mesh = model.geom_dataid[index]
+        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        vert = np.array(model.mesh_vert[start : start + count], dtype=np.float64)
+        start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        face = np.array(model.mesh_face[start : start + count], dtype=np.int32)
+    return Geom(name, _TYPES[kind], np.array(model.geom_size[index]), friction, group, rounding, vert, face)

@@ -1,0 +1,7 @@
+"""The MuJoCo engine plugin that steps a BioTac's skin inside `mj_step`. Importing it registers it."""
+
+from .engine import ATTRIBUTES, PLUGIN_NAME, check, register
+
+__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "register"]
+
+register()

@@ -1,0 +1,215 @@
+"""The engine plugin "biotac_mj.skin": MuJoCo's plugin interface, served from Python through ctypes.
+
+MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter lock for each call. Nothing may be
+raised into C, so an exception is kept, reported once as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
+"""
+
+import ctypes
+import functools
+import importlib
+import threading
+import warnings
+
+import mujoco
+
+from . import structs
+
+__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
+
+PLUGIN_NAME = "biotac_mj.skin"
+
+# Everything that makes one BioTac, as strings in the model: a saved XML or MJB says it all. `biotac_mj.coupling.config` gives their meaning.
+ATTRIBUTES = (
+    "skin",
+    "stepper",
+    "readings",
+    "material",
+    "liquid",
+    "coupling",
+    "geoms",
+    "rounding",
+    "friction",
+    "priority",
+    "seed",
+    "device",
+    "options",
+)
+
+_INT, _PTR = ctypes.c_int, ctypes.c_void_p
+_PASSIVE = int(mujoco.mjtPluginCapabilityBit.mjPLUGIN_PASSIVE)
+_SENSOR = int(mujoco.mjtPluginCapabilityBit.mjPLUGIN_SENSOR)
+_CALLBACKS = {
+    "nstate": ctypes.CFUNCTYPE(_INT, _PTR, _INT),
+    "nsensordata": ctypes.CFUNCTYPE(_INT, _PTR, _INT, _INT),
+    "init": ctypes.CFUNCTYPE(_INT, _PTR, _PTR, _INT),
+    "destroy": ctypes.CFUNCTYPE(None, _PTR, _INT),
+    "copy": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _INT),
+    "reset": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _INT),
+    "compute": ctypes.CFUNCTYPE(None, _PTR, _PTR, _INT, _INT),
+    "advance": ctypes.CFUNCTYPE(None, _PTR, _PTR, _INT),
+    "visualize": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _PTR, _INT),
+}
+
+
+class _Plugin(ctypes.Structure):
+    """mjpPlugin of mjplugin.h."""
+
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("nattribute", _INT),
+        ("attributes", ctypes.POINTER(ctypes.c_char_p)),
+        ("capabilityflags", _INT),
+        ("needstage", _INT),
+        *_CALLBACKS.items(),
+        *((name, _PTR) for name in ("act_dot", "sdf_distance", "sdf_gradient", "sdf_staticdistance", "sdf_attribute", "sdf_aabb")),
+    ]
+
+
+_lock = threading.RLock()
+_instances = {}  # (mjData address, plugin instance) -> Instance; holds only what the state and the model determine
+_errors = []
+_alive = []  # what C points to
+
+
+def _coupling():
+    # Late, so that `import biotac_mj` loads neither Warp nor the geometry.
+    return importlib.import_module("biotac_mj.coupling.instance")
+
+
+def _keep(error):
+    with _lock:
+        _errors.append(error)
+    try:
+        warnings.warn(f"BioTac: {error} (biotac_mj.plugin.check() raises it)", RuntimeWarning, stacklevel=3)
+    except RuntimeWarning:  # the user turned warnings into errors: it is kept above
+        pass
+
+
+def _guarded(on_error):
+    def decorate(function):
+        @functools.wraps(function)
+        def call(*args):
+            try:
+                return function(*args)
+            except BaseException as error:  # noqa: BLE001 - C cannot take it
+                _keep(error)
+                return on_error
+
+        return call
+
+    return decorate
+
+
+def _instance(model, data, index):
+    key = (data, index)
+    instance = _instances.get(key)
+    if instance is None:  # a copy made by mj_copyData has no init
+        with _lock:
+            instance = _instances.get(key)
+            if instance is None:
+                view = structs.ModelView(model)
+                instance = _instances[key] = _coupling().Instance(view, structs.DataView(data, view), index)
+    return instance
+
+
+@_guarded(-1)
+def _nstate(model, index):
+    return _coupling().state_size(structs.ModelView(model), index)
+
+
+@_guarded(0)
+def _nsensordata(model, index, sensor):
+    return 0
+
+
+@_guarded(-1)
+def _init(model, data, index):
+    with _lock:
+        _instances.pop((data, index), None)
+        _instance(model, data, index)
+    return 0
+
+
+@_guarded(None)
+def _destroy(data, index):
+    with _lock:
+        _instances.pop((data, index), None)
+
+
+@_guarded(None)
+def _copy(destination, model, source, index):
+    with _lock:
+        _instances.pop((destination, index), None)
+
+
+@_guarded(None)
+def _reset(model, state, plugin_data, index):
+    _coupling().reset_state(structs.ModelView(model), state, index)
+
+
+def _compute(model, data, index, capability):
+    try:
+        instance = _instance(model, data, index)
+        if capability == _PASSIVE:
+            instance.passive()
+        elif capability == _SENSOR:
+            instance.sense()
+    except BaseException as error:  # noqa: BLE001
+        _keep(error)
+        instance = _instances.get((data, index))
+        if instance is not None:
+            instance.failed()
+
+
+@_guarded(None)
+def _advance(model, data, index):
+    _instance(model, data, index).advance()
+
+
+@_guarded(None)
+def _visualize(model, data, option, scene, index):
+    _instance(model, data, index).visualize()
+
+
+def register():
+    """Makes the plugin known to MuJoCo; a second call does nothing.
+
+    Raises:
+      RuntimeError: MuJoCo refuses the plugin, for example because another library took its name.
+    """
+    with _lock:
+        if _alive:
+            return
+        functions = dict(
+            nstate=_nstate, nsensordata=_nsensordata, init=_init, destroy=_destroy, copy=_copy, reset=_reset, compute=_compute,
+            advance=_advance, visualize=_visualize,
+        )
+        callbacks = {name: _CALLBACKS[name](function) for name, function in functions.items()}
+        names = (ctypes.c_char_p * len(ATTRIBUTES))(*(name.encode() for name in ATTRIBUTES))
+        plugin = _Plugin(
+            name=PLUGIN_NAME.encode(),
+            nattribute=len(ATTRIBUTES),
+            attributes=names,
+            capabilityflags=_PASSIVE | _SENSOR,
+            needstage=int(mujoco.mjtStage.mjSTAGE_VEL),
+            **callbacks,
+        )
+        slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))
+        if slot < 0:
+            raise RuntimeError(f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of biotac_mj loaded?")
+        _alive.extend((callbacks, names, plugin))
+
+
+def check():
+    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was none."""
+    with _lock:
+        errors = list(_errors)
+        _errors.clear()
+    if errors:
+        raise errors[0]
+
+
+def clear_errors():
+    """Forgets the kept errors."""
+    with _lock:
+        _errors.clear()
