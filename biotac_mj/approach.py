@@ -92,17 +92,17 @@ def _split(tri):
     return np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
 
-def first_touch(geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjData, direction, refinements: int = 7, keep: int = 48) -> float:
+def first_touch(geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjData, direction, resolution: float = 2e-5, keep: int = 48) -> float:
     """How far the geoms of a model travel along a direction until they first touch the resting skin.
 
     Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split again and again, so that the touch is found
-    inside faces too, to well below a micrometre on a smooth geom.
+    inside faces too.
 
     Args:
       geometry: the skin, in the world frame of the model.
       model, data: hold the indenter's geoms and nothing else, placed before the skin, `mj_forward` done.
       direction: of travel (3,).
-      refinements: how often the nearest faces are split.
+      resolution: the nearest faces are split down to this edge [m]; on a sphere of radius r the touch is found to resolution^2 / r.
       keep: how many of them are split each time.
 
     Returns:
@@ -123,10 +123,13 @@ def first_touch(geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjDa
     facing = np.einsum("ij,j->i", np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]), backward) > 0
     tri = _split(tri[facing])
     best = np.inf
-    for _ in range(refinements):
+    while True:
         nearest = np.minimum(gap(tri.mean(1)), gap(tri.reshape(-1, 3)).reshape(-1, 3).min(1))
         best = min(best, nearest.min())
-        tri = _split(tri[np.argsort(nearest)[:keep]])
+        tri = tri[np.argsort(nearest)[:keep]]
+        if np.linalg.norm(tri - np.roll(tri, 1, axis=1), axis=2).max() < resolution:
+            break
+        tri = _split(tri)
     if not np.isfinite(best):
         raise ValueError("the indenter passes the skin without touching it: change the location or the direction")
     return float(best)

@@ -1,0 +1,143 @@
+"""The `biotac` command: one verb per job. The work of a verb lives beside this file and is loaded when the verb is used."""
+
+import argparse
+import sys
+
+__all__ = ["main", "parser"]
+
+# Names that the help shows without loading what defines them (tests hold them together).
+INDENTERS = "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm cube_14mm ring_7mm".split()
+MATERIALS = ("default", "paper", "rubber")
+SKINS = ("coarse", "default", "fine")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    from . import __version__
+
+    top = argparse.ArgumentParser(prog="biotac", description="A SynTouch BioTac fingertip in MuJoCo.")
+    top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    _add_press(verbs)
+    _add_view(verbs)
+    _add_import_mesh(verbs)
+    return top
+
+
+def _verb(verbs, name, run, text):
+    verb = verbs.add_parser(name, help=text, description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    verb.set_defaults(run=run)
+    return verb
+
+
+def _add_skin(verb):
+    verb.add_argument("--skin", default="default", help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`")
+    verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
+    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)")
+    verb.add_argument("--seed", type=int, default=0, help="of the sensor's noise")
+    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+
+
+def _add_press(verbs):
+    verb = _verb(verbs, "press", _press, "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.")
+    verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME",
+                      help=f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's sphere, capsule, "
+                      "cylinder, ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres")  # fmt: skip
+    verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM",
+                      help="where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X Y Z, moved to the "
+                      "nearest point of the skin. BioTac frame: tip at -x, pad at -y, nail at +y")  # fmt: skip
+    verb.add_argument("--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of the press (default: inward normal of the skin there)")
+    verb.add_argument("--depth", type=float, default=2.4, metavar="MM", help="travel from first touch")
+    verb.add_argument("--slide", type=float, default=0.0, metavar="MM", help="travel along the skin after the press")
+    verb.add_argument("--slide-direction", type=float, nargs=3, default=[1.0, 0.0, 0.0], metavar=("X", "Y", "Z"), help="of the slide")
+    verb.add_argument("--speed", type=float, default=10.0, metavar="MM/S", help="of press and slide")
+    verb.add_argument("--hold", type=float, default=20.0, metavar="MS", help="rest at the end of press and slide")
+    verb.add_argument("--timestep", type=float, default=4.0, metavar="MS", help="of MuJoCo")
+    ways = verb.add_mutually_exclusive_group()
+    ways.add_argument("--one-way", dest="two_way", action="store_false", default=False, help="the indenter's path is prescribed (default)")
+    ways.add_argument("--two-way", dest="two_way", action="store_true", default=False, help="a servo with mass pushes the indenter and gives way")
+    verb.add_argument("--mu", type=float, default=None, help="friction between skin and indenter (default: the material's)")
+    _add_skin(verb)
+    verb.add_argument("--out", default="out/press", metavar="DIR", help="folder of the results")
+    verb.add_argument("--render", action=argparse.BooleanOptionalAction, default=True,
+                      help="MuJoCo's render in press.png; without it, or without a GL library, matplotlib draws the surfaces")  # fmt: skip
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _press(args):
+    import math
+    import pathlib
+
+    from . import press, press_report
+    from .press_record import write_readings, write_skin
+
+    location = [1e-3 * v for v in args.location]
+    if len(location) < 3:
+        location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
+    options = press.PressOptions(
+        indenter=args.indenter, location=tuple(location), direction=args.direction and tuple(args.direction), depth=1e-3 * args.depth,
+        slide=1e-3 * args.slide, slide_direction=tuple(args.slide_direction), material=args.material, liquid=args.liquid, skin=args.skin,
+        timestep=1e-3 * args.timestep, speed=1e-3 * args.speed, hold=1e-3 * args.hold, two_way=args.two_way, friction=args.mu, seed=args.seed,
+        device=args.device,
+    )  # fmt: skip
+    record, picture = press.press(options, render=press.render if args.render else None, progress=not args.quiet)
+    out = pathlib.Path(args.out)
+    files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
+    write_readings(record, files[0])
+    write_skin(record, files[1])
+    press_report.write_picture(record, files[2], picture)
+    if args.render and picture is None:
+        print("no GL library works here: press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)")
+    print(press_report.table(record, files))
+
+
+def _add_view(verbs):
+    verb = _verb(verbs, "view", _view, "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag with ctrl and right button.")
+    _add_skin(verb)
+    verb.add_argument("--render", metavar="FILE", help="write a picture of the ball lying on the pad instead of opening a window")
+    verb.add_argument("--seconds", type=float, default=0.3, help="how long to simulate before --render")
+
+
+def _view(args):
+    from . import view
+
+    view.view(skin=args.skin, material=args.material, liquid=args.liquid, seed=args.seed, device=args.device, render=args.render, seconds=args.seconds)
+
+
+def _add_import_mesh(verbs):
+    verb = _verb(verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin.")
+    verb.add_argument("path", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file")
+    verb.add_argument("--out", metavar="FILE.npz", help="where to store it (default: PATH's name with .npz, in the current folder)")
+
+
+def _import_mesh(args):
+    import pathlib
+
+    from . import mesh_table
+    from .geometry import import_mesh
+
+    geometry = import_mesh(args.path)
+    out = pathlib.Path(args.out or pathlib.Path(args.path).resolve().stem + ".npz")
+    if out.suffix != ".npz":
+        raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
+    geometry.save(out)
+    print(mesh_table.table(geometry))
+    print(f"  stored in {out}: use it with --skin {out}")
+
+
+def main(argv=None) -> int:
+    """Runs a verb; bad input is one line on stderr and exit code 2."""
+    args = parser().parse_args(argv)
+    try:
+        args.run(args)
+    except (ValueError, FileNotFoundError) as error:
+        print(f"biotac: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("biotac: stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

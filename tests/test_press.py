@@ -1,0 +1,275 @@
+"""Press: the path against closed forms, the run with a skin of springs whose answer is known, the files read back."""
+
+import csv
+import json
+
+import h5py
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from matplotlib.image import imread
+
+from biotac_mj import approach, offscreen, press_indenter, press_record, press_report
+from biotac_mj import press as pressing
+from biotac_mj.coupling import SkinResult, register_stepper, stepper
+from biotac_mj.press import PressOptions
+from biotac_mj.sensor.channels import CHANNELS
+
+STIFFNESS = 40.0  # of a node's spring [N/m]
+
+
+class NodeSprings:
+    """Every outer node gives way to a sphere along its normal, held by a spring: forces are known by hand."""
+
+    def __init__(self, config, geometry, geoms):
+        self.geometry, self.geoms, self.nstate = geometry, geoms, 3 * geometry.nvert
+        self.outer = np.unique(geometry.outer_face)
+
+    def reset(self, state):
+        state[:] = self.geometry.vert.ravel()
+
+    def vert_xpos(self, state):
+        return state.reshape(-1, 3)
+
+    def solve(self, state, geom_pos, geom_mat, dt):
+        x = self.geometry.vert.copy()
+        away = x[self.outer] - geom_pos[0]
+        distance = np.linalg.norm(away, axis=1)
+        depth = np.clip(self.geoms[0].size[0] - distance, 0, None)[:, None]
+        normal = away / distance[:, None]
+        x[self.outer] += depth * normal
+        force = -STIFFNESS * depth * normal
+        wrench = np.concatenate([force.sum(0), np.cross(x[self.outer], force).sum(0)])[None]
+        jacobian = np.concatenate([np.tile(np.eye(3), (len(self.outer), 1, 1)),
+                                   -np.array([[[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]] for p in x[self.outer]])], axis=2)  # fmt: skip
+        along = np.einsum("ni,nij->nj", normal, jacobian) * (depth > 0)
+        return SkinResult(x.ravel(), wrench, STIFFNESS * along.T[None] @ along, x)
+
+
+@pytest.fixture
+def springs(monkeypatch, shell, tmp_path):
+    """Options of a press on the shell with node springs and no readings."""
+    for table in (stepper._steppers, stepper._readings):
+        for name, value in table.items():
+            monkeypatch.setitem(table, name, value)
+    register_stepper("fem", NodeSprings)
+    monkeypatch.setitem(stepper._readings, "biotac", stepper._readings["none"])
+    path = shell.save(tmp_path / "shell.npz")
+    return dict(skin=str(path), location=(-8e-3, 0.0), depth=1e-3, hold=0.0)
+
+
+def hand_force(shell, record, radius=3.5e-3):
+    """(n, 3) force of the springs on the sphere at the recorded positions."""
+    outer = shell.vert[np.unique(shell.outer_face)]
+    away = outer[None] - (record.indenter_pos - [0, radius, 0])[:, None]
+    distance = np.linalg.norm(away, axis=-1, keepdims=True)
+    return -STIFFNESS * (np.clip(radius - distance, 0, None) * away / distance).sum(1)
+
+
+# --- the path
+
+
+def test_surface_point_and_first_touch_of_an_ellipsoid(shell):
+    # the shell's outer surface inscribes an ellipsoid with half-axes 13, 7, 7 mm about (-8, 0, 0) mm
+    point, normal = approach.surface_point(shell, -8e-3, 0.0)
+    assert np.allclose(point, [-8e-3, -7e-3, 0], atol=5e-5) and np.allclose(normal, [0, -1, 0], atol=0.02)
+    point, normal = approach.surface_point(shell, -8e-3, np.pi / 2)
+    assert np.allclose(point, [-8e-3, 0, 7e-3], atol=5e-5) and np.allclose(normal, [0, 0, 1], atol=0.02)
+    point, normal = approach.nearest_point(shell, [-30e-3, 0, 0])
+    assert np.allclose(point, [-21e-3, 0, 0], atol=1e-4) and np.allclose(normal, [-1, 0, 0], atol=0.05)
+
+
+def touching_box(size):
+    """A flat box skin: its front face lies at y = -size."""
+    from biotac_mj.geometry.skin_geometry import SkinGeometry
+
+    box = trimesh.creation.box(extents=[20 * size, 2 * size, 20 * size])
+    none, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
+    return SkinGeometry("box", box.vertices, np.zeros((0, 4)), box.faces, no_face, [], none, no_face, none, no_face, none, no_face, none, none)
+
+
+@pytest.mark.parametrize(
+    ("name", "tip"),
+    [("sphere_7mm", 0.0), ("cylinder_short_7mm", 0.0), ("cube_14mm", 0.0), ("ring_7mm", 0.0), ("geom:capsule:0.002,0.003", 5e-3),
+     ("geom:ellipsoid:0.002,0.003,0.004", 4e-3), ("geom:plane", 0.0)],
+)  # fmt: skip
+def test_path_starts_5_um_before_a_flat_skin(name, tip):
+    size = 5e-3
+    options = PressOptions(indenter=name, location=(1e-3, 0.0), depth=1e-3, speed=0.01, timestep=4e-3, hold=0.0)
+    path = pressing.plan_path(touching_box(size), press_indenter.make_indenter(name), options)
+    # the frame's origin is `tip` behind the front of the shape, which touches inside a face
+    assert path.position(0.0)[1] == pytest.approx(-size - tip, abs=0.3e-6)
+    assert path.depth[0] == -5e-6 and path.depth[-1] == 1e-3
+    assert np.allclose(np.diff(path.depth)[1:], 4e-5) and len(path.depth) == 26
+
+
+def test_slide_goes_across_the_press(shell):
+    options = PressOptions(location=(-8e-3, 0.3), depth=1e-3, slide=2e-3, hold=0.02)
+    path = pressing.plan_path(shell, press_indenter.make_indenter("sphere_7mm"), options)
+    assert abs(path.direction @ path.slide_direction) < 1e-12
+    assert path.slid[-1] == 2e-3 and (np.diff(path.slid) >= 0).all() and path.depth[-1] == 1e-3
+    assert (path.slid[path.depth < 1e-3] == 0).all()
+
+
+def test_quaternion_turns_y_to_the_direction():
+    for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
+        out = np.empty(3)
+        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), pressing._rotation_from_y(np.array(direction, float)))
+        assert np.allclose(out, direction)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (dict(location=(0.05, 0.0)), "no skin at x = 50 mm: it reaches from -21.0 to 5.0 mm"),
+        (dict(direction=(0.0, -1.0, 0.0)), "leaves the skin"),
+        (dict(slide=1e-3, slide_direction=(0.0, 1.0, 0.0), direction=(0.0, 1.0, 0.0)), "along the press"),
+        (dict(depth=0.0), "depth is 0.0: it must be a positive number"),
+        (dict(speed=float("nan")), "speed is nan"),
+        (dict(location=(float("nan"), 0.0)), "location .* NaN"),
+        (dict(location=(0.0,)), "1 numbers: give x and an angle, or x, y and z"),
+        (dict(direction=(0.0, 0.0, 0.0)), "is no direction"),
+        (dict(indenter="sphere_8mm"), "unknown indenter 'sphere_8mm': choose one of .*ring_7mm"),
+        (dict(indenter="geom:torus:1"), "unknown geom type 'torus'.* sphere, capsule"),
+        (dict(indenter="geom:capsule:0.003"), "a capsule needs 2 positive sizes in metres"),
+        (dict(indenter="geom:sphere:x"), "are not numbers"),
+        (dict(indenter="geom:box:0.1,-1,1"), "3 positive sizes"),
+    ],
+)
+def test_bad_input_names_cause_and_remedy(shell, change, text):
+    with pytest.raises(ValueError, match=text):
+        options = PressOptions(**{"location": (-8e-3, 0.0), **change})
+        pressing.plan_path(shell, press_indenter.make_indenter(options.indenter), options)
+
+
+def test_indenter_meshes_are_checked(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no indenter mesh at .*none.obj"):
+        press_indenter.make_indenter(f"mesh:{tmp_path / 'none.obj'}")
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=3e-3)
+    ball.export(tmp_path / "ball.obj")
+    assert press_indenter.make_indenter(f"mesh:{tmp_path / 'ball.obj'}").vert.shape == ball.vertices.shape
+    trimesh.Trimesh(ball.vertices, ball.faces[1:]).export(tmp_path / "open.obj")
+    with pytest.raises(ValueError, match="is open.*close its holes"):
+        press_indenter.make_indenter(f"mesh:{tmp_path / 'open.obj'}")
+    trimesh.creation.icosphere(radius=3.0).export(tmp_path / "big.obj")
+    with pytest.raises(ValueError, match="must be in metres"):
+        press_indenter.make_indenter(f"mesh:{tmp_path / 'big.obj'}")
+
+
+# --- the run
+
+
+def test_one_way_press_feels_the_springs(springs, shell):
+    record, picture = pressing.press(PressOptions(**springs), progress=False)
+    assert picture is None and record.depth[-1] == pytest.approx(1e-3)
+    expected = hand_force(shell, record)
+    assert np.linalg.norm(record.force[0]) == 0 and np.linalg.norm(expected[-1]) > 0.1
+    assert np.allclose(record.force, expected, atol=1e-9)
+    # the recorded nodes touch the sphere and do not enter it
+    gap = np.linalg.norm(record.vert_xpos[-1] - (record.indenter_pos[-1] - [0, 3.5e-3, 0]), axis=1) - 3.5e-3
+    assert gap.min() == pytest.approx(0, abs=1e-8)
+    assert np.allclose(np.diff(record.time), 4e-3) and (record.nonconverged == 0).all()
+
+
+def test_two_way_press_gives_way_to_the_force(springs, shell):
+    record, _ = pressing.press(PressOptions(**{**springs, "hold": 0.2}, two_way=True), progress=False)
+    # at rest the servo (50 kN/m) carries the springs' force
+    lag = 1e-3 - record.depth[-1]
+    assert lag == pytest.approx(np.linalg.norm(record.force[-1]) / 5e4, rel=0.02)
+    assert np.allclose(record.force[-1], hand_force(shell, record)[-1], rtol=1e-3, atol=1e-6)
+
+
+def test_two_way_plane_is_refused(springs):
+    with pytest.raises(ValueError, match="a plane cannot be pushed .* geom:box"):
+        pressing.press(PressOptions(**springs, indenter="geom:plane", two_way=True), progress=False)
+
+
+# --- the files
+
+
+def test_readings_are_read_back(synthetic_press, tmp_path):
+    press_record.write_readings(synthetic_press, tmp_path / "readings.csv")
+    with open(tmp_path / "readings.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *[f"e{i}" for i in range(1, 20)],
+                             "pdc", "pac", "tdc", "tac", "nonconverged"]  # fmt: skip
+    assert len(rows) == 12
+    assert np.allclose([float(row["force_y_N"]) for row in rows], synthetic_press.force[:, 1], rtol=1e-8)
+    assert np.array_equal([[float(row[name]) for name in CHANNELS] for row in rows], synthetic_press.counts)
+    assert rows[-1]["nonconverged"] == "1" and list(tmp_path.iterdir()) == [tmp_path / "readings.csv"]
+
+
+def test_skin_is_read_back(synthetic_press, tmp_path):
+    press_record.write_skin(synthetic_press, tmp_path / "skin.h5")
+    with h5py.File(tmp_path / "skin.h5") as file:
+        assert file["vert_xpos"].dtype == np.float32 and file["vert_xpos"].attrs["unit"] == "m"
+        assert np.array_equal(file["vert_xpos"], synthetic_press.vert_xpos)
+        assert np.array_equal(file["elem"], synthetic_press.geometry.elem)
+        assert np.array_equal(file["outer_face"], synthetic_press.geometry.outer_face)
+        assert tuple(file["counts"].attrs["names"]) == CHANNELS
+        assert json.loads(file.attrs["parameters"])["depth"] == 1.5e-3
+        assert json.loads(file.attrs["versions"])["mujoco"] == mujoco.__version__
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file.csv"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), press_record.replacing(path) as temporary:
+        temporary.write_text("new")
+        raise RuntimeError
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_record_refuses_wrong_shapes(synthetic_press):
+    import dataclasses
+
+    with pytest.raises(ValueError, match=r"counts of a press with 12 saved steps has shape \(12, 22\): \(12, 23\) is needed"):
+        dataclasses.replace(synthetic_press, counts=np.zeros((12, 22)))
+
+
+def test_table(synthetic_press):
+    text = press_report.table(synthetic_press, ["a.csv"])
+    peak = 4 / 3 * 1.7e6 * np.sqrt(3.5e-3) * 1.5e-3**1.5
+    assert f"{peak:.3f} N at 1.500 mm" in text and "PDC         +300 counts" in text and "1 did not converge" in text and "a.csv" in text
+    first = np.argmax(np.abs(synthetic_press.electrode_change[-1]))
+    assert f"electrodes  E{first + 1} " in text
+
+
+def colors(image):
+    """How many distinct colours, in steps of 1/16, cover at least 20 pixels."""
+    _, count = np.unique((image[..., :3] * 16).astype(int).reshape(-1, 3), axis=0, return_counts=True)
+    return (count >= 20).sum()
+
+
+def test_picture_without_gl(synthetic_press, tmp_path):
+    press_report.write_picture(synthetic_press, tmp_path / "press.png")
+    image = imread(tmp_path / "press.png")
+    # the surfaces, upper left: skin, dimple and indenter each bring their shades; a blank panel has black and white
+    assert colors(image[60:480, : image.shape[1] // 2]) > 40
+    assert colors(image[60:480, image.shape[1] // 2 :]) > 20
+
+
+def test_no_gl_library_means_no_render(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert offscreen.find_gl() is None
+    monkeypatch.setenv("MUJOCO_GL", "")
+    monkeypatch.setattr(offscreen, "_works", lambda gl: False)
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='press'/></worldbody></mujoco>")
+    assert offscreen.find_gl() is None and pressing.render(model, mujoco.MjData(model)) is None
+    with pytest.raises(ValueError, match="no GL library to render with: install libosmesa6"):
+        offscreen.Offscreen(model, 32, 32, None)
+
+
+def test_probe_rejects_a_library_that_is_not_there():
+    assert not offscreen._works("nosuchlibrary")
+
+
+def test_render_shows_skin_and_indenter(springs):
+    if offscreen.find_gl() is None:
+        pytest.skip("no GL library here: nothing to render with")
+    _, picture = pressing.press(PressOptions(**springs), render=pressing.render, progress=False)
+    assert picture.shape == (640, 900, 3) and colors(picture / 255) > 20
+    green = (picture[..., 1] > 1.3 * picture[..., 0]) & (picture[..., 1] > 1.3 * picture[..., 2])
+    orange = (picture[..., 0] > 1.3 * picture[..., 1]) & (picture[..., 0] > 1.5 * picture[..., 2])
+    assert green.mean() > 0.05 and orange.mean() > 0.005
