@@ -1,0 +1,83 @@
+"""The card of a skin: what it is, in numbers."""
+
+import os
+import pathlib
+
+import numpy as np
+
+from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
+
+__all__ = ["skin_numbers", "write_card"]
+
+
+def skin_numbers(skin: SkinGeometry) -> dict:
+    """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the electrodes to the inner skin [mm].
+
+    Thickness is the distance of each inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the way from the electrode
+    along its normal to the inner surface.
+    """
+    import trimesh
+
+    mesh = TetMesh(skin.vert, skin.elem)
+    vert = skin.vert * 1e3  # trimesh drops small triangles of a mesh in metres
+    outer = trimesh.Trimesh(vert, skin.outer_face, process=False)
+    inner = trimesh.Trimesh(vert, skin.inner_face, process=False)
+    _, thickness, _ = trimesh.proximity.closest_point(outer, vert[np.unique(skin.inner_face)])
+    cavity, core = -enclosed_volume(vert, skin.inner_face), enclosed_volume(skin.core_vert * 1e3, skin.core_face)
+    lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
+    return {
+        "nodes": skin.nvert,
+        "tetrahedra": skin.nelem,
+        "outer nodes": len(np.unique(skin.outer_face)),
+        "inner nodes": len(np.unique(skin.inner_face)),
+        "held nodes": len(skin.fixed),
+        "minimum dihedral angle": lowest.min(),
+        "minimum dihedral angle, 1st percentile over tetrahedra": np.percentile(lowest, 1),
+        "skin volume": mesh.volumes.sum() * 1e9,
+        "cavity volume": cavity,
+        "core volume": core,
+        "fluid volume": cavity - core,
+        "thickness median": np.median(thickness),
+        "thickness minimum": thickness.min(),
+        "thickness maximum": thickness.max(),
+        "box": [vert.min(axis=0), vert.max(axis=0)],
+        "gaps": _ray_lengths(inner, skin.electrode_pos * 1e3, skin.electrode_normal),
+    }
+
+
+def _ray_lengths(surface, origin, direction):
+    """Distance (n,) along each ray to the nearest face of a trimesh; nan where it misses (Moeller-Trumbore)."""
+    a, b, c = (surface.triangles[:, i] for i in range(3))
+    length = np.full(len(origin), np.nan)
+    for i, (o, d) in enumerate(zip(origin, direction)):
+        p = np.cross(d, c - a)
+        det = np.sum((b - a) * p, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.sum((o - a) * p, axis=1) / det
+            q = np.cross(o - a, b - a)
+            v, t = q @ d / det, np.sum((c - a) * q, axis=1) / det
+        hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 0)
+        length[i] = t[hit].min() if hit.any() else np.nan
+    return length
+
+
+def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
+    """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came about."""
+    n = skin_numbers(skin)
+    low, high = n.pop("box")
+    gaps = n.pop("gaps")
+    unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
+    rows = [f"| {key} | {value:{'d' if isinstance(value, int) else '.3f'}} {next((u for k, u in unit.items() if k in key), '')} |" for key, value in n.items()]
+    rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
+    rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
+    text = "\n".join([
+        f"# Skin `{skin.name}`", "", "| | |", "|---|---|", *rows, "",
+        f"How it was made: {made}; `scripts/make_assets.py`. The shape is `biotac_mj.geometry.BioTacDimensions`, whose docstring gives the source of each number.",
+        "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
+    ])  # fmt: skip
+    path = pathlib.Path(path)
+    temporary = path.with_suffix(path.suffix + ".tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+    return path

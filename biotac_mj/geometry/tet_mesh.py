@@ -1,0 +1,138 @@
+"""A tetrahedral mesh and what can be asked of it: volumes, angles, boundary, and whether it may be simulated."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+__all__ = ["TetMesh"]
+
+# Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is opposite to vertex i.
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+_FACE_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_DEGENERATE = 1e-6  # a regular tetrahedron has a volume of 0.118 edge^3; below this share of its longest edge^3 one is flat to rounding of its file
+
+
+@dataclasses.dataclass(frozen=True)
+class TetMesh:
+    """Tetrahedra over nodes.
+
+    Attributes:
+      vert: (nvert, 3) float64 [m].
+      elem: (nelem, 4) int32, 0-based; positive volume where (v1 - v0, v2 - v0, v3 - v0) is right-handed.
+    """
+
+    vert: np.ndarray
+    elem: np.ndarray
+
+    def __post_init__(self):
+        vert = np.ascontiguousarray(self.vert, dtype=np.float64)
+        elem = np.ascontiguousarray(self.elem, dtype=np.int32)
+        if vert.ndim != 2 or vert.shape[1] != 3:
+            raise ValueError(f"vert has shape {vert.shape}: pass (nvert, 3) positions in metres")
+        if elem.ndim != 2 or elem.shape[1] != 4 or not len(elem):
+            raise ValueError(f"elem has shape {elem.shape}: pass (nelem, 4) vertex indices, at least one tetrahedron")
+        object.__setattr__(self, "vert", vert)
+        object.__setattr__(self, "elem", elem)
+
+    @functools.cached_property
+    def volumes(self) -> np.ndarray:
+        """(nelem,) signed volumes [m^3]."""
+        corner = self.vert[self.elem]
+        return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0
+
+    @functools.cached_property
+    def dihedral_angles(self) -> np.ndarray:
+        """(nelem, 6) angles between faces [rad]."""
+        corner = self.vert[self.elem][:, _FACES]  # (nelem, 4 faces, 3 corners, 3)
+        normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), np.finfo(float).tiny)
+        cosine = np.stack([-np.sum(normal[:, i] * normal[:, j], axis=-1) for i, j in _FACE_PAIRS], axis=-1)
+        return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+    @functools.cached_property
+    def boundary(self) -> np.ndarray:
+        """(nface, 3) int32 faces that belong to one tetrahedron only, normals outwards."""
+        face = self.elem[:, _FACES].reshape(-1, 3)
+        _, first, count = np.unique(np.sort(face, axis=1), axis=0, return_index=True, return_counts=True)
+        if count.max() > 2:
+            raise ValueError(
+                f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first has vertices {face[first[count > 2][0]].tolist()}: "
+                "remove duplicate or overlapping tetrahedra"
+            )
+        return np.ascontiguousarray(face[np.sort(first[count == 1])])
+
+    def boundary_components(self) -> list[np.ndarray]:
+        """The boundary's connected parts, (nface_i, 3) each, by decreasing absolute enclosed volume.
+
+        A part with positive `enclosed_volume` is an outside, one with negative volume a cavity.
+        """
+        import scipy.sparse as sparse
+
+        face = self.boundary
+        edge = np.concatenate([face[:, :2], face[:, 1:]])
+        graph = sparse.coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(self.vert),) * 2)
+        _, label = sparse.csgraph.connected_components(graph, directed=False)
+        label = label[face[:, 0]]
+        parts = [face[label == i] for i in np.unique(label)]
+        return sorted(parts, key=lambda part: -abs(enclosed_volume(self.vert, part)))
+
+    def check(self) -> "TetMesh":
+        """Returns itself when it can be simulated.
+
+        Raises:
+          ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or non-manifold surface, unused vertices;
+            the text says how many, which comes first and what to do.
+        """
+        bad = np.flatnonzero(~np.isfinite(self.vert).all(axis=1))
+        if len(bad):
+            raise ValueError(f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: the file is damaged, export it again")
+        bad = np.flatnonzero(((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1))
+        if len(bad):
+            raise ValueError(
+                f"{len(bad)} tetrahedra name vertices outside 0..{len(self.vert) - 1}, the first is tetrahedron {bad[0]} = {self.elem[bad[0]].tolist()}: "
+                "indices must be 0-based (subtract 1 if the file counts from 1)"
+            )
+        corner = self.vert[self.elem]
+        longest = np.max([np.linalg.norm(corner[:, i] - corner[:, j], axis=1) for i, j in _FACE_PAIRS], axis=0)
+        flat = np.flatnonzero(np.abs(self.volumes) <= _DEGENERATE * longest**3)
+        if len(flat):
+            raise ValueError(
+                f"{len(flat)} tetrahedra are degenerate (no volume), the first is tetrahedron {flat[0]} = {self.elem[flat[0]].tolist()}: "
+                "merge its nodes or mesh again with a larger edge length"
+            )
+        inverted = np.flatnonzero(self.volumes < 0)
+        if len(inverted):
+            remedy = "swap two indices of every tetrahedron" if len(inverted) == len(self.elem) else "swap two of its indices, or mesh again"
+            raise ValueError(
+                f"{len(inverted)} tetrahedra are inverted (negative volume), the first is tetrahedron {inverted[0]} = "
+                f"{self.elem[inverted[0]].tolist()}: {remedy}"
+            )
+        check_closed(self.boundary)
+        unused = np.setdiff1d(np.arange(len(self.vert)), self.elem)
+        if len(unused):
+            raise ValueError(f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: remove them and renumber")
+        return self
+
+
+def check_closed(face: np.ndarray, name: str = "surface") -> None:
+    """Raises ValueError unless every edge of `face` (nface, 3) is shared by exactly two faces that run through it in opposite directions."""
+    edge = face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, first, count = np.unique(np.sort(edge, axis=1), axis=0, return_index=True, return_counts=True)
+    if (count == 1).any():
+        where = edge[first[count == 1][0]].tolist()
+        raise ValueError(f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices {where}: fill the holes")
+    if (count > 2).any():
+        where = edge[first[count > 2][0]].tolist()
+        raise ValueError(
+            f"the {name} is not a manifold: {np.sum(count > 2)} edges have more than two faces, the first joins vertices {where}: "
+            "separate the parts that touch along them"
+        )
+    if len(np.unique(edge, axis=0)) != len(edge):
+        raise ValueError(f"the {name} has faces of both orientations: make all normals point outwards")
+
+
+def enclosed_volume(vert: np.ndarray, face: np.ndarray) -> float:
+    """Volume inside a closed surface by the divergence theorem; negative where the normals point inwards."""
+    a, b, c = (vert[face[:, i]] for i in range(3))
+    return float(np.sum(np.cross(a, b) * c) / 6.0)

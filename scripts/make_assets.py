@@ -1,0 +1,80 @@
+"""Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid parts and the indenters.
+
+    pip install pytetwild pyvista
+    python scripts/make_assets.py [--only coarse default fine rigid indenters]
+
+fTetWild runs on one thread, so that a result can be made again; another version of it may give another mesh, the surfaces stay the same.
+"""
+
+import argparse
+import importlib.metadata
+import pathlib
+
+import numpy as np
+
+from biotac_mj.geometry.assembly import assemble
+from biotac_mj.geometry.card import write_card
+from biotac_mj.geometry.importing import write_obj
+from biotac_mj.geometry.meshing import mesh_between
+from biotac_mj.geometry.parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
+from biotac_mj.geometry.tet_mesh import TetMesh
+
+ASSETS = pathlib.Path(__file__).parents[1] / "assets"
+
+# edge [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of the box's diagonal (32 mm)
+RESOLUTIONS = {
+    "coarse": {"edge": 2.0, "spacing": 0.6, "epsilon": 6e-3},
+    "default": {"edge": 0.92, "spacing": 0.5, "epsilon": 2e-3},
+    "fine": {"edge": 0.55, "spacing": 0.3, "epsilon": 1e-3},
+}
+CORE = {"edge": 0.6, "spacing": 0.3, "epsilon": 1e-3}
+
+
+def surface_only(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The boundary of a mesh with its own numbering: vert (n, 3), face (m, 3)."""
+    used, face = np.unique(mesh.boundary, return_inverse=True)
+    return mesh.vert[used], face.reshape(-1, 3).astype(np.int32)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=[*RESOLUTIONS, "rigid", "indenters"], default=[*RESOLUTIONS, "rigid", "indenters"])
+    only = parser.parse_args().only
+    bodies = biotac_bodies()
+
+    if "rigid" in only:
+        write_obj(ASSETS / "core.obj", *_metres(surface_only(mesh_between(bodies["core"], None, **CORE))))
+        write_obj(ASSETS / "nail.obj", *_metres(nail_plate()))
+        write_obj(ASSETS / "clamp.obj", *_metres(clamp_plate()))
+    if "indenters" in only:
+        from biotac_mj.geometry.indenters import INDENTERS, indenter
+
+        for name in INDENTERS:
+            write_obj(ASSETS / "indenters" / f"{name}.obj", *indenter(name).mesh())
+
+    rigid = {name: read_rigid(ASSETS / f"{name}.obj") for name in ("core", "nail", "clamp")}
+    position, normal = electrodes(bodies["core"])
+    for name, settings in RESOLUTIONS.items():
+        if name not in only:
+            continue
+        mesh = mesh_between(bodies["outer"], bodies["cavity"], **settings)
+        skin = assemble(name, TetMesh(mesh.vert * 1e-3, mesh.elem), **rigid, electrodes=(position * 1e-3, normal))
+        path = skin.save(ASSETS / "skins" / f"{name}.npz")
+        made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then biotac_mj.geometry.meshing.improve"
+        print(write_card(path.with_suffix(".md"), skin, made).read_text())
+
+
+def _metres(mesh):
+    return mesh[0] * 1e-3, mesh[1]
+
+
+def read_rigid(path):
+    """vert (n, 3) [m], face (m, 3) of a closed .obj."""
+    from biotac_mj.geometry.importing import read_obj
+
+    (body,) = read_obj(path)
+    return body
+
+
+if __name__ == "__main__":
+    main()
