@@ -11,6 +11,13 @@ MATERIALS = ("default", "paper", "rubber")
 SKINS = ("coarse", "default", "fine")
 
 
+class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Defaults where they say something."""
+
+    def _get_help_string(self, action):
+        return action.help if action.default in (None, False, True) else super()._get_help_string(action)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     from . import __version__
@@ -25,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _verb(verbs, name, run, text):
-    verb = verbs.add_parser(name, help=text, description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    verb = verbs.add_parser(name, help=text, description=text, formatter_class=_Formatter)
     verb.set_defaults(run=run)
     return verb
 
@@ -113,15 +120,25 @@ def _add_import_mesh(verbs):
 def _import_mesh(args):
     import pathlib
 
-    from . import mesh_table
     from .geometry import import_mesh
+    from .geometry.card import skin_numbers
 
-    geometry = import_mesh(args.path)
-    out = pathlib.Path(args.out or pathlib.Path(args.path).resolve().stem + ".npz")
+    source = pathlib.Path(args.path)
+    out = pathlib.Path(args.out or f"{source.resolve().stem}.npz")
     if out.suffix != ".npz":
         raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
+    geometry = import_mesh(source)
+    numbers = skin_numbers(geometry)
+    units = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
+    low, high = numbers.pop("box")
+    gaps = numbers.pop("gaps")
+    for name, value in numbers.items():
+        unit = next((u for key, u in units.items() if key in name), "")
+        print(f"  {name:<56}{value if isinstance(value, int) else f'{value:.3f}':>10} {unit}")
+    for axis, a, b in zip("xyz", low, high):
+        print(f"  {'box ' + axis:<56}{a:>10.3f} .. {b:.3f} mm")
+    print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
     geometry.save(out)
-    print(mesh_table.table(geometry))
     print(f"  stored in {out}: use it with --skin {out}")
 
 

@@ -167,12 +167,7 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
     spec.option.timestep = options.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = np.zeros(3)
-    spec.visual.headlight.ambient[:] = 0.4
-    # from beside the pad, which looks up in the picture
-    eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
-    side = np.cross(up, eye)
-    spec.worldbody.add_camera(name="press", pos=0.055 * eye + [-0.008, -0.003, 0], quat=_look(eye, side), fovy=40)
-    spec.worldbody.add_light(pos=[-0.1, -0.3, -0.1], dir=[0.3, 0.9, 0.3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
+    _stage(spec)
     spec.worldbody.add_body(name="finger")
 
     body = spec.worldbody.add_body(name="indenter", pos=path.position(-_LEAD), quat=path.quat, mocap=not options.two_way)
@@ -205,13 +200,20 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
     return spec, handle
 
 
-def _look(eye, side):
-    """Quaternion of a camera that looks from `eye` to the origin with `side` on its right."""
+def _stage(spec):
+    """Camera, light and a white background."""
+    # from beside the pad, which looks up in the picture
+    eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
-    x = side / np.linalg.norm(side)
+    x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
-    return quat
+    spec.worldbody.add_camera(name="press", pos=0.045 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
+    spec.worldbody.add_light(pos=[-0.1, -0.3, -0.1], dir=[0.6, 0.9, -0.1], diffuse=[0.5] * 3, specular=[0.1] * 3,
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)  # fmt: skip
+    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = 0.35, 0.35, 0.05
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, width=8, height=48)
+    sky.rgb1, sky.rgb2 = [1.0] * 3, [1.0] * 3
 
 
 def _read(handle, data):
@@ -257,8 +259,12 @@ def press(options: PressOptions = PressOptions(), render=None, progress: bool = 
     indenter = press_indenter.make_indenter(options.indenter)
     path = plan_path(geometry, indenter, options)
     spec, handle = build_scene(indenter, path, options)
-    model = spec.compile()
-    data = mujoco.MjData(model)
+    try:
+        model = spec.compile()
+        data = mujoco.MjData(model)
+    except (ValueError, mujoco.FatalError):
+        plugin.check()  # says why, where MuJoCo only says that
+        raise
     nodes = _Nodes(handle, model)
     rows, picture = [], None
     last = len(path.depth) - 1

@@ -1,0 +1,97 @@
+"""A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes are shown by the plugin."""
+
+import os
+import sys
+import time
+
+import mujoco
+import numpy as np
+
+from . import approach, plugin
+from .press_record import replacing
+
+__all__ = ["build_scene", "view"]
+
+_PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])  # turns the pad, -y of the BioTac, to the world's +z
+_RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
+
+
+def build_scene(skin="default", **attach_options):
+    """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs keep it over the pad.
+
+    Args:
+      skin: name, file or SkinGeometry.
+      attach_options: see `biotac_mj.attach`.
+
+    Returns:
+      spec, and the handle of `biotac_mj.attach`.
+    """
+    from .coupling import attach
+    from .geometry import SkinGeometry, load_skin
+
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    top, _ = approach.surface_point(geometry, -10e-3, 0.0)
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 4e-3
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
+    spec.visual.headlight.ambient[:] = 0.3
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384)
+    sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
+    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
+    ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
+    for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
+        joint = ball.add_joint(name=f"ball_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        joint.stiffness, joint.damping = stiffness, 0.5
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0], contype=0, conaffinity=0, rgba=[0.85, 0.45, 0.15, 0.6])
+    handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
+    return spec, handle
+
+
+def view(skin="default", material="default", liquid=None, seed=0, device="cpu", render=None, seconds=0.3):
+    """Opens the viewer and steps in real time as far as the machine goes; or renders.
+
+    Args:
+      skin, material, liquid, seed, device: see `biotac_mj.attach`; liquid None takes the material's choice.
+      render: path of a picture to write after `seconds` [s] instead.
+
+    Raises:
+      ValueError: no display for a window, or no GL library to render with.
+    """
+    from .skin.material import material as preset
+
+    if render is None and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ValueError("no display to open a window on: use `biotac view --render FILE.png`, or set DISPLAY")
+    liquid = preset(material).liquid if liquid is None else liquid
+    spec, _ = build_scene(skin, material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    if render is not None:
+        return _render(model, data, render, seconds)
+    import mujoco.viewer
+
+    with mujoco.viewer.launch_passive(model, data) as window:
+        while window.is_running():
+            begin = time.perf_counter()
+            mujoco.mj_step(model, data)
+            plugin.check()
+            window.sync()
+            time.sleep(max(0.0, model.opt.timestep - (time.perf_counter() - begin)))
+
+
+def _render(model, data, path, seconds):
+    from matplotlib.image import imsave
+
+    from .offscreen import Offscreen, find_gl
+
+    with Offscreen(model, 1000, 750, find_gl()) as screen:
+        while data.time < seconds:
+            mujoco.mj_step(model, data)
+            plugin.check()
+        camera = mujoco.MjvCamera()
+        camera.lookat, camera.distance, camera.azimuth, camera.elevation = [-0.008, 0, 0.004], 0.05, 60, -25
+        picture = screen.render(data, camera)
+    with replacing(path) as temporary:
+        imsave(temporary, picture)
+    print(f"  wrote {path}: {data.time:.2f} s after the ball was let go")

@@ -1,0 +1,102 @@
+"""The command line: help, errors in one line, and the files of a whole press."""
+
+import csv
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from biotac_mj import cli, press_indenter
+from biotac_mj.skin.material import PRESETS
+
+
+def test_names_in_the_help_are_the_real_ones():
+    from biotac_mj.geometry import SKINS
+
+    assert sorted(cli.INDENTERS) == sorted(press_indenter.INDENTERS)
+    assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
+
+
+def test_help_shows_all_choices(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["press", "--help"])
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for choice in (*cli.INDENTERS, "capsule", "cylinder", "ellipsoid", "box", "plane", "mesh:FILE", *cli.MATERIALS, *cli.SKINS, "--no-liquid",
+                   "--location", "--direction", "--depth", "--slide", "--slide-direction", "--timestep", "--speed", "--two-way", "--one-way",
+                   "--mu", "--seed", "--out", "--no-render", "--device"):  # fmt: skip
+        assert choice in text, choice
+
+
+def test_help_is_light():
+    code = "import sys; from biotac_mj.cli import parser; parser().format_help(); print([m for m in ('warp', 'trimesh', 'matplotlib') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["press", "--indenter", "cone"], "unknown indenter 'cone': choose one of"),
+        (["press", "--indenter", "geom:torus:1"], "unknown geom type 'torus'"),
+        (["press", "--indenter", "mesh:nowhere.obj"], "no indenter mesh at nowhere.obj"),
+        (["press", "--skin", "nowhere.npz"], "no skin at nowhere.npz: pass 'coarse', 'default', 'fine' or a file made by"),
+        (["press", "--skin", "coarse", "--location", "40"], "no skin at x = 40 mm"),
+        (["press", "--skin", "coarse", "--material", "jelly"], "unknown material 'jelly': choose one of default, paper, rubber"),
+        (["press", "--depth", "-1"], "depth is -0.001: it must be a positive number"),
+        (["import-mesh", "nowhere"], "no mesh at nowhere"),
+        (["import-mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
+    ],
+)
+def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("biotac: error: ") and text in err and err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_view_without_a_display_says_what_to_do(capsys, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert cli.main(["view"]) == 2
+    assert "no display to open a window on: use `biotac view --render FILE.png`" in capsys.readouterr().err
+
+
+def test_press_writes_readings_skin_and_picture(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # the picture must not need a GL library
+    out = tmp_path / "press"
+    assert cli.main(["press", "--skin", "coarse", "--depth", "0.4", "--out", str(out), "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert "no GL library works here" in said and "peak force" in said and "wall time" in said
+    with open(out / "readings.csv") as file:
+        rows = list(csv.DictReader(file))
+    depth = np.array([float(row["depth_m"]) for row in rows])
+    force = np.array([[float(row[f"force_{axis}_N"]) for axis in "xyz"] for row in rows])
+    assert depth[0] == -5e-6 and depth[-1] == 4e-4 and np.linalg.norm(force[0]) < 1e-6
+    # pushed along +y, the skin pushes back along -y; more with every step of the press
+    pressing = force[depth < 4e-4]
+    assert (np.diff(pressing[1:, 1]) < 0).all() and abs(force[-1, 1]) > 5 * np.abs(force[-1, [0, 2]]).max()
+    with h5py.File(out / "skin.h5") as file:
+        assert len(file["vert_xpos"]) == len(rows)
+        moved = file["vert_xpos"][-1] - file["vert"][:]
+        # the skin gives way by what the indenter travels, less what it overlaps in the contact's softness
+        assert 0.7 * 4e-4 < moved[:, 1].max() < 1.05 * 4e-4
+        assert np.abs(moved[file["fixed"][:]]).max() < 1e-8
+    assert len(np.unique(imread(out / "press.png")[::4, ::4].reshape(-1, 4), axis=0)) > 100
+    assert sorted(path.name for path in out.iterdir()) == ["press.png", "readings.csv", "skin.h5"]
+
+
+def test_import_mesh_prints_a_table_and_stores_a_skin(shared, capsys, tmp_path):
+    out = tmp_path / "real.npz"
+    assert cli.main(["import-mesh", str(shared / "data" / "nvlabs_biotac_sim"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    # numbers of the published mesh
+    for name, value in (("nodes", 4246), ("tetrahedra", 15410), ("held nodes", 400)):
+        assert any(line.split()[-1] == str(value) for line in said.splitlines() if line.strip().startswith(name)), said
+    from biotac_mj.geometry import load_skin
+
+    assert load_skin(out).nvert == 4246

@@ -1,0 +1,39 @@
+"""The examples run headless and end with the right physics; the README shows the code that runs."""
+
+import importlib.util
+
+import numpy as np
+
+
+def load(repo, name):
+    spec = importlib.util.spec_from_file_location(name, repo / "examples" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_quickstart_ball_rests_on_the_pad(repo):
+    model, data = load(repo, "quickstart").main(seconds=0.4, skin="coarse")
+    # a ball at rest: the skin carries its weight, 0.1 kg x 9.81 m/s^2; the pad is -y of the BioTac
+    assert np.allclose(data.sensor("biotac_contact_force").data[1], 0.981, rtol=0.01)
+    electrodes = data.sensor("biotac_electrodes").data
+    assert electrodes.shape == (19,) and (electrodes == electrodes.round()).all() and (electrodes > 0).all() and (electrodes < 4096).all()
+
+
+def test_press_example(repo):
+    record = load(repo, "press").main(skin="coarse", depth=0.5e-3)
+    # the force opposes the press, which points inwards at 0.3 rad around the finger
+    inwards = np.array([0, np.cos(0.3), -np.sin(0.3)])
+    assert record.force[-1] @ inwards < -0.05
+    # the electrode under the contact: nearest to the touch among those that changed most
+    change = np.abs(record.electrode_change[-1])
+    assert change.max() > 20
+
+
+def test_readme_shows_the_quickstart(repo):
+    readme = (repo / "README.md").read_text()
+    code = readme.split("```python\n")[1].split("```")[0]
+    lines = [line.strip().split("  #")[0] for line in code.splitlines() if line.strip() and not line.startswith("import")]
+    source = (repo / "examples" / "quickstart.py").read_text()
+    shown = [line for line in lines if line in source]
+    assert len(shown) >= 6, f"the README's example drifted from examples/quickstart.py: only {shown} is in it"

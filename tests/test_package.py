@@ -1,0 +1,84 @@
+"""The package: light import, names, what the wheel carries."""
+
+import importlib.resources
+import re
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+import biotac_mj
+
+
+def run(code, **environ):
+    import os
+
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environ}, timeout=120)
+
+
+def test_import_is_light():
+    code = "import biotac_mj, sys; print(*[m for m in ('torch', 'warp', 'trimesh', 'matplotlib', 'scipy', 'h5py', 'mujoco_warp') if m in sys.modules])"
+    result = run(code)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == ""
+
+
+def test_import_registers_the_plugin():
+    xml = "<mujoco><extension><plugin plugin='biotac_mj.skin'/></extension></mujoco>"
+    code = f"mujoco.MjModel.from_xml_string({xml!r}); print('known')"
+    assert "plugin biotac_mj.skin not found" in run("import mujoco; " + code).stderr
+    assert run("import mujoco, biotac_mj; " + code).stdout.strip() == "known"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="MUJOCO_GL=nonsense is Linux's way to ask for a library that is not there")
+def test_a_gl_library_that_fails_does_not_stop_the_import():
+    result = run("import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, os.environ['MUJOCO_GL'])", MUJOCO_GL="nonsense")
+    assert result.stdout.split() == ["0", "disable"], result.stderr
+    assert "MUJOCO_GL=nonsense does not work here" in result.stderr
+
+
+@pytest.mark.parametrize("name", [n for n in biotac_mj.__all__ if n != "__version__"])
+def test_public_names_are_there(name):
+    assert getattr(biotac_mj, name) is not None and name in dir(biotac_mj)
+
+
+def test_unknown_name_says_what_there_is():
+    with pytest.raises(AttributeError, match="no attribute 'atach'; it has .*attach"):
+        _ = biotac_mj.atach
+
+
+def test_every_package_is_listed(repo):
+    listed = set(tomllib.loads((repo / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    present = {".".join(path.parent.relative_to(repo).parts) for path in (repo / "biotac_mj").rglob("__init__.py")}
+    assert present | {"biotac_mj.plugin", "biotac_mj.mjcf", "biotac_mj.assets"} == listed
+
+
+def test_data_is_found_as_resources():
+    assert (importlib.resources.files("biotac_mj.mjcf") / "biotac.xml").is_file()
+    for skin in ("coarse", "default", "fine"):
+        assert (importlib.resources.files("biotac_mj.assets") / "skins" / f"{skin}.npz").is_file()
+
+
+def test_versions_agree(repo):
+    cff = (repo / "CITATION.cff").read_text()
+    assert re.search(rf"^version: {re.escape(biotac_mj.__version__)}$", cff, re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
+    """Builds a wheel, unpacks it elsewhere and imports it from there, away from the checkout."""
+    import zipfile
+
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, repo], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        names = set(file.namelist())
+        file.extractall(tmp_path / "site")
+    assert {"biotac_mj/plugin/__init__.py", "biotac_mj/mjcf/biotac.xml", "biotac_mj/assets/skins/default.npz"} <= names
+    assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "plugin/", "assets/"))]
+    code = f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); import biotac_mj; print(biotac_mj.plugin.__file__, biotac_mj.load_skin('coarse').nvert)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(str(tmp_path / "site"))
