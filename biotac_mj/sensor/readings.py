@@ -1,0 +1,99 @@
+"""What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for stored motions."""
+
+import numpy as np
+
+from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.channels import REST_TEMPERATURE
+from biotac_mj.sensor.film import FilmConduction
+
+__all__ = ["PhysicsReadings", "record"]
+
+
+class PhysicsReadings:
+    """Counts of all channels from the deformed skin and the liquid's pressure. Constant: the state belongs to the caller.
+
+    Args:
+      geometry: the skin.
+      seed: of the noise; give every sensor its own.
+      noise: False leaves quantisation only.
+      sensor: "1" | "2" | "3", whose published rest counts the electrodes show at rest.
+      film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
+      `Acquisition.needs_impedance`).
+      temperature: of the core, steady [C]; TDC is constant and TAC at mid-scale but for noise.
+      film: a FilmConduction to share between sensors of the same geometry; None builds one.
+
+    Attributes:
+      nstate: length of the state vector.
+    """
+
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        seed=0,
+        noise=True,
+        sensor="1",
+        film_every_step=False,
+        temperature=REST_TEMPERATURE,
+        film: FilmConduction | None = None,
+    ):
+        self.film = FilmConduction(geometry, sensor=sensor) if film is None else film
+        self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
+        self.temperature = temperature
+        self.nstate = self.acquisition.nstate
+        self._rest = self.film.impedance(geometry.vert)
+
+    def reset(self, state, vert_xpos=None, pressure=0.0, time=0.0):
+        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state (nstate,)."""
+        impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
+        self.acquisition.reset(state, impedance, pressure, self.temperature, time)
+
+    def advance(self, state, time, dt, vert_xpos, pressure):
+        """Samples the step (time, time + dt].
+
+        Args:
+          state: (nstate,) float64, updated in place.
+          time: at the start of the step [s]; dt: its length [s].
+          vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m].
+          pressure: of the liquid at the end of the step, above rest [Pa].
+
+        Raises:
+          ValueError: wrong shape or a value that is not finite; the state is unchanged then.
+        """
+        impedance = self.film.impedance(vert_xpos) if self.acquisition.needs_impedance(state, time, dt) else None
+        self.acquisition.advance(state, time, dt, impedance, pressure, self.temperature)
+
+    def readings(self, state):
+        """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""
+        return self.acquisition.readings(state)
+
+
+def record(readings, time, vert_xpos, pressure):
+    """Counts over a stored motion; impedance and pressure are linear between its samples.
+
+    Args:
+      readings: PhysicsReadings.
+      time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
+
+    Returns:
+      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, 19), pdc (nt,), pac (nt, 22), tac (nt,), tdc (nt,).
+
+    Raises:
+      ValueError: lengths that differ, or time that does not increase.
+    """
+    time, pressure = np.asarray(time, dtype=float), np.asarray(pressure, dtype=float)
+    if time.ndim != 1 or not len(time) or len(vert_xpos) != len(time) or pressure.shape != time.shape:
+        raise ValueError(
+            f"time has shape {time.shape}, vert_xpos {len(vert_xpos)} samples, pressure {pressure.shape}: pass one of each per sample"
+        )
+    if not np.all(np.diff(time) > 0):
+        raise ValueError(
+            f"time does not increase after sample {int(np.argmax(~(np.diff(time) > 0)))}: sort the samples and drop repeated ones"
+        )
+    state = np.zeros(readings.nstate)
+    readings.reset(state, vert_xpos[0], pressure[0], time[0])
+    rows = [readings.readings(state)]
+    for i in range(1, len(time)):
+        readings.advance(state, time[i - 1], time[i] - time[i - 1], vert_xpos[i], pressure[i])
+        rows.append(readings.readings(state))
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
