@@ -66,14 +66,14 @@ class _Plugin(ctypes.Structure):
 
 
 _lock = threading.RLock()
-_instances = {}  # (mjData address, plugin instance) -> Instance; holds only what the state and the model determine
+_worlds = {}  # mjData address -> World, all BioTacs in it; holds only what the state and the model determine
 _errors = []
 _alive = []  # what C points to
 
 
-def _coupling():
+def _coupling(module):
     # Late, so that `import biotac_mj` loads neither Warp nor the geometry.
-    return importlib.import_module("biotac_mj.coupling.instance")
+    return importlib.import_module(f"biotac_mj.coupling.{module}")
 
 
 def _keep(error):
@@ -100,21 +100,21 @@ def _guarded(on_error):
     return decorate
 
 
-def _instance(model, data, index):
-    key = (data, index)
-    instance = _instances.get(key)
-    if instance is None:  # a copy made by mj_copyData has no init
+def _world(model, data, index):
+    world = _worlds.get(data)
+    if world is None:  # also the way of a copy made by mj_copyData, which has no init
         with _lock:
-            instance = _instances.get(key)
-            if instance is None:
+            world = _worlds.get(data)
+            if world is None:
                 view = structs.ModelView(model)
-                instance = _instances[key] = _coupling().Instance(view, structs.DataView(data, view), index)
-    return instance
+                mine = [i for i in range(view.nplugin) if view.plugin[i] == view.plugin[index]]
+                world = _worlds[data] = _coupling("world").World(view, structs.DataView(data, view), mine)
+    return world
 
 
 @_guarded(-1)
 def _nstate(model, index):
-    return _coupling().state_size(structs.ModelView(model), index)
+    return _coupling("instance").state_size(structs.ModelView(model), index)
 
 
 @_guarded(0)
@@ -125,50 +125,51 @@ def _nsensordata(model, index, sensor):
 @_guarded(-1)
 def _init(model, data, index):
     with _lock:
-        _instances.pop((data, index), None)
-        _instance(model, data, index)
+        world = _worlds.get(data)
+        if world is not None and index == min(world.instances):  # left over from an mjData at this address
+            del _worlds[data]
+        _world(model, data, index)
     return 0
 
 
 @_guarded(None)
 def _destroy(data, index):
     with _lock:
-        _instances.pop((data, index), None)
+        _worlds.pop(data, None)
 
 
 @_guarded(None)
 def _copy(destination, model, source, index):
     with _lock:
-        _instances.pop((destination, index), None)
+        _worlds.pop(destination, None)
 
 
 @_guarded(None)
 def _reset(model, state, plugin_data, index):
-    _coupling().reset_state(structs.ModelView(model), state, index)
+    _coupling("instance").reset_state(structs.ModelView(model), state, index)
 
 
 def _compute(model, data, index, capability):
     try:
-        instance = _instance(model, data, index)
+        world = _world(model, data, index)
         if capability == _PASSIVE:
-            instance.passive()
+            world.passive(index)
         elif capability == _SENSOR:
-            instance.sense()
+            world.instances[index].sense()
     except BaseException as error:  # noqa: BLE001
         _keep(error)
-        instance = _instances.get((data, index))
-        if instance is not None:
-            instance.failed()
+        if data in _worlds:
+            _worlds[data].failed(index)
 
 
 @_guarded(None)
 def _advance(model, data, index):
-    _instance(model, data, index).advance()
+    _world(model, data, index).instances[index].advance()
 
 
 @_guarded(None)
 def _visualize(model, data, option, scene, index):
-    _instance(model, data, index).visualize()
+    _world(model, data, index).instances[index].visualize()
 
 
 def register():

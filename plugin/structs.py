@@ -18,6 +18,9 @@ LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
 LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
 LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
 LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
+LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+for _stage in ("mj_referenceConstraint", "mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint"):
+    getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 
 _SCALARS = {
@@ -185,3 +188,20 @@ class DataView(_View):
     def project_constraints(self):
         """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and regularisation."""
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
+
+    def acceleration(self):
+        """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint rows as they are now.
+
+        Runs MuJoCo's own later stages, which mj_forward runs again; what it would not overwrite (the input of mj_inverse, the warm start) is put back.
+        """
+        model, data = self.model.address, self.address
+        qacc, warmstart = self.qacc, self.qacc_warmstart
+        kept = qacc.copy(), warmstart.copy()
+        LIBRARY.mj_rne(model, data, 0, self.qfrc_bias.ctypes.data)
+        LIBRARY.mj_referenceConstraint(model, data)
+        LIBRARY.mj_fwdActuation(model, data)
+        LIBRARY.mj_fwdAcceleration(model, data)
+        LIBRARY.mj_fwdConstraint(model, data)
+        out = qacc.copy()
+        qacc[:], warmstart[:] = kept
+        return out

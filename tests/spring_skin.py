@@ -71,26 +71,29 @@ class SpringSkin:
         for i, (geom, pos, mat) in enumerate(zip(self.geoms, geom_pos, geom_mat)):
             local = (self.vert - pos) @ mat
             depth, normal = _depth(geom, local)
-            for node in np.flatnonzero((depth > 0) & (touched < 0)):
-                touched[node] = i
-                x, out = self.vert[node], mat @ normal[node]
-                if memory[node, 0] != i + 1:
-                    memory[node, 0], memory[node, 1:] = i + 1, local[node]
-                slip = pos + mat @ memory[node, 1:] - x
-                slip -= out * (out @ slip)
-                trial = 0.5 * self.k * np.linalg.norm(slip)
-                limit = geom.friction * self.k * depth[node]
-                share = min(1.0, limit / trial) if trial > 0 else 1.0
-                if share < 1.0:
-                    slip = slip * share
-                    memory[node, 1:] = mat.T @ (x + slip - pos)
-                force = self.k * depth[node] * out + 0.5 * self.k * slip  # on the node
-                wrench[geom.group] -= np.concatenate([force, np.cross(x, force)])
-                stiff = self.k * np.outer(out, out) + 0.5 * self.k * share * (np.eye(3) - np.outer(out, out))
-                lever = np.array([[0, x[2], -x[1]], [-x[2], 0, x[0]], [x[1], -x[0], 0]])
-                at = np.concatenate([np.eye(3), lever], axis=1)  # velocity at x of a body that moves by (t, w): t + w x x
-                tangent[geom.group] += at.T @ stiff @ at
-                moved[node] = x + out * depth[node]
+            node = np.flatnonzero((depth > 0) & (touched < 0))
+            if not len(node):
+                continue
+            fresh = node[memory[node, 0] != i + 1]
+            memory[fresh, 0], memory[fresh, 1:] = i + 1, local[fresh]
+            touched[node] = i
+            x, out, depth = self.vert[node], normal[node] @ mat.T, depth[node]
+            slip = pos + memory[node, 1:] @ mat.T - x
+            slip -= out * (out * slip).sum(axis=1, keepdims=True)
+            trial = 0.5 * self.k * np.linalg.norm(slip, axis=1)
+            share = np.minimum(1.0, geom.friction * self.k * depth / np.maximum(trial, 1e-300))
+            slip *= share[:, None]
+            memory[node, 1:] = np.where(share[:, None] < 1.0, (x + slip - pos) @ mat, memory[node, 1:])
+            force = self.k * depth[:, None] * out + 0.5 * self.k * slip  # on the nodes
+            wrench[geom.group] -= np.concatenate([force.sum(axis=0), np.cross(x, force).sum(axis=0)])
+            project = out[:, :, None] * out[:, None, :]
+            stiff = self.k * project + 0.5 * self.k * share[:, None, None] * (np.eye(3) - project)
+            at = np.zeros((len(node), 3, 6))  # velocity at x of a body that moves by (t, w): t + w x x
+            at[:, :, :3] = np.eye(3)
+            at[:, 0, 4], at[:, 0, 5], at[:, 1, 5] = x[:, 2], -x[:, 1], x[:, 0]
+            at[:, 1, 3], at[:, 2, 3], at[:, 2, 4] = -x[:, 2], x[:, 1], -x[:, 0]
+            tangent[geom.group] += np.einsum("nia,nij,njb->ab", at, stiff, at)
+            moved[node] = x + out * depth[:, None]
         memory[touched < 0] = 0.0
         new[4 * n :] = moved.ravel()
         return SkinResult(new, wrench, tangent, moved, pressure=1e4 * np.abs(wrench[:, 1]).sum())

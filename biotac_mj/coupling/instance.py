@@ -5,6 +5,7 @@ mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
 """
 
 import ctypes
+import dataclasses
 import functools
 import threading
 
@@ -21,6 +22,7 @@ __all__ = ["Instance", "Setup", "reset_state", "state_size"]
 
 # head of the plugin state: steps that did not converge, then how the last committed step went
 _HEAD = 4
+_MODEL = 6 + 36 + 3 + 9  # of a touching body: wrench, tangent, and the pose they belong to
 _FAILED, _CONVERGED, _ITERATIONS, _RESIDUAL = range(_HEAD)
 STATUS = ("converged", "failed_steps", "iterations", "residual")
 
@@ -80,17 +82,18 @@ class Setup:
 
     @property
     def nstate(self):
-        return _HEAD + 6 * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
+        return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state):
-        """Head, last wrenches (ngroup, 6), the skin's and the readings' parts of a plugin state, as views."""
-        a = _HEAD + 6 * self.ngroup
+        """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin state, as views."""
+        a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate
-        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, 6), state[a:b], state[b:]
+        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:]
 
     def reset(self, state):
-        head, wrench, skin, readings = self.parts(state)
-        head[:], wrench[:] = 0.0, 0.0
+        head, models, skin, readings = self.parts(state)
+        head[:], models[:] = 0.0, 0.0
+        models[:, [45, 49, 53]] = 1.0  # a rotation, though nothing touches
         head[_CONVERGED] = 1.0
         with self.skin.lock:
             self.skin.stepper.reset(skin)
@@ -121,7 +124,7 @@ class Instance:
 
     def __init__(self, model, data, index):
         self.setup = setup = Setup(model, index)
-        self.model, self.data = model, data
+        self.model, self.data, self.index, self.touching = model, data, index, setup.touching
         sensors = setup.named("sensor")
         self.sensor = {
             name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
@@ -136,7 +139,8 @@ class Instance:
         if size != setup.nstate:
             raise ValueError(f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec")
         self._state = slice(start, start + size)
-        self._key = self._result = self._reading = None
+        self._result = self._reading = self._pose = None
+        self._solved = {}
         self._error = False
         self._shown = None
 
@@ -145,30 +149,43 @@ class Instance:
         """(nstate,) view of the plugin state."""
         return self.data.plugin_state[self._state]
 
-    def _horizon(self):
-        # Runge-Kutta evaluates forces at the poses it sets itself: the skin is then explicit
+    @property
+    def horizon(self):
+        """How far ahead [s] the skin is solved: the end of the step; 0 in Runge-Kutta stages, which set their own poses (the skin is explicit there)."""
         return 0.0 if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else self.model.opt.timestep
 
-    def passive(self):
-        """Solves the skin for the end of this step and, two-way, gives MuJoCo its wrenches and stiffness."""
-        self._error = False
-        horizon = self._horizon()
+    def begin(self):
+        """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
+        self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError("the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or Euler, or coupling='one-way'")
-        pos, mat = self.setup.touching.predict(self.data, horizon)
+
+    def last_model(self):
+        """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3), (ngroup, 3, 3)."""
+        models = self.setup.parts(self.state)[1]
+        return models[:, :6], models[:, 6:42].reshape(-1, 6, 6), models[:, 42:45], models[:, 45:].reshape(-1, 3, 3)
+
+    def solve(self, pos, mat):
+        """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings."""
+        self._pose = pos, mat
         dt = self.model.opt.timestep
         key = (pos.tobytes(), mat.tobytes(), dt, self.state.tobytes())
-        if key != self._key:  # solving is a function of the key, so a second mj_forward costs nothing
-            skin = self.setup.skin
+        result = self._solved.get(key)  # solving is a function of the key, so a second mj_forward costs nothing
+        if result is None:
+            geom_pose = self.touching.geom_pose(pos, mat)
+            skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
-                result = skin.stepper.solve(self.setup.parts(self.state)[2], pos, mat, dt)
+                result = skin.stepper.solve(before, *geom_pose, dt)
             if not result.converged:  # go on with what was last known to be good
-                result.state = self.setup.parts(self.state)[2].copy()
-                result.wrench = self.setup.parts(self.state)[1].copy()
-                result.tangent = np.zeros((self.setup.ngroup, 6, 6))
-            self._key, self._result, self._reading = key, result, None
-        if self.two_way:
-            self.metric.apply(self.data, self._result.wrench, self._result.tangent, horizon)
+                wrench, _, pos, mat = self.last_model()
+                tangent = np.zeros((self.setup.ngroup, 6, 6))
+                result = dataclasses.replace(result, state=before.copy(), wrench=wrench.copy(), tangent=tangent)
+                result.vert_xpos = skin.stepper.vert_xpos(result.state)
+            if len(self._solved) > 8:
+                self._solved.clear()
+            self._solved[key] = result
+        self._result, self._reading = result, None
+        return result
 
     def _counts(self):
         if self._reading is None:
@@ -195,7 +212,7 @@ class Instance:
 
     def failed(self):
         """After an exception: the step's skin is unknown; the status sensor says -1."""
-        self._error, self._key, self._result, self._reading = True, None, None, None
+        self._error, self._result, self._reading = True, None, None
         self._flag()
 
     def _flag(self):
@@ -208,10 +225,13 @@ class Instance:
         if self._error or result is None:
             return
         readings, _ = self._counts()
-        head, wrench, skin, readings_state = self.setup.parts(self.state)
+        head, models, skin, readings_state = self.setup.parts(self.state)
         head[:] = head[_FAILED] + (not result.converged), result.converged, result.iterations, result.residual
-        wrench[:], skin[:], readings_state[:] = result.wrench, result.state, readings
-        self._key = None
+        n = self.setup.ngroup
+        parts = (result.wrench, result.tangent.reshape(n, 36), self._pose[0], self._pose[1].reshape(n, 9))
+        models[:] = np.concatenate(parts, axis=1)
+        skin[:], readings_state[:] = result.state, readings
+        self._solved.clear()
 
     def visualize(self):
         """Shows the deformed outer surface and colours the electrodes; MuJoCo calls it while it updates a scene."""

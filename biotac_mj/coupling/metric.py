@@ -1,7 +1,7 @@
 """The skin's stiffness in MuJoCo's dynamics: rows of constraints that add h^2 J' S J to the inertia, across kinematic trees.
 
-The step of a body pressed by the skin is linearly implicit: the force at the end of the step is W - h^2 S J a, with W the wrench at the pose
-predicted without acceleration, S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The rest is
+The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached without acceleration, S = -dW/dx and J
+the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The rest is
 exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference acceleration zero gives, one row for each of the six
 eigenvalues s of S. MuJoCo's solver so finds the accelerations of object and finger together, with every other contact and limit: equal
 and opposite forces whatever the masses, nothing at rest, where a = 0. `docs/coupling.md` compares this with the alternatives.
@@ -41,25 +41,25 @@ class Metric:
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
             model.eq_active0[slot] = 1
 
-    def apply(self, data, wrench, tangent, horizon):
-        """Adds the wrenches (ngroup, 6) to `qfrc_passive` and the tangents (ngroup, 6, 6) over `horizon` [s] to the rows."""
+    def jacobians(self, data):
+        """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in that frame."""
         frame = data.xmat[self.core].reshape(3, 3)
         origin = np.ascontiguousarray(data.xpos[self.core])
-        own, force, rows = None, None, {}
-        for group in np.flatnonzero(wrench.any(axis=1) | tangent.any(axis=(1, 2))):
-            if own is None:
-                own, force = data.jacobian(self.core, origin), 0.0
-            world = data.jacobian(int(self.body[group]), origin) - own
-            jacobian = np.concatenate([frame.T @ world[:3], frame.T @ world[3:]])
-            force = force + wrench[group] @ jacobian
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = frame.T
+        own = data.jacobian(self.core, origin)
+        return np.stack([turn @ (data.jacobian(int(b), origin) - own) for b in self.body]) if len(self.body) else np.zeros((0, 6, self.model.nv))
+
+    def write(self, data, jacobian, tangent, horizon):
+        """Puts the stiffness of tangents (ngroup, 6, 6) over `horizon` [s] into the rows."""
+        if not self.slot:
+            return
+        rows = {}
+        for group in np.flatnonzero(tangent.any(axis=(1, 2))) if horizon else ():
             root = self.root[group]
-            if root in self.slot and horizon:
-                # bodies that are welded together move as one: their stiffnesses add
-                rows[root] = (jacobian, tangent[group] + (rows[root][1] if root in rows else 0.0))
-        if force is not None:
-            data.qfrc_passive += force
-        if self.slot:
-            self._write(data, rows, horizon)
+            if root in self.slot:  # bodies that are welded together move as one: their stiffnesses add
+                rows[root] = (jacobian[group], tangent[group] + (rows[root][1] if root in rows else 0.0))
+        self._write(data, rows, horizon)
 
     def _write(self, data, rows, horizon):
         model = self.model
@@ -96,5 +96,3 @@ class Metric:
             gains[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
             if islands:
                 island_weight[place[here]], island_regular[place[here]] = value, 1.0 / value
-        if model.opt.solver == int(mujoco.mjtSolver.mjSOL_PGS) or model.opt.noslip_iterations:
-            data.project_constraints()

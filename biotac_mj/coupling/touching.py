@@ -5,7 +5,7 @@ import numpy as np
 
 from .stepper import Geom
 
-__all__ = ["Touching", "rotation"]
+__all__ = ["Touching", "displace", "displacement", "rotation"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -38,9 +38,11 @@ class Touching:
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         self.geoms = [_describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)]
-        # rows of the stacked bodies (core first) whose motion is predicted
-        self._owner = np.concatenate([[core], bodies]).astype(np.int64)
-        self._root = model.body_rootid[self._owner]
+        self.group = group
+        # the bodies whose motion is predicted: the BioTac's, then the touching ones; MuJoCo gives velocities at their trees' centres of mass
+        self._body = np.concatenate([[core], self.body]).astype(np.int64)
+        self._root = model.body_rootid[self._body]
+        self._geom_pos, self._geom_mat = model.geom_pos[ids], _matrix(model.geom_quat[ids])
 
     def key(self) -> bytes:
         """Bytes that differ whenever the skin would see other geoms."""
@@ -52,30 +54,33 @@ class Touching:
         return b"|".join(parts)
 
     def predict(self, data, horizon):
-        """Poses in the BioTac frame when every body goes on at its present velocity for `horizon` [s].
+        """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity for `horizon` [s].
 
         Returns:
-          (ngeom, 3) positions [m], (ngeom, 3, 3) rotations.
+          (ngroup, 3) positions [m], (ngroup, 3, 3) rotations.
+        """
+        pos, mat = data.xpos[self._body], data.xmat[self._body].reshape(-1, 3, 3)
+        if horizon:
+            velocity = data.cvel[self._body]  # rotation, then translation of the point at the tree's centre of mass
+            spin = velocity[:, :3]
+            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, pos - data.subtree_com[self._root]))
+            mat = rotation(horizon * spin) @ mat
+        frame = mat[0]
+        return (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
+
+    def geom_pose(self, pos, mat):
+        """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms on bodies at (ngroup, 3), (ngroup, 3, 3).
 
         Raises:
           ValueError: a pose is not finite.
         """
-        n = len(self._owner)
-        pos, mat = np.empty((n, 3)), np.empty((n, 3, 3))
-        pos[0], mat[0] = data.xpos[self.core], data.xmat[self.core].reshape(3, 3)
-        pos[1:], mat[1:] = data.geom_xpos[self.geom], data.geom_xmat[self.geom].reshape(-1, 3, 3)
-        if horizon:
-            velocity = data.cvel[self._owner]  # rotation, then translation of the point at the tree's centre of mass
-            spin = velocity[:, :3]
-            arm = pos - data.subtree_com[self._root]
-            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, arm))
-            mat = rotation(horizon * spin) @ mat
-        frame = mat[0]
-        relative_pos, relative_mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
-        if not (np.isfinite(relative_pos.sum()) and np.isfinite(relative_mat.sum())):
-            bad = [g.name or f"#{i}" for g, i, p, r in zip(self.geoms, self.geom, relative_pos, relative_mat) if not np.isfinite(p.sum() + r.sum())]
-            raise ValueError(f"NaN in the pose of the BioTac or of geom {', '.join(bad)}: check mocap_pos, qpos and qvel at time {data.time:g} s")
-        return relative_pos, relative_mat
+        owner = mat[self.group]
+        geom_pos = pos[self.group] + (owner @ self._geom_pos[:, :, None])[:, :, 0]
+        geom_mat = owner @ self._geom_mat
+        if not np.isfinite(geom_pos.sum() + geom_mat.sum()):
+            bad = [g.name or f"#{i}" for g, i, p, r in zip(self.geoms, self.geom, geom_pos, geom_mat) if not np.isfinite(p.sum() + r.sum())]
+            raise ValueError(f"NaN in the pose of the BioTac or of geom {', '.join(bad)}: check mocap_pos, qpos and qvel")
+        return geom_pos, geom_mat
 
 
 def _cross(a, b):
@@ -96,6 +101,30 @@ def rotation(vector):
     k[:, 0, 1], k[:, 0, 2], k[:, 1, 2] = -vector[:, 2], vector[:, 1], -vector[:, 0]
     k -= k.transpose(0, 2, 1)
     return np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+
+
+def _matrix(quat):
+    """(n, 3, 3) rotations of (n, 4) unit quaternions."""
+    w, x, y, z = quat.T
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+
+
+def displacement(pos, mat, pos0, mat0):
+    """(n, 6) small motions (translation of the origin's point, rotation vector) that take poses (n, 3), (n, 3, 3) from pos0, mat0 to pos, mat."""
+    turn = mat @ mat0.transpose(0, 2, 1)
+    axis = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    sine = np.sqrt(np.einsum("ij,ij->i", axis, axis))
+    angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1))
+    vector = axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None]
+    return np.concatenate([pos - pos0 - _cross(vector, pos0), vector], axis=1)
+
+
+def displace(pos, mat, motion):
+    """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
+    turn = rotation(motion[:, 3:])
+    return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
 
 
 def _select(model, core, names):
