@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Geoms:
-    """Touching geoms in the BioTac frame; arrays over worlds are [geom, world]."""
+    """Touching geoms in the BioTac frame, at the end and at the start of the step; arrays over worlds are [geom, world]."""
 
     count: int
     kind: wp.array(dtype=int)
@@ -29,6 +29,8 @@ class Geoms:
     friction: wp.array2d(dtype=real)
     pos: wp.array2d(dtype=vec3)
     mat: wp.array2d(dtype=mat33)
+    pos_last: wp.array2d(dtype=vec3)
+    mat_last: wp.array2d(dtype=mat33)
     grids: Grids
 
 
@@ -69,11 +71,11 @@ def contact_force(
     face: wp.array(dtype=wp.vec3i),
     area: wp.array(dtype=real),
     sample: wp.array(dtype=vec3),
-    offset: wp.array(dtype=real),
     stiffness: real,
     stick_ratio: real,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
     # Out:
@@ -124,9 +126,8 @@ def contact_force(
                 R = geoms.mat[g, w]
                 y = wp.transpose(R) * (p - geoms.pos[g, w])
                 dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                d = dn[3] - offset[i]
-                if d < gap:
-                    gap = d
+                if dn[3] < gap:
+                    gap = dn[3]
                     touched = g
                     normal = vec3(dn[0], dn[1], dn[2])
                     local = y
@@ -138,8 +139,13 @@ def contact_force(
                 K = k * nn
                 mu = geoms.friction[touched, w]
                 stick = local
-                if mu > real(0.0) and anchor_geom[i, w] == touched:
-                    stick = anchor[i, w]
+                if mu > real(0.0):
+                    if anchor_geom[i, w] == touched:
+                        stick = anchor[i, w]
+                    else:
+                        # touched within this step: slip counts from where the sample was on the geom when the step began
+                        last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
+                        stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                     slip = local - stick
                     slip = slip - wp.dot(slip, normal) * normal
                     length = wp.length(slip)

@@ -84,8 +84,10 @@ class SkinData:
             self.jacobian = wp.zeros((model.nelem, nworld), dtype=real)
             self.corner = wp.zeros((4 * model.nelem, nworld), dtype=vec3)
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
-            self.inner = ContactState(model.inner, nsample, model.nvert, nworld) if model.inner else None
-            self.face_volume = wp.zeros((len(model.inner.face) if model.inner else 0, nworld), dtype=real)
+            self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
+            ninner = len(model.inner.face) if model.inner else 0
+            self.face_volume = wp.zeros((ninner, nworld), dtype=real)
+            self.inner_corner = wp.zeros((3 * ninner, nworld), dtype=vec3)
         self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
         self.core_pos = np.zeros((nworld, 3))
         self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
@@ -99,8 +101,8 @@ class SkinData:
         self.velocity.zero_()
         self.force.zero_()
         self.outer.reset()
-        if self.inner:
-            self.inner.reset()
+        if self.core:
+            self.core.reset()
         self.wrench = np.zeros((self.nworld, 0, 6))
         self.pressure = np.zeros(self.nworld)
         self.volume = np.full(self.nworld, self.model.liquid_volume)
@@ -108,7 +110,6 @@ class SkinData:
         self.nonconverged = np.zeros(self.nworld, int)
         self.iterations = np.zeros(self.nworld, int)
         self.error = np.zeros(self.nworld)
-        self._moved = False
 
     @property
     def vert_xpos(self):
@@ -120,7 +121,7 @@ class SkinData:
 
     @property
     def core_force(self):
-        return _leading(self.inner.node_force) if self.inner else np.zeros((self.nworld, self.model.nvert, 3))
+        return _leading(self.core.node_force) if self.core else np.zeros((self.nworld, self.model.nvert, 3))
 
     @property
     def reaction(self):

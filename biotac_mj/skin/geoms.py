@@ -61,8 +61,16 @@ class GeomSet:
             struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
             struct.pos = wp.zeros((count, nworld), dtype=vec3)
             struct.mat = wp.array(np.tile(np.eye(3), (count, nworld, 1, 1)), dtype=mat33) if count else wp.zeros((0, nworld), dtype=mat33)
-        struct.grids = pack_grids(grids, self.device)
+            struct.pos_last = wp.clone(struct.pos)
+            struct.mat_last = wp.clone(struct.mat)
+        struct.grids, self._meshes = pack_grids(grids, self.device)
         self.struct = struct
+        self._posed = False
+
+    def advance(self):
+        """Makes the poses of this step those of the last one."""
+        wp.copy(self.struct.pos_last, self.struct.pos)
+        wp.copy(self.struct.mat_last, self.struct.mat)
 
     def set_pose(self, pos, mat=None):
         """Poses of the geoms in the BioTac frame.
@@ -77,6 +85,9 @@ class GeomSet:
         self._assign(self.struct.pos, pos, (3,), "positions")
         if mat is not None:
             self._assign(self.struct.mat, mat, (3, 3), "rotations")
+        if not self._posed:
+            self._posed = True
+            self.advance()
 
     def set_friction(self, friction):
         """Coulomb coefficients (ngeom,) or (nworld, ngeom)."""

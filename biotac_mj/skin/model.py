@@ -27,6 +27,7 @@ class SkinOptions:
       liquid: fills the space between skin and core; None takes the material preset's choice.
       bulk_modulus: of the liquid [Pa]; water has 2.2e9.
       core_contact: whether the inner surface can touch the rigid core.
+      core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core contact [m].
       contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference solutions' ratio.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
@@ -43,6 +44,7 @@ class SkinOptions:
     liquid: bool | None = None
     bulk_modulus: float = 2.2e9
     core_contact: bool = True
+    core_clearance: float = 2e-5
     contact_stiffness: float | None = None
     stick_ratio: float = 0.1
     samples: int = 4
@@ -67,24 +69,22 @@ class SkinOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], offsets of the samples' gaps [m], node incidence."""
+    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], node incidence."""
 
     face: wp.array
     area: wp.array
-    offset: wp.array
     start: wp.array
     slot: wp.array
     face_np: np.ndarray
 
     @classmethod
-    def create(cls, vert, face, samples, device):
+    def create(cls, vert, face, device):
         edge = vert[face[:, 1:]] - vert[face[:, :1]]
         area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
         start, slot = elasticity.incidence(len(vert), face)
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
             wp.array(area, dtype=real, device=device),
-            wp.zeros(len(face) * samples, dtype=real, device=device),
             wp.array(start, dtype=int, device=device),
             wp.array(slot, dtype=int, device=device),
             face,
@@ -100,12 +100,13 @@ class SkinModel:
       options: SkinOptions.
       device: "cpu" or a CUDA device of Warp.
       fixed: (n,) nodes that do not move, instead of the geometry's.
+      core_faces: (n,) inner faces that can meet the core, instead of all that start clear of it.
 
     Raises:
       ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed.
     """
 
-    def __init__(self, geometry: SkinGeometry, material_choice="default", options: SkinOptions | None = None, device="cpu", fixed=None):
+    def __init__(self, geometry: SkinGeometry, material_choice="default", options: SkinOptions | None = None, device="cpu", fixed=None, core_faces=None):
         self.geometry = geometry
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
@@ -139,13 +140,13 @@ class SkinModel:
             self.slot = wp.array(slot, dtype=int)
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(contact.face_samples(self.options.samples), dtype=vec3)
-            nsample = len(self.sample)
-            self.outer = Surface.create(vert, geometry.outer_face, nsample, self.device)
-            self.inner = Surface.create(vert, geometry.inner_face, nsample, self.device) if len(geometry.inner_face) else None
+            self.outer = Surface.create(vert, geometry.outer_face, self.device)
+            self.inner = Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
         self.has_liquid = bool(self.has_liquid and self.inner is not None)
         self.has_core = bool(self.options.core_contact and self.inner is not None and len(geometry.core_face))
         if self.has_core:
-            self._offset_core()
+            faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
+            self.core_surface = Surface.create(vert, faces, self.device)
         self.rest_volume, self.liquid_volume = self._volumes()
         stiffness = elasticity.rest_stiffness(self.nvert, elem, inverse_edges, volume, self.material.mu, self.material.lame)
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
@@ -158,12 +159,13 @@ class SkinModel:
             self._cores[nworld] = GeomSet(["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device)
         return self._cores[nworld]
 
-    def _offset_core(self):
-        """A skin that starts slightly inside the core (bonded areas, faceted surfaces) starts without force: its gap counts from there."""
-        gap = wp.zeros(len(self.inner.offset), dtype=real, device=self.device)
-        wp.launch(contact.rest_gap, dim=(len(self.inner.face), len(self.sample)),
+    def _core_faces(self) -> np.ndarray:
+        """Inner faces that can meet the core: those that start nearer to it than the clearance lie on it (bonded, or faceted into it)."""
+        face = self.geometry.inner_face
+        gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
+        wp.launch(contact.rest_gap, dim=(len(face), len(self.sample)),
                   inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert], outputs=[gap], device=self.device)  # fmt: skip
-        wp.copy(self.inner.offset, wp.array(np.minimum(gap.numpy(), 0.0), dtype=real, device=self.device))
+        return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 
     def _volumes(self):
         if self.inner is None:
@@ -204,4 +206,4 @@ class _Key:
 
 
 def _core_grid(geometry: SkinGeometry):
-    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 1.5e-4)
+    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 3e-4)

@@ -21,8 +21,9 @@ _FAR = wp.constant(wp.float64(1.0e3))
 
 @wp.struct
 class Grids:
-    """Distance grids of all meshes, one after another."""
+    """Distance grids of all meshes, one after another, and the meshes themselves (millimetres)."""
 
+    mesh: wp.array(dtype=wp.uint64)
     value: wp.array(dtype=wp.float32)
     first: wp.array(dtype=int)
     shape: wp.array(dtype=wp.vec3i)
@@ -38,11 +39,14 @@ class DistanceGrid:
       value: (nx, ny, nz) float32, negative inside [m].
       origin: (3,) position of value[0, 0, 0] [m].
       spacing: of the grid, the same along the three axes [m].
+      vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from the triangles.
     """
 
     value: np.ndarray
     origin: np.ndarray
     spacing: float
+    vert: np.ndarray
+    face: np.ndarray
 
 
 @wp.kernel
@@ -70,37 +74,44 @@ def bake_distance_grid(vert: np.ndarray, face: np.ndarray, cells: int = 64, marg
     vert, face = np.asarray(vert, float), np.asarray(face, np.int32)
     if not len(vert) or not len(face):
         raise ValueError("a mesh geom without faces has no distance field: give it a triangle mesh")
-    _, merged = np.unique(vert.round(9), axis=0, return_inverse=True)
+    _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
     welded = merged.reshape(-1)[face]
     edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
-    if {tuple(e) for e in edges} != {tuple(e[::-1]) for e in edges}:
+    if not np.array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)):
         raise ValueError("the mesh is open: its inside is not defined; close its holes")
     low, high = vert.min(0), vert.max(0)
     if spacing is None:
         spacing = float((high - low).max() / cells)
-    # millimetres: single-precision queries drop triangles that are tiny in metres
+    mesh = _mesh(vert, face, "cpu", support_winding_number=True)
     scale = 1e3
-    mesh = wp.Mesh(wp.array(vert * scale, dtype=wp.vec3, device="cpu"), wp.array(face.ravel(), dtype=int, device="cpu"), support_winding_number=True)
     shape = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
     origin = low - margin
     value = wp.zeros(int(shape.prod()), dtype=wp.float32, device="cpu")
     reach = float(np.linalg.norm(high - low) + 4 * margin) * scale
     wp.launch(_bake, dim=len(value), inputs=[mesh.id, wp.vec3(*(origin * scale)), spacing * scale, int(shape[1]), int(shape[2]), reach],
               outputs=[value], device="cpu")  # fmt: skip
-    return DistanceGrid((value.numpy() / scale).reshape(shape), origin, spacing)
+    return DistanceGrid((value.numpy() / scale).reshape(shape), origin, spacing, vert, face)
 
 
-def pack_grids(grids, device) -> Grids:
-    """The grids as one Warp struct; an empty list gives one grid of a single far value."""
-    grids = list(grids) or [DistanceGrid(np.full((2, 2, 2), 1e3, np.float32), np.zeros(3), 1.0)]
+def _mesh(vert, face, device, **options) -> wp.Mesh:
+    """In millimetres: single-precision queries drop triangles that are tiny in metres."""
+    return wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device), **options)
+
+
+def pack_grids(grids, device):
+    """The grids as one Warp struct, and the meshes, which must live as long as the struct does."""
+    grids = list(grids)
+    meshes = [_mesh(g.vert, g.face, device) for g in grids]
     packed = Grids()
-    packed.value = wp.array(np.concatenate([g.value.ravel() for g in grids]).astype(np.float32), device=device)
-    packed.first = wp.array(np.cumsum([0] + [g.value.size for g in grids[:-1]]).astype(np.int32), device=device)
-    packed.shape = wp.array(np.array([g.value.shape for g in grids], np.int32), dtype=wp.vec3i, device=device)
-    packed.origin = wp.array(np.array([g.origin for g in grids]), dtype=vec3, device=device)
-    packed.spacing = wp.array(np.array([g.spacing for g in grids]), dtype=real, device=device)
-    return packed
+    with wp.ScopedDevice(device):
+        packed.mesh = wp.array([m.id for m in meshes], dtype=wp.uint64)
+        packed.value = wp.array(np.concatenate([g.value.ravel() for g in grids] or [np.zeros(0)]), dtype=wp.float32)
+        packed.first = wp.array(np.cumsum([0] + [g.value.size for g in grids[:-1]])[: len(grids)], dtype=int)
+        packed.shape = wp.array(np.array([g.value.shape for g in grids]).reshape(-1, 3), dtype=wp.vec3i)
+        packed.origin = wp.array(np.array([g.origin for g in grids]).reshape(-1, 3), dtype=vec3)
+        packed.spacing = wp.array([g.spacing for g in grids], dtype=real)
+    return packed, meshes
 
 
 @wp.func
@@ -131,22 +142,48 @@ def _grid_value(grids: Grids, k: int, p: vec3):
 
 
 @wp.func
-def _grid_distance(grids: Grids, k: int, p: vec3):
+def _mesh_distance(grids: Grids, k: int, p: vec3):
+    """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay sharp."""
     d = _grid_value(grids, k, p)
-    if d >= _FAR:
+    h = grids.spacing[k]
+    if d > real(2.0) * h:
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    # differences over half a cell each way: unlike the trilinear gradient they are continuous from cell to cell
-    h = real(0.5) * grids.spacing[k]
-    ex = vec3(h, real(0.0), real(0.0))
-    ey = vec3(real(0.0), h, real(0.0))
-    ez = vec3(real(0.0), real(0.0), h)
-    n = vec3(
-        wp.min(_grid_value(grids, k, p + ex), real(1.0)) - wp.min(_grid_value(grids, k, p - ex), real(1.0)),
-        wp.min(_grid_value(grids, k, p + ey), real(1.0)) - wp.min(_grid_value(grids, k, p - ey), real(1.0)),
-        wp.min(_grid_value(grids, k, p + ez), real(1.0)) - wp.min(_grid_value(grids, k, p - ez), real(1.0)),
-    )
-    n = wp.normalize(n)
-    return wp.vec4d(n[0], n[1], n[2], d)
+    if d < -real(2.0) * h:
+        n = vec3(
+            _grid_value(grids, k, p + vec3(h, real(0.0), real(0.0))) - _grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
+            _grid_value(grids, k, p + vec3(real(0.0), h, real(0.0))) - _grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
+            _grid_value(grids, k, p + vec3(real(0.0), real(0.0), h)) - _grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
+        )
+        n = wp.normalize(n)
+        return wp.vec4d(n[0], n[1], n[2], d)
+    mesh = grids.mesh[k]
+    q = wp.vec3(wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3)))
+    query = wp.mesh_query_point_sign_normal(mesh, q, 4.0e3 * wp.float32(h))
+    if not query.result:
+        return wp.vec4d(real(1.0), real(0.0), real(0.0), real(4.0) * h)
+    a = _double(wp.mesh_get_point(mesh, 3 * query.face))
+    ab = _double(wp.mesh_get_point(mesh, 3 * query.face + 1)) - a
+    ac = _double(wp.mesh_get_point(mesh, 3 * query.face + 2)) - a
+    mm = real(1.0e3) * p
+    u = real(query.u)
+    v = real(query.v)
+    w = real(1.0) - u - v
+    n = wp.normalize(wp.cross(ab, ac))
+    edge = real(1.0e-5)
+    if wp.min(u, wp.min(v, w)) > edge:
+        d = wp.dot(mm - a, n)  # over the inside of a face: its plane, exactly
+    else:
+        away = mm - (a + v * ab + w * ac)
+        d = wp.length(away)
+        if d > real(1.0e-5):
+            n = real(query.sign) * away / d
+        d = real(query.sign) * d
+    return wp.vec4d(n[0], n[1], n[2], d * real(1.0e-3))
+
+
+@wp.func
+def _double(p: wp.vec3):
+    return vec3(real(p[0]), real(p[1]), real(p[2]))
 
 
 @wp.func
@@ -247,4 +284,4 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
         return _rounded_cylinder(size[0], size[1], rounding, p)
     if kind == 6:
         return _rounded_box(size, rounding, p)
-    return _grid_distance(grids, grid, p)
+    return _mesh_distance(grids, grid, p)

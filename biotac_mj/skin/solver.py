@@ -69,22 +69,58 @@ class _Step:
         d, options = self.d, self.m.options
         active = np.ones(d.nworld, bool)
         d.iterations[:] = 0
+        self._evaluate()
         for iteration in range(options.max_newton + 1):
-            self._evaluate()
             residual = self.force * self.mask
             finite = np.isfinite(_host(residual.sum((0, 2))))
             self.M.update(self._tangents(), self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             z = self.M.apply(residual)
             error = _host((residual * z).sum((0, 2)))
-            load = view(d.outer.node_force) + (view(d.inner.node_force) if d.inner else 0)
+            load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
             active = finite & ~(error <= options.tolerance**2 * work)
             if not active.any() or iteration == options.max_newton:
                 break
             d.iterations += active
-            self.x += self._conjugate_gradients(residual, z, active)
+            self._line_search(self._conjugate_gradients(residual, z, active), residual, active)
         self._finish(finite & ~active)
+
+    def _line_search(self, dx, residual, active):
+        """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the full step overshoots.
+
+        Along a descent direction of an energy that is its minimum; friction has no energy, its work along dx still has to balance.
+        """
+        base = _copy(self.x)
+        slope = _host((residual * dx).sum((0, 2)))
+        low, high = np.zeros_like(slope), np.full_like(slope, np.nan)
+        slope_low, slope_high = slope.copy(), slope.copy()
+        alpha = np.where(active, 1.0, 0.0)
+        side = np.zeros(len(slope), int)
+        for _ in range(12):
+            self.x[...] = base + _like(self.x, alpha)[:, None] * dx
+            self._evaluate()
+            now = _host((self.force * dx).sum((0, 2)))
+            valid = np.isfinite(now)
+            if self.m.material.law == "neo_hookean":
+                valid &= _host(view(self.d.jacobian).min(0) if isinstance(self.x, np.ndarray) else view(self.d.jacobian).amin(0)) > 0.02
+            enough = ~active | (valid & (now >= -0.5 * slope))
+            enough &= ~active | np.isnan(high) | (now <= 0.5 * slope)
+            if enough.all():
+                break
+            over = ~enough & (~valid | (now < 0))
+            under = ~enough & ~over
+            # Illinois: an end that stays twice loses half of its slope
+            slope_low = np.where(over & (side == 1), slope_low / 2, slope_low)
+            slope_high = np.where(under & (side == -1), slope_high / 2, slope_high)
+            side = np.where(over, 1, np.where(under, -1, side))
+            low, slope_low = np.where(under, alpha, low), np.where(under, now, slope_low)
+            high, slope_high = np.where(over, alpha, high), np.where(over, np.where(valid, now, -np.inf), slope_high)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                secant = low + (high - low) * slope_low / (slope_low - slope_high)
+            secant = np.where(np.isfinite(slope_high), secant, (low + high) / 2)
+            secant = np.clip(secant, low + 0.05 * (high - low), high - 0.05 * (high - low))
+            alpha = np.where(enough, alpha, secant)
 
     def _evaluate(self):
         """Forces at x: elastic, contact, core, liquid, inertia."""
@@ -95,13 +131,13 @@ class _Step:
         launch(elasticity.gather, (n, w), [m.start, m.slot, d.corner, 1.0, 0], [d.force])
         self._contact(d.outer, self.geoms)
         if m.has_core:
-            self._contact(d.inner, m.core(w))
+            self._contact(d.core, m.core(w))
         if m.inner is not None:
             launch(liquid.cavity_volume, d.face_volume.shape, [m.inner.face, d.x], [d.face_volume])
             d.volume = m.liquid_volume + _host(view(d.face_volume).sum(0)) - m.rest_volume
         if m.has_liquid:
-            launch(liquid.volume_gradient, d.face_volume.shape, [m.inner.face, d.x], [d.inner.corner])
-            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.inner.corner, 1.0, 0], [d.gradient])
+            launch(liquid.volume_gradient, d.face_volume.shape, [m.inner.face, d.x], [d.inner_corner])
+            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.inner_corner, 1.0, 0], [d.gradient])
             d.pressure = -self.kappa * (d.volume - m.liquid_volume)
             self.force += _like(self.x, d.pressure)[:, None] * self.gradient
         if self.inertia is not None:
@@ -114,14 +150,14 @@ class _Step:
         surface, launch = state.surface, _launcher(m.device)
         launch(
             contact.contact_force, state.touching.shape,
-            [surface.face, surface.area, m.sample, surface.offset, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, state.anchor_geom, state.anchor],
+            [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last, state.anchor_geom, state.anchor],
             [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
         )  # fmt: skip
         launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
         self.force += view(state.node_force)
 
     def _tangents(self):
-        states = [self.d.outer] + ([self.d.inner] if self.m.has_core else [])
+        states = [self.d.outer] + ([self.d.core] if self.m.has_core else [])
         return [(s.surface.face_np, s.touching.numpy(), view(s.block)) for s in states]
 
     def _elastic_product(self, p):
@@ -143,7 +179,7 @@ class _Step:
             q *= 1 + m.options.stiffness_damping / self.dt
             q += (1 + m.options.mass_damping * self.dt) * self.inertia * p
         launch = _launcher(m.device)
-        for s in [d.outer] + ([d.inner] if m.has_core else []):
+        for s in [d.outer] + ([d.core] if m.has_core else []):
             launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
             launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
         if m.has_liquid:
@@ -200,6 +236,8 @@ class _Step:
             )  # fmt: skip
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
         d.outer.commit()
+        self.geoms.advance()
+        wp.copy(d.x_last, d.x)
         if self.inertia is not None:
             pos, mat = self.pose
             world = np.einsum("wij,nwj->nwi", mat, d.x.numpy()) + pos
