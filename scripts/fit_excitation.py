@@ -1,8 +1,7 @@
 """Where the four excitation electrodes of the film model may sit: fits EXCITATION and CONDUCTIVITY of biotac_mj/sensor/film.py.
 
-Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric about z = 0, whose film impedances
-at rest come
-nearest to the published rest counts: least RMS of ln(published / film) after its mean, over the mean pattern of the three published
+Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric about z = 0, whose film
+impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its mean, over the mean pattern of the three published
 sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an estimate, not a measurement; the list of local optima
 shows how flat it is.
 
@@ -33,7 +32,7 @@ def pairs(parameter):
 
 
 def misfit(geometry, parameter, goal):
-    """RMS of ln(published / film) about its mean, its mean, and the correlation; infinite where discs overlap or have no film."""
+    """RMS of ln(published / film) about its mean, its mean, and the correlation; infinite where discs overlap or lack a film."""
     try:
         film = FilmConduction(geometry, excitation=pairs(parameter), sensor=None)
         centre = np.concatenate([geometry.electrode_pos, film.excitation_pos])

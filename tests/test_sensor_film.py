@@ -97,7 +97,7 @@ def test_annulus_converges_with_second_order():
 
 
 def test_tube_resistance_per_length(tube_film):
-    """Far from the excitation discs the current is uniform: Z grows by 1 / (sigma h 2 pi R) per length, R the radius of the film's middle."""
+    """Far from the excitation discs Z grows by 1 / (sigma h 2 pi R) per length, R the radius of the film's middle."""
     impedance = tube_film.impedance(tube_film.geometry.vert)
     x = tube_film.geometry.electrode_pos[:, 0]
     far = x < 30e-3  # the discs' own near field is the same everywhere, but for the tube's open end

@@ -28,9 +28,9 @@ class CoreSurface:
         area = np.linalg.norm(cross, axis=1)
         corner, cross, area = corner[area > 0], cross[area > 0], area[area > 0]
         self.normal = cross / area[:, None]
-        self.origin = corner[:, 0]
-        self.edge1, self.edge2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        self._gram = np.stack([(self.edge1**2).sum(1), (self.edge1 * self.edge2).sum(1), (self.edge2**2).sum(1)], axis=1)
+        origin, edge1, edge2 = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        gram = np.stack([(edge1**2).sum(1), (edge1 * edge2).sum(1), (edge2**2).sum(1)], axis=1)
+        self._packed = np.concatenate([origin, edge1, edge2, gram], axis=1)  # one gather per query
         points, owner = _sample(corner, spacing)
         self._tree, self._owner = cKDTree(points), owner
 
@@ -45,12 +45,13 @@ class CoreSurface:
         """
         point = np.asarray(point, dtype=float)
         triangle = self._owner[self._tree.query(point, k=_CANDIDATES)[1]]
-        offset = point[:, None] - self.origin[triangle]
-        s, t = _closest_on_triangle(self._gram[triangle], (offset * self.edge1[triangle]).sum(-1), (offset * self.edge2[triangle]).sum(-1))
-        gap = offset - s[..., None] * self.edge1[triangle] - t[..., None] * self.edge2[triangle]
-        best = np.argmin((gap**2).sum(-1), axis=1)[:, None]
-        gap = np.take_along_axis(gap, best[..., None], axis=1)[:, 0]
-        triangle = np.take_along_axis(triangle, best, axis=1)[:, 0]
+        packed = self._packed[triangle]
+        edge1, edge2 = packed[..., 3:6], packed[..., 6:9]
+        offset = point[:, None] - packed[..., :3]
+        s, t = _closest_on_triangle(packed[..., 9:], np.einsum("nki,nki->nk", offset, edge1), np.einsum("nki,nki->nk", offset, edge2))
+        gap = offset - s[..., None] * edge1 - t[..., None] * edge2
+        best = np.arange(len(point)), np.argmin(np.einsum("nki,nki->nk", gap, gap), axis=1)
+        gap, triangle = gap[best], triangle[best]
         sign = np.where((gap * self.normal[triangle]).sum(1) < 0, -1.0, 1.0)
         return sign * np.sqrt((gap**2).sum(1)), point - gap, triangle
 

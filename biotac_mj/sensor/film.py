@@ -30,7 +30,7 @@ EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 
 CONDUCTIVITY = 0.367  # [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at 25 C
 _CORE_RADIUS = 5.325e-3  # [m], published cylinder about the x axis; only says where to look for the core's surface
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
-_SLACK = 2.5e-3  # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
+_SLACK = 2.0e-3  # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
 
 
 class FilmConduction:
