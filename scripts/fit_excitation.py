@@ -1,9 +1,9 @@
 """Where the four excitation electrodes of the film model may sit: fits EXCITATION and CONDUCTIVITY of biotac_mj/sensor/film.py.
 
 Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric about z = 0, whose film
-impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its mean, over the mean pattern of the three published
-sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an estimate, not a measurement; the list of local optima
-shows how flat it is.
+impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its mean, over the mean pattern of
+the three published sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an estimate, not a measurement; the
+list of local optima shows how flat it is. EXCITATION is the best on the paper's mesh (import it, then pass --skin); takes a minute.
 
     python scripts/fit_excitation.py [--skin default]
 """
