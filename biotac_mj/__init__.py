@@ -24,6 +24,8 @@ from . import plugin  # registers the engine plugin  # noqa: E402
 
 __version__ = "0.1.0"
 
+__all__ = ["SkinData", "SkinGeometry", "SkinModel", "__version__", "attach", "import_mesh", "load_skin", "plugin", "step"]
+
 _HOME = {
     "SkinGeometry": "geometry",
     "load_skin": "geometry",
@@ -33,8 +35,6 @@ _HOME = {
     "step": "skin",
     "attach": "coupling",
 }
-
-__all__ = ["__version__", "plugin", *_HOME]
 
 
 def __getattr__(name):

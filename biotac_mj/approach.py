@@ -7,7 +7,8 @@ from .geometry.skin_geometry import SkinGeometry
 
 __all__ = ["first_touch", "nearest_point", "surface_point"]
 
-_PATCH = 1.5e-3  # radius over which the normal is averaged [m]: about two edges of the default skin, so that it is the finger's and not a triangle's
+# radius over which a normal is averaged [m]: about two edges of the default skin, so that it is the finger's and not one triangle's
+_PATCH = 1.5e-3
 
 
 def _hits(tri, origin, direction):
@@ -26,7 +27,7 @@ def _hits(tri, origin, direction):
 
 
 def _closest(tri, point):
-    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: the plane's foot where it is inside, else the best of the three edges."""
+    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: the foot on the plane if inside, else the best of the three edges."""
     a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -92,11 +93,13 @@ def _split(tri):
     return np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
 
-def first_touch(geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjData, direction, resolution: float = 2e-5, keep: int = 48) -> float:
+def first_touch(
+    geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjData, direction, resolution: float = 2e-5, keep: int = 48
+) -> float:
     """How far the geoms of a model travel along a direction until they first touch the resting skin.
 
-    Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split again and again, so that the touch is found
-    inside faces too.
+    Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split again and again, so that the
+    touch is found inside faces too.
 
     Args:
       geometry: the skin, in the world frame of the model.

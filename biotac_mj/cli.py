@@ -40,7 +40,9 @@ def _verb(verbs, name, run, text):
 def _add_skin(verb):
     verb.add_argument("--skin", default="default", help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`")
     verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
-    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)")
+    verb.add_argument(
+        "--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)"
+    )
     verb.add_argument("--seed", type=int, default=0, help="of the sensor's noise")
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
 
@@ -53,7 +55,9 @@ def _add_press(verbs):
     verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM",
                       help="where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X Y Z, moved to the "
                       "nearest point of the skin. BioTac frame: tip at -x, pad at -y, nail at +y")  # fmt: skip
-    verb.add_argument("--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of the press (default: inward normal of the skin there)")
+    verb.add_argument(
+        "--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of the press (default: inward normal of the skin there)"
+    )
     verb.add_argument("--depth", type=float, default=2.4, metavar="MM", help="travel from first touch")
     verb.add_argument("--slide", type=float, default=0.0, metavar="MM", help="travel along the skin after the press")
     verb.add_argument("--slide-direction", type=float, nargs=3, default=[1.0, 0.0, 0.0], metavar=("X", "Y", "Z"), help="of the slide")
@@ -62,7 +66,9 @@ def _add_press(verbs):
     verb.add_argument("--timestep", type=float, default=4.0, metavar="MS", help="of MuJoCo")
     ways = verb.add_mutually_exclusive_group()
     ways.add_argument("--one-way", dest="two_way", action="store_false", default=False, help="the indenter's path is prescribed (default)")
-    ways.add_argument("--two-way", dest="two_way", action="store_true", default=False, help="a servo with mass pushes the indenter and gives way")
+    ways.add_argument(
+        "--two-way", dest="two_way", action="store_true", default=False, help="a servo with mass pushes the indenter and gives way"
+    )
     verb.add_argument("--mu", type=float, default=None, help="friction between skin and indenter (default: the material's)")
     _add_skin(verb)
     verb.add_argument("--out", default="out/press", metavar="DIR", help="folder of the results")
@@ -99,7 +105,12 @@ def _press(args):
 
 
 def _add_view(verbs):
-    verb = _verb(verbs, "view", _view, "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag with ctrl and right button.")
+    verb = _verb(
+        verbs,
+        "view",
+        _view,
+        "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag with ctrl and right button.",
+    )
     _add_skin(verb)
     verb.add_argument("--render", metavar="FILE", help="write a picture of the ball lying on the pad instead of opening a window")
     verb.add_argument("--seconds", type=float, default=0.3, help="how long to simulate before --render")
@@ -108,7 +119,15 @@ def _add_view(verbs):
 def _view(args):
     from . import view
 
-    view.view(skin=args.skin, material=args.material, liquid=args.liquid, seed=args.seed, device=args.device, render=args.render, seconds=args.seconds)
+    view.view(
+        skin=args.skin,
+        material=args.material,
+        liquid=args.liquid,
+        seed=args.seed,
+        device=args.device,
+        render=args.render,
+        seconds=args.seconds,
+    )
 
 
 def _add_import_mesh(verbs):

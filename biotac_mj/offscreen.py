@@ -1,7 +1,7 @@
 """Pictures without a window: MuJoCo's renderer on whichever GL library works here.
 
-`mujoco.Renderer` is bound to the library that MUJOCO_GL named when mujoco was imported. Here the library is looked for when it is needed, and tried in a
-process of its own first, because a broken one may take the process with it.
+`mujoco.Renderer` is bound to the library that MUJOCO_GL named when mujoco was imported. Here the library is looked for when it is
+needed, and tried in a process of its own first, because a broken one may take the process with it.
 """
 
 import contextlib

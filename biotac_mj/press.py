@@ -1,4 +1,7 @@
-"""One press of an indenter into a BioTac with `mj_step`: where it goes, the scene, the run. What is written of it: press_record, press_report."""
+"""One press of an indenter into a BioTac with `mj_step`: where it goes, the scene, the run.
+
+What is kept and written of it is in `press_record` and `press_report`.
+"""
 
 import dataclasses
 import time
@@ -12,7 +15,7 @@ from .geometry.skin_geometry import SkinGeometry
 from .press_record import PressRecord
 from .sensor.channels import CHANNELS
 
-__all__ = ["Path", "PressOptions", "build_scene", "plan_path", "press", "render"]
+__all__ = ["Path", "PressOptions", "build_scene", "plan_path", "press", "render", "see_through"]
 
 _LEAD = 5e-6  # the indenter starts this far before first touch [m]
 _PREFIX = "biotac_"
@@ -119,7 +122,9 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
     direction = -normal if options.direction is None else np.asarray(options.direction, float)
     direction = direction / np.linalg.norm(direction)
     if direction @ normal >= 0:
-        raise ValueError(f"direction {direction.round(3).tolist()} leaves the skin at {(1e3 * point).round(2).tolist()} mm: it must point into it")
+        raise ValueError(
+            f"direction {direction.round(3).tolist()} leaves the skin at {(1e3 * point).round(2).tolist()} mm: it must point into it"
+        )
     across = np.asarray(options.slide_direction, float)
     across = across - (across @ direction) * direction
     if options.slide and np.linalg.norm(across) < 1e-3 * np.linalg.norm(options.slide_direction):
@@ -144,7 +149,9 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
 
     rest = np.zeros(int(round(options.hold / options.timestep)))
     down, along = ramp(options.depth), ramp(options.slide)
-    depth = np.concatenate([[-_LEAD], down, rest + options.depth, 0 * along + options.depth, (rest if options.slide else rest[:0]) + options.depth])
+    depth = np.concatenate(
+        [[-_LEAD], down, rest + options.depth, 0 * along + options.depth, (rest if options.slide else rest[:0]) + options.depth]
+    )
     slid = np.concatenate([[0], 0 * down, rest, along, (rest if options.slide else rest[:0]) + options.slide])
     return Path(start, quat, direction, across, depth, slid)
 
@@ -171,7 +178,7 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
     spec.worldbody.add_body(name="finger")
 
     body = spec.worldbody.add_body(name="indenter", pos=path.position(-_LEAD), quat=path.quat, mocap=not options.two_way)
-    look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 0.45])
+    look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 0.35])
     if options.two_way:
         if indenter.type == "plane":
             raise ValueError("a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: press it one-way, or use a flat geom:box")
@@ -197,7 +204,15 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
         seed=options.seed,
         device=options.device,
     )
+    see_through(spec, handle)
     return spec, handle
+
+
+def see_through(spec, handle):
+    """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are seen."""
+    spec.skin(handle.prefix + "skin").rgba[3] = 0.45
+    for i in range(1, 20):
+        spec.site(f"{handle.prefix}e{i}").size[0] = 7e-4
 
 
 def _stage(spec):
@@ -208,17 +223,21 @@ def _stage(spec):
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
-    spec.worldbody.add_camera(name="press", pos=0.045 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
+    spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
     spec.worldbody.add_light(pos=[-0.1, -0.3, -0.1], dir=[0.6, 0.9, -0.1], diffuse=[0.5] * 3, specular=[0.1] * 3,
                              type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)  # fmt: skip
     spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = 0.35, 0.35, 0.05
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, width=8, height=48)
+    sky = spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, width=8, height=48
+    )
     sky.rgb1, sky.rgb2 = [1.0] * 3, [1.0] * 3
 
 
 def _read(handle, data):
     """What one step left: (3,) force of the skin on the indenter [N], (23,) counts, non-converged steps."""
-    counts = np.concatenate([handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])])  # of PAC's 22 the latest
+    counts = np.concatenate(
+        [handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])]
+    )  # of PAC's 22 the latest
     return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
 
 

@@ -67,14 +67,18 @@ def _from_geom(text):
     try:
         size = tuple(float(s) for s in sizes.split(",") if s)
     except ValueError:
-        raise ValueError(f"sizes {sizes!r} of 'geom:{text}' are not numbers: give half-sizes in metres, as in geom:capsule:0.003,0.005") from None
+        raise ValueError(
+            f"sizes {sizes!r} of 'geom:{text}' are not numbers: give half-sizes in metres, as in geom:capsule:0.003,0.005"
+        ) from None
     if kind == "plane":
         size = size or (0.02, 0.02, 0.001)
         needed = 3
     else:
         needed = _SIZES[kind]
     if len(size) != needed or not all(np.isfinite(s) and s > 0 for s in size):
-        raise ValueError(f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: as in geom:capsule:0.003,0.005")
+        raise ValueError(
+            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: as in geom:capsule:0.003,0.005"
+        )
     vert, face = _surface(kind, size)
     return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), _Z_TO_Y, vert @ _matrix(_Z_TO_Y).T, face)
 
@@ -103,9 +107,10 @@ def _matrix(quat):
 
 
 def make_indenter(text: str) -> Indenter:
-    """The indenter that a text asks for: a name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in metres.
+    """The indenter that a text asks for.
 
-    The z axis of a geom goes ahead: a capsule presses with its cap, a cylinder with its end, a plane with its front.
+    A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in metres. The z axis of a geom goes
+    ahead: a capsule presses with its cap, a cylinder with its end, a plane with its front.
 
     Raises:
       ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in metres.
@@ -119,7 +124,9 @@ def make_indenter(text: str) -> Indenter:
     if text not in INDENTERS:
         raise ValueError(f"unknown indenter {text!r}: choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE")
     shape = indenter(text)
-    return Indenter(text, shape.geom_type, shape.size, shape.rounding if shape.size else 0.0, np.array(shape.pos), np.array(shape.quat), *shape.mesh())
+    return Indenter(
+        text, shape.geom_type, shape.size, shape.rounding if shape.size else 0.0, np.array(shape.pos), np.array(shape.quat), *shape.mesh()
+    )
 
 
 def add_indenter(spec: mujoco.MjSpec, body, shape: Indenter, exact: bool = True, **geom):

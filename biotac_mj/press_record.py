@@ -103,7 +103,7 @@ def write_readings(record: PressRecord, path) -> None:
 
 
 def write_skin(record: PressRecord, path) -> None:
-    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m] with the skin's topology and the readings beside it; parameters and versions as JSON attributes."""
+    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and versions as JSON attributes."""
     import h5py
 
     geometry = record.geometry

@@ -23,7 +23,7 @@ def _unroll(points):
 
 
 def draw_electrodes(axes, record: PressRecord, step: int) -> None:
-    """The unrolled core: electrodes coloured by their change in counts, over contours of how far the skin moved."""
+    """The unrolled core: electrodes coloured by their change in counts (red: fewer, as in the render), over contours of the skin's motion."""
     geometry = record.geometry
     change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)
@@ -33,7 +33,7 @@ def draw_electrodes(axes, record: PressRecord, step: int) -> None:
         axes.tricontour(*_unroll(geometry.vert[outer]).T, moved, levels=6, colors="0.75", linewidths=0.8, zorder=1)
     limit = max(np.abs(change).max(), 1.0)
     place = _unroll(geometry.electrode_pos)
-    dots = axes.scatter(*place.T, c=change, cmap="RdBu_r", vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2)
+    dots = axes.scatter(*place.T, c=change, cmap="RdBu", vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2)
     for i, (x, y) in enumerate(place):
         dark = abs(change[i]) > 0.6 * limit
         axes.annotate(str(i + 1), (x, y), ha="center", va="center", fontsize=8, color="white" if dark else "black", zorder=3)
@@ -100,7 +100,7 @@ def draw_surface(axes, record: PressRecord, step: int) -> None:
     low, high = 1e3 * (geometry.vert @ _TO_PAD_UP.T).min(0), 1e3 * (geometry.vert @ _TO_PAD_UP.T).max(0)
     high[2] += 5
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.35)
+    axes.set_box_aspect(high - low, zoom=1.1)
     axes.view_init(np.degrees(elevation), np.degrees(azimuth))
     axes.set_axis_off()
 

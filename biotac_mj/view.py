@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from . import approach, plugin
+from .press import see_through
 from .press_record import replacing
 
 __all__ = ["build_scene", "view"]
@@ -36,16 +37,21 @@ def build_scene(skin="default", **attach_options):
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
     spec.visual.headlight.ambient[:] = 0.3
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384)
+    sky = spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384
+    )
     sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
-    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
     ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
     ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
     for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
         joint = ball.add_joint(name=f"ball_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-        joint.stiffness, joint.damping = stiffness, 0.5
-    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0], contype=0, conaffinity=0, rgba=[0.85, 0.45, 0.15, 0.6])
+        joint.stiffness[0], joint.damping[0] = stiffness, 0.5
+    ball.add_geom(
+        name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0], contype=0, conaffinity=0, rgba=[0.85, 0.45, 0.15, 0.6]
+    )
     handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
+    see_through(spec, handle)
     return spec, handle
 
 
@@ -69,9 +75,9 @@ def view(skin="default", material="default", liquid=None, seed=0, device="cpu", 
     data = mujoco.MjData(model)
     if render is not None:
         return _render(model, data, render, seconds)
-    import mujoco.viewer
+    from mujoco import viewer
 
-    with mujoco.viewer.launch_passive(model, data) as window:
+    with viewer.launch_passive(model, data) as window:
         while window.is_running():
             begin = time.perf_counter()
             mujoco.mj_step(model, data)

@@ -68,7 +68,7 @@ def synthetic_press(shell):
         xpos[step, inside] = center + radius * away[inside] / distance[inside, None]
     force = np.zeros((n, 3))
     force[:, 1] = -4 / 3 * 1.7e6 * np.sqrt(radius) * np.clip(depth, 0, None) ** 1.5
-    near = np.exp(-(np.linalg.norm(shell.electrode_pos - first_touch, axis=1) / 4e-3) ** 2)
+    near = np.exp(-((np.linalg.norm(shell.electrode_pos - first_touch, axis=1) / 4e-3) ** 2))
     counts = np.full((n, 23), 3000.0)
     counts[:, :19] += np.round(np.clip(depth, 0, None)[:, None] / 1.5e-3 * (150 - 900 * near))
     counts[:, 19] += np.round(2e5 * np.clip(depth, 0, None))

@@ -33,7 +33,9 @@ def test_import_registers_the_plugin():
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="MUJOCO_GL=nonsense is Linux's way to ask for a library that is not there")
 def test_a_gl_library_that_fails_does_not_stop_the_import():
-    result = run("import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, os.environ['MUJOCO_GL'])", MUJOCO_GL="nonsense")
+    result = run(
+        "import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, os.environ['MUJOCO_GL'])", MUJOCO_GL="nonsense"
+    )
     assert result.stdout.split() == ["0", "disable"], result.stderr
     assert "MUJOCO_GL=nonsense does not work here" in result.stderr
 

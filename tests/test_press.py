@@ -86,7 +86,9 @@ def touching_box(size):
 
     box = trimesh.creation.box(extents=[20 * size, 2 * size, 20 * size])
     none, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
-    return SkinGeometry("box", box.vertices, np.zeros((0, 4)), box.faces, no_face, [], none, no_face, none, no_face, none, no_face, none, none)
+    return SkinGeometry(
+        "box", box.vertices, np.zeros((0, 4)), box.faces, no_face, [], none, no_face, none, no_face, none, no_face, none, none
+    )
 
 
 @pytest.mark.parametrize(
