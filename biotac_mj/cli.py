@@ -18,6 +18,16 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
         return action.help if action.default in (None, False, True) else super()._get_help_string(action)
 
 
+_INDENTER_HELP = (
+    f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's sphere, capsule, cylinder, "
+    "ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres"
+)
+_LOCATION_HELP = (
+    "where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X Y Z, moved to the nearest point "
+    "of the skin. BioTac frame: tip at -x, pad at -y, nail at +y"
+)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     from . import __version__
@@ -49,12 +59,8 @@ def _add_skin(verb):
 
 def _add_press(verbs):
     verb = _verb(verbs, "press", _press, "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.")
-    verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME",
-                      help=f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's sphere, capsule, "
-                      "cylinder, ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres")  # fmt: skip
-    verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM",
-                      help="where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X Y Z, moved to the "
-                      "nearest point of the skin. BioTac frame: tip at -x, pad at -y, nail at +y")  # fmt: skip
+    verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=_INDENTER_HELP)
+    verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM", help=_LOCATION_HELP)
     verb.add_argument(
         "--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of the press (default: inward normal of the skin there)"
     )
@@ -88,11 +94,23 @@ def _press(args):
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
     options = press.PressOptions(
-        indenter=args.indenter, location=tuple(location), direction=args.direction and tuple(args.direction), depth=1e-3 * args.depth,
-        slide=1e-3 * args.slide, slide_direction=tuple(args.slide_direction), material=args.material, liquid=args.liquid, skin=args.skin,
-        timestep=1e-3 * args.timestep, speed=1e-3 * args.speed, hold=1e-3 * args.hold, two_way=args.two_way, friction=args.mu, seed=args.seed,
+        indenter=args.indenter,
+        location=tuple(location),
+        direction=args.direction and tuple(args.direction),
+        depth=1e-3 * args.depth,
+        slide=1e-3 * args.slide,
+        slide_direction=tuple(args.slide_direction),
+        material=args.material,
+        liquid=args.liquid,
+        skin=args.skin,
+        timestep=1e-3 * args.timestep,
+        speed=1e-3 * args.speed,
+        hold=1e-3 * args.hold,
+        two_way=args.two_way,
+        friction=args.mu,
+        seed=args.seed,
         device=args.device,
-    )  # fmt: skip
+    )
     record, picture = press.press(options, render=press.render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]

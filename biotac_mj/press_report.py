@@ -23,7 +23,7 @@ def _unroll(points):
 
 
 def draw_electrodes(axes, record: PressRecord, step: int) -> None:
-    """The unrolled core: electrodes coloured by their change in counts (red: fewer, as in the render), over contours of the skin's motion."""
+    """The unrolled core: electrodes coloured by their change (red: fewer counts, as in the render) over contours of the skin's motion."""
     geometry = record.geometry
     change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)

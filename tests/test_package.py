@@ -18,7 +18,8 @@ def run(code, **environ):
 
 
 def test_import_is_light():
-    code = "import biotac_mj, sys; print(*[m for m in ('torch', 'warp', 'trimesh', 'matplotlib', 'scipy', 'h5py', 'mujoco_warp') if m in sys.modules])"
+    heavy = ("torch", "warp", "trimesh", "matplotlib", "scipy", "h5py", "mujoco_warp")
+    code = f"import biotac_mj, sys; print(*[m for m in {heavy} if m in sys.modules])"
     result = run(code)
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip() == ""
@@ -80,7 +81,10 @@ def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
         file.extractall(tmp_path / "site")
     assert {"biotac_mj/plugin/__init__.py", "biotac_mj/mjcf/biotac.xml", "biotac_mj/assets/skins/default.npz"} <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "plugin/", "assets/"))]
-    code = f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); import biotac_mj; print(biotac_mj.plugin.__file__, biotac_mj.load_skin('coarse').nvert)"
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); import biotac_mj; "
+        "print(biotac_mj.plugin.__file__, biotac_mj.load_skin('coarse').nvert)"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith(str(tmp_path / "site"))

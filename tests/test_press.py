@@ -41,8 +41,8 @@ class NodeSprings:
         x[self.outer] += depth * normal
         force = -STIFFNESS * depth * normal
         wrench = np.concatenate([force.sum(0), np.cross(x[self.outer], force).sum(0)])[None]
-        jacobian = np.concatenate([np.tile(np.eye(3), (len(self.outer), 1, 1)),
-                                   -np.array([[[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]] for p in x[self.outer]])], axis=2)  # fmt: skip
+        cross = np.array([[[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]] for p in x[self.outer]])
+        jacobian = np.concatenate([np.tile(np.eye(3), (len(self.outer), 1, 1)), -cross], axis=2)
         along = np.einsum("ni,nij->nj", normal, jacobian) * (depth > 0)
         return SkinResult(x.ravel(), wrench, STIFFNESS * along.T[None] @ along, x)
 
