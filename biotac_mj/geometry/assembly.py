@@ -39,8 +39,11 @@ def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
     """
     near = np.zeros(len(vert), dtype=bool)
     for body_vert, body_face in bodies:
-        _, distance, _ = _closest(body_vert, body_face, vert)
-        near |= distance < tolerance
+        low, high = body_vert.min(axis=0) - 2 * tolerance, body_vert.max(axis=0) + 2 * tolerance
+        candidate = np.flatnonzero(((vert > low) & (vert < high)).all(axis=1))
+        if len(candidate):
+            _, distance, _ = _closest(body_vert, body_face, vert[candidate])
+            near[candidate] |= distance < tolerance
     return np.flatnonzero(near).astype(np.int32)
 
 

@@ -34,6 +34,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "held nodes": len(skin.fixed),
         "minimum dihedral angle": lowest.min(),
         "minimum dihedral angle, 1st percentile over tetrahedra": np.percentile(lowest, 1),
+        "share of inner nodes two or more edges from the outside": 1 - np.mean(np.isin(*_inner_and_linked(skin))),
         "skin volume": mesh.volumes.sum() * 1e9,
         "cavity volume": cavity,
         "core volume": core,
@@ -46,6 +47,11 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     }
 
 
+def _inner_and_linked(skin):
+    """Inner nodes, and all nodes that share a tetrahedron with an outer node."""
+    return np.unique(skin.inner_face), np.unique(skin.elem[np.isin(skin.elem, skin.outer_face).any(axis=1)])
+
+
 def _ray_lengths(surface, origin, direction):
     """Distance (n,) along each ray to the nearest face of a trimesh; nan where it misses (Moeller-Trumbore)."""
     a, b, c = (surface.triangles[:, i] for i in range(3))
@@ -53,11 +59,11 @@ def _ray_lengths(surface, origin, direction):
     for i, (o, d) in enumerate(zip(origin, direction)):
         p = np.cross(d, c - a)
         det = np.sum((b - a) * p, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             u = np.sum((o - a) * p, axis=1) / det
             q = np.cross(o - a, b - a)
             v, t = q @ d / det, np.sum((c - a) * q, axis=1) / det
-        hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 0)
+            hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 0)
         length[i] = t[hit].min() if hit.any() else np.nan
     return length
 

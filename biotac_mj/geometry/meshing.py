@@ -4,6 +4,9 @@ fTetWild keeps within an envelope of the surfaces it is given; afterwards bounda
 along the surfaces and inside, to round the worst tetrahedra.
 """
 
+import contextlib
+import tempfile
+
 import numpy as np
 
 from biotac_mj.geometry.tet_mesh import TetMesh
@@ -46,54 +49,58 @@ def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coar
     if inner is not None:
         face = np.concatenate([face, surfaces[1][1][:, ::-1] + len(vert)])
         vert = np.concatenate([vert, surfaces[1][0]])
-    vert, elem = pytetwild.tetrahedralize(
-        vert, face.astype(np.int32), edge_length_abs=edge, epsilon=epsilon, stop_energy=8.0, coarsen=coarsen, num_threads=1
-    )
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # fTetWild leaves a file where it runs
+        vert, elem = pytetwild.tetrahedralize(
+            vert, face.astype(np.int32), edge_length_abs=edge, epsilon=epsilon, stop_energy=8.0, coarsen=coarsen, num_threads=1
+        )
     mesh = TetMesh(vert, elem)
     inverted = mesh.volumes < 0
     mesh.elem[inverted] = mesh.elem[inverted][:, [0, 2, 1, 3]]
     return improve(TetMesh(mesh.vert, mesh.elem), bodies)
 
 
-def improve(mesh: TetMesh, bodies, rounds: int = 12, power: float = 2.0) -> TetMesh:
+def improve(mesh: TetMesh, bodies, iterations: int = 150, power: float = 8.0) -> TetMesh:
     """Moves nodes to round the tetrahedra; nodes of the boundary part i stay on bodies[i] (parts by decreasing enclosed volume).
 
-    Minimises the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular tetrahedron: 1 for a regular one, infinite
-    for a flat one (mean ratio). L-BFGS in the surfaces' tangent planes alternates with projection onto the surfaces.
+    Lowers the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular tetrahedron: 1 for a regular one, infinite
+    for a flat one (mean ratio); the power lets the worst count. Descent with a step per node in the surfaces' tangent planes, projected
+    back onto the surfaces, halved until the energy falls.
     """
-    from scipy.optimize import minimize
-
     vert, elem = mesh.vert.copy(), mesh.elem
     owner = np.full(len(vert), -1)
     for i, part in enumerate(mesh.boundary_components()):
         owner[part] = i
     vert = _project(vert, owner, bodies, elem)
-    for _ in range(rounds):
-        normal = np.zeros_like(vert)
+    size = np.cbrt(np.abs(mesh.volumes))  # a node's stiffness goes with energy / size^2 of its tetrahedra
+    value, gradient, share = _roundness(vert, elem, power)
+    length = 1.0
+    for _ in range(iterations):
+        stiffness = np.zeros(len(vert))
+        np.add.at(stiffness, elem, (share / size**2)[:, None])
+        step = -gradient / (power**2 * stiffness)[:, None]
         for i, body in enumerate(bodies):
-            normal[owner == i] = body.normal(vert[owner == i])
-        start = vert
-
-        def energy(step, start=start, normal=normal):
-            step = step.reshape(-1, 3)
-            step = step - np.sum(step * normal, axis=1, keepdims=True) * normal
-            value, gradient = _roundness(start + step, elem, power)
-            return value, (gradient - np.sum(gradient * normal, axis=1, keepdims=True) * normal).ravel()
-
-        result = minimize(energy, np.zeros(vert.size), jac=True, method="L-BFGS-B", bounds=[(-0.1, 0.1)] * vert.size, options={"maxiter": 30})
-        step = result.x.reshape(-1, 3)
-        vert = _project(start + step - np.sum(step * normal, axis=1, keepdims=True) * normal, owner, bodies, elem, start)
+            normal = body.normal(vert[owner == i])
+            step[owner == i] -= np.sum(step[owner == i] * normal, axis=1, keepdims=True) * normal
+        while length > 1e-4:
+            trial = _project(vert + length * step, owner, bodies, elem, vert)
+            new_value, new_gradient, new_share = _roundness(trial, elem, power)
+            if new_value < value:
+                break
+            length *= 0.5
+        else:
+            break
+        vert, value, gradient, share, length = trial, new_value, new_gradient, new_share, min(2.0 * length, 4.0)
     return TetMesh(vert, elem)
 
 
 def _roundness(vert, elem, power):
-    """Energy of `improve` and its gradient (nvert, 3); infinite when a tetrahedron is inverted."""
+    """Energy of `improve`, its gradient (nvert, 3) and the tetrahedra's shares (nelem,); infinite when one is inverted."""
     corner = vert[elem]
     edges = np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)
     shape = edges @ _REGULAR
     det = np.linalg.det(shape)
     if det.min() <= 0:
-        return 1e300, np.zeros_like(vert)
+        return np.inf, np.zeros_like(vert), np.ones(len(elem))
     norm = np.sum(shape**2, axis=(1, 2))
     ratio = norm / (3 * det ** (2 / 3))
     slope = (power * ratio ** (power - 1))[:, None, None] * (
@@ -104,7 +111,7 @@ def _roundness(vert, elem, power):
     for k in range(3):
         np.add.at(gradient, elem[:, k + 1], force[:, k])
     np.add.at(gradient, elem[:, 0], -force.sum(axis=1))
-    return float(np.sum(ratio**power)), gradient
+    return float(np.sum(ratio**power)), gradient, ratio**power
 
 
 def _project(vert, owner, bodies, elem, fallback=None):
