@@ -87,7 +87,11 @@ class SpringSkin:
             force = self.k * depth[:, None] * out + 0.5 * self.k * slip  # on the nodes
             wrench[geom.group] -= np.concatenate([force.sum(axis=0), np.cross(x, force).sum(axis=0)])
             project = out[:, :, None] * out[:, None, :]
-            stiff = self.k * project + 0.5 * self.k * share[:, None, None] * (np.eye(3) - project)
+            across = np.eye(3) - project
+            along = slip / np.maximum(np.linalg.norm(slip, axis=1), 1e-300)[:, None]
+            # a sliding spring gives no resistance along its motion, only across it; how its force follows the normal force is left out (not symmetric)
+            across -= np.where(share < 1.0, 1.0, 0.0)[:, None, None] * along[:, :, None] * along[:, None, :]
+            stiff = self.k * project + 0.5 * self.k * share[:, None, None] * across
             at = np.zeros((len(node), 3, 6))  # velocity at x of a body that moves by (t, w): t + w x x
             at[:, :, :3] = np.eye(3)
             at[:, 0, 4], at[:, 0, 5], at[:, 1, 5] = x[:, 2], -x[:, 1], x[:, 0]

@@ -1,0 +1,263 @@
+"""The two-way coupling against statics, Coulomb's law and conservation of momentum, with a skin of springs."""
+
+import mujoco
+import numpy as np
+import pytest
+import spring_skin
+
+import biotac_mj
+from biotac_mj.coupling import attach
+from biotac_mj.coupling.touching import displace, displacement, rotation
+
+PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
+PAD_DOWN = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+G = 9.81
+HINGED = """<body name="finger"><joint name="hinge" type="hinge" axis="0 1 0" pos="-.04 0 0" {}/>
+  <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/></body>"""
+
+
+def scene(bodies, timestep=0.002, gravity="0 0 -9.81", integrator="implicitfast", finger='<body name="finger"/>', stiffness=1e3, flags="", **settings):
+    """A pad of springs, facing up in the plane z = 8 mm around the origin, under other bodies."""
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="{integrator}">{flags}</option><worldbody>{finger}{bodies}</worldbody></mujoco>'
+    )
+    settings = dict(stepper="springs", readings="none", friction=0.3, options={"stiffness": stiffness}) | settings
+    handle = attach(spec, body="finger", quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(), **settings)
+    model = spec.compile()
+    return model, mujoco.MjData(model), handle
+
+
+def ball(mass, joint="<freejoint/>", pos=f"0 0 {0.018 - 1e-5}", friction=0.3):
+    return f'<body name="ball" pos="{pos}">{joint}<geom name="ball" type="sphere" size=".01" mass="{mass}" friction="{friction}"/></body>'
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    yield
+    biotac_mj.plugin.check()
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.001, 0.002, 0.004])
+@pytest.mark.parametrize("mass", [0.001, 0.01, 0.1, 1.0])
+def test_a_ball_reads_its_weight(mass, timestep):
+    # node stiffness such that each ball sinks in by about 0.1 mm and settles within the run
+    model, data, handle = scene(ball(mass), timestep, stiffness=2e4 * max(mass, 0.05))
+    steps = int(0.3 / timestep)
+    mujoco.mj_step(model, data, steps)
+    forces = []
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+        forces.append(handle.read(data, "contact_force")[:3])
+    weight = mass * G
+    np.testing.assert_allclose(forces, np.tile([0.0, weight, 0.0], (20, 1)), atol=0.01 * weight)  # no chatter: every step, not the mean
+    assert np.ptp(np.array(forces)[:, 1]) < 0.005 * weight
+    # MuJoCo's balance without constraints: the passive force carries the weight
+    np.testing.assert_allclose(data.qfrc_passive[2], data.qfrc_bias[2], rtol=0.01)
+    assert handle.read(data, "status")[0] == 1
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.004])
+@pytest.mark.parametrize("mass", [0.001, 1.0, None])
+def test_a_light_finger_pushes_without_static_error(mass, timestep):
+    """A hinged finger of 24 g turns against a ball that a joint limit (or the world) holds back: the torques balance exactly."""
+    joint = '<joint type="slide" axis="0 0 1" range="-1 0" limited="true" solreflimit=".01 1"/>' if mass else ""
+    model, data, _ = scene(ball(mass or 1.0, joint, "0 0 .0181"), timestep, "0 0 0", finger=HINGED.format(""), stiffness=2e3)
+    torque = -0.04 * min(2 * G * (mass or 1.0), 5.0)
+    data.qfrc_applied[0] = torque
+    mujoco.mj_step(model, data, int(0.5 / timestep))
+    assert abs(data.qvel).max() < 1e-5
+    assert data.qfrc_passive[0] == pytest.approx(-torque, rel=1e-5)
+
+
+def test_a_light_finger_on_its_limit_carries_a_ball():
+    finger = HINGED.format('range="-90 0" limited="true" solreflimit=".01 1"')
+    model, data, _ = scene(ball(0.1, '<joint type="slide" axis="0 0 1"/>'), 0.004, finger=finger)
+    mujoco.mj_step(model, data, 200)
+    assert abs(data.qvel).max() < 1e-6
+    assert data.qfrc_passive[1] == pytest.approx(0.1 * G, rel=1e-6)
+    assert data.qfrc_constraint[1] == pytest.approx(0.0, abs=1e-6)  # at rest the rows that carry the stiffness push nothing
+
+
+def _momentum(model, data):
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_comVel(model, data)
+    linear, angular = np.zeros(3), np.zeros(3)
+    for b in range(1, model.nbody):
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
+        axes = data.ximat[b].reshape(3, 3)
+        linear += model.body_mass[b] * velocity[3:]
+        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (model.body_inertia[b] * (axes.T @ velocity[:3]))
+    return linear, angular
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.004])
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
+@pytest.mark.parametrize("masses", [(0.02, 0.001), (0.05, 0.03), (0.02, 1.0)])
+def test_momentum_of_free_finger_and_object_is_conserved(masses, integrator, timestep):
+    """A spinning ball hits a free finger off its centre and slides."""
+    finger = '<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{}" contype="0" conaffinity="0"/></body>'.format(masses[0])
+    model, data, handle = scene(ball(masses[1], pos=".002 .001 .0185"), timestep, "0 0 0", integrator, finger, stiffness=2e3)
+    # MuJoCo's own step of a free body errs by 1e-3 at 4 ms, with its own contacts too, where its centre of mass is off its joint or its inertia
+    # has unequal axes: such a finger would test MuJoCo
+    core = model.body("biotac_core").id
+    model.body_ipos[core] = [-0.01, 0, 0]
+    model.body_inertia[core] = model.body_inertia[core].mean()
+    mujoco.mj_setConst(model, data)
+    data.qvel[6:] = [0.1, 0.05, -0.3, 3, 4, 2]
+    linear, angular = _momentum(model, data)
+    touched = 0
+    for _ in range(int(0.05 / timestep)):
+        mujoco.mj_step(model, data)
+        touched += handle.read(data, "contact_force").any()
+    after = _momentum(model, data)
+    assert touched >= 2
+    assert np.linalg.norm(after[0] - linear) < 1e-12 * np.linalg.norm(linear)
+    assert np.linalg.norm(after[1] - angular) < 1e-12 * np.linalg.norm(angular)
+    assert np.linalg.norm(data.qvel[:3]) > 1e-4  # there was something to conserve
+
+
+def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
+    """Energy, too, comes close to what it was as the step shrinks: implicit Euler's loss is of first order."""
+    losses = []
+    for timestep in (0.0001, 0.00005):
+        finger = '<body name="finger"><joint type="slide" axis="0 0 1"/><geom type="box" size=".01 .01 .01" mass=".03" contype="0" conaffinity="0"/></body>'
+        model, data, _ = scene(ball(0.03, '<joint type="slide" axis="0 0 1"/>', "0 0 .0181"), timestep, "0 0 0", "Euler", finger, 1e2)
+        data.qvel[1] = -0.2
+        mujoco.mj_step(model, data, int(0.04 / timestep))
+        losses.append(1 - (data.qvel[1] - data.qvel[0]) ** 2 / 0.04)
+        assert data.qvel[1] > data.qvel[0]  # they part
+    assert 0 < losses[1] < losses[0] < 0.3
+    assert losses[1] / losses[0] == pytest.approx(0.5, abs=0.12)
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.004])
+@pytest.mark.parametrize("mass", [0.001, 0.1])
+def test_a_block_sticks_and_slips_at_mu(mass, timestep):
+    joints = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+    block = f'<body name="block" pos="0 0 .01299">{joints}<geom type="box" size=".05 .05 .005" mass="{mass}" friction="0.2"/></body>'
+    model, data, _ = scene(block, timestep, friction=0.3)  # MuJoCo's rule: the larger friction counts
+    mujoco.mj_step(model, data, int(0.2 / timestep))
+    limit = 0.3 * mass * G
+    data.qfrc_applied[0] = 0.98 * limit
+    mujoco.mj_step(model, data, int(0.2 / timestep))
+    start = data.qpos[0]
+    mujoco.mj_step(model, data, int(0.2 / timestep))
+    assert abs(data.qpos[0] - start) < 2e-7  # sticks: creeps less than 1 um/s
+    data.qfrc_applied[0] = 1.5 * limit
+    mujoco.mj_step(model, data, 5)
+    start, time = data.qvel[0], data.time
+    mujoco.mj_step(model, data, 10)
+    assert (data.qvel[0] - start) / (data.time - time) == pytest.approx(0.5 * limit / mass, rel=0.01)
+
+
+def test_priority_decides_whose_friction_counts():
+    for priority, expected in ((0, 0.8), (1, 0.3), (-1, 0.2)):
+        block = '<body name="block" pos="0 0 .013"><freejoint/><geom type="box" size=".05 .05 .005" mass="0.1" friction="{}"/></body>'
+        friction = 0.8 if priority == 0 else 0.2
+        seen = {}
+        name = f"watch{priority}"
+
+        class Watching(spring_skin.SpringSkin):
+            def __init__(self, config, geometry, geoms, seen=seen):
+                seen["friction"] = geoms[0].friction
+                super().__init__(config, geometry, geoms)
+
+        biotac_mj.coupling.register_stepper(name, Watching)
+        scene(block.format(friction), priority=priority, friction=0.3, stepper=name)
+        assert seen["friction"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("timestep", [0.001, 0.004])
+def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
+    """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction there is."""
+    fingers = "".join(
+        f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/><geom size=".003" mass=".03" contype="0" conaffinity="0"/></body>'
+        for i, (z, s) in enumerate(((-0.0131, 1), (0.0131, -1)))
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" integrator="implicitfast"/><worldbody>{fingers}'
+        '<body name="box"><freejoint/><geom type="box" size=".004 .004 .005" mass=".005"/></body></worldbody></mujoco>'
+    )
+    handles = [
+        attach(spec, body=f"finger{i}", quat=quat, pos=[0.01, 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(), stepper="springs", readings="none",
+               friction=0.5, options={"stiffness": 1e3})
+        for i, quat in enumerate((PAD_UP, PAD_DOWN))
+    ]  # fmt: skip
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qfrc_applied[:2] = 1.0
+    mujoco.mj_step(model, data, int(0.3 / timestep))
+    start = data.body("box").xpos.copy()
+    mujoco.mj_step(model, data, int(0.3 / timestep))
+    np.testing.assert_allclose(data.body("box").xpos, start, atol=1e-6)
+    for handle in handles:
+        assert handle.read(data, "contact_force")[1] == pytest.approx(1.0, rel=0.01)
+    total = sum(data.xmat[model.body(h.body).id].reshape(3, 3) @ h.read(data, "contact_force")[:3] for h in handles)
+    np.testing.assert_allclose(total, [-0.005 * G, 0, 0], atol=1e-5)
+
+
+def test_several_bodies_touch_one_skin():
+    bodies = "".join(
+        f'<body pos="{x} 0 .0129"><freejoint/><geom type="box" size=".0025 .004 .005" mass="{mass}"/></body>' for x, mass in ((-0.003, 0.002), (0.003, 0.05))
+    )
+    model, data, handle = scene(bodies, 0.002)
+    mujoco.mj_step(model, data, 150)
+    assert handle.read(data, "contact_force")[1] == pytest.approx(0.052 * G, rel=0.01)
+    np.testing.assert_allclose(data.qfrc_passive[[2, 8]], [0.002 * G, 0.05 * G], rtol=0.01)
+
+
+def test_a_mocap_indenter_presses_a_resting_finger():
+    """Position-driven: the force is the springs' for that depth, and the welded finger feels it."""
+    body = '<body name="probe" mocap="true" pos="0 0 .0185"><geom type="box" size=".05 .05 .01"/></body>'
+    model, data, handle = scene(body, 0.002, stiffness=1e3)
+    data.mocap_pos[0] = [0, 0, 0.0178]  # 0.2 mm deep
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "contact_force")[1] == pytest.approx(81 * 1e3 * 0.2e-3, rel=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["PGS", "CG", "Newton"])
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_every_solver_and_jacobian_gives_the_same_motion(solver, jacobian):
+    def run(**option):
+        model, data, _ = scene(ball(0.001), 0.002, finger=HINGED.format('range="-90 0" limited="true"'))
+        model.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{option['solver'].upper()}")
+        model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{option['jacobian'].upper()}")
+        model.opt.iterations, model.opt.tolerance = 1000, 1e-14
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 25)
+        return data.qpos.copy()
+
+    np.testing.assert_allclose(run(solver=solver, jacobian=jacobian), run(solver="Newton", jacobian="dense"), atol=2e-7)
+
+
+def test_one_way_leaves_the_dynamics_alone():
+    bodies = ball(0.01, pos="0.001 0 .0182") + '<geom type="plane" size="1 1 .1" pos="0 0 .0075"/>'
+    model, data, handle = scene(bodies, coupling="one-way", readings="sum")
+    bare = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>'
+        f'<body name="finger"><body name="core" quat="{" ".join(map(str, PAD_UP))}" pos=".01 0 0"><inertial pos="0 0 0" mass=".004" '
+        f'diaginertia="1e-7 1e-7 1e-7"/></body></body>{bodies}</worldbody></mujoco>'
+    )
+    plain = mujoco.MjData(bare)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(bare, plain)
+        assert np.array_equal(data.qpos, plain.qpos) and np.array_equal(data.qvel, plain.qvel)
+    assert handle.read(data, "contact_force")[1] > 0  # it did read
+
+
+def test_runge_kutta_steps_explicitly():
+    model, data, handle = scene(ball(0.1), 0.0002, integrator="RK4")
+    mujoco.mj_step(model, data, 200)
+    assert handle.read(data, "contact_force")[1] > 0 and np.isfinite(data.qpos).all()
+
+
+def test_displacement_undoes_displace():
+    rng = np.random.default_rng(0)
+    pos, mat = rng.normal(size=(5, 3)) * 0.01, rotation(rng.normal(size=(5, 3)))
+    motion = rng.normal(size=(5, 6)) * 1e-5
+    np.testing.assert_allclose(displacement(*displace(pos, mat, motion), pos, mat), motion, atol=1e-11)
+    large = rotation(np.array([[0.0, 0.0, 3.0], [1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(displacement(np.zeros((2, 3)), large, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))[:, 3:], [[0, 0, 3], [1, 0, 0]], atol=1e-12)
