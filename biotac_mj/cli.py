@@ -111,6 +111,7 @@ def _press(args):
         seed=args.seed,
         device=args.device,
     )
+    _calm_warp()
     record, picture = press.press(options, render=press.render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -137,6 +138,7 @@ def _add_view(verbs):
 def _view(args):
     from . import view
 
+    _calm_warp()
     view.view(
         skin=args.skin,
         material=args.material,
@@ -177,6 +179,13 @@ def _import_mesh(args):
     print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
     geometry.save(out)
     print(f"  stored in {out}: use it with --skin {out}")
+
+
+def _calm_warp():
+    import warp
+
+    warp.config.quiet = True
+    print("solving the skin with Warp; the first run compiles its kernels, which takes about a minute")
 
 
 def main(argv=None) -> int:

@@ -25,7 +25,7 @@ def test_press_example(repo):
     # the force opposes the press, which points inwards at 0.3 rad around the finger
     inwards = np.array([0, np.cos(0.3), -np.sin(0.3)])
     assert record.force[-1] @ inwards < -0.05
-    # the electrode under the contact: nearest to the touch among those that changed most
+    # far above the noise of at most 7 counts
     change = np.abs(record.electrode_change[-1])
     assert change.max() > 20
 
