@@ -121,8 +121,8 @@ def _check_place(spec, site, body, prefix):
 
 def _model(geometry):
     """mjcf/biotac.xml with the meshes, electrodes and outer surface of a skin."""
-    path = importlib.resources.files("biotac_mj.mjcf") / "biotac.xml"
-    spec = mujoco.MjSpec.from_string(path.read_text())
+    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
+        spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
     for part in ("core", "nail", "clamp"):
         mesh, vert, face = spec.mesh(part), getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")
         if len(face) == 0:
@@ -134,7 +134,7 @@ def _model(geometry):
     for i, position in enumerate(geometry.electrode_pos, start=1):
         spec.site(f"e{i}").pos = position
     node, face = np.unique(geometry.outer_face, return_inverse=True)
-    skin = spec.add_skin(name="skin", rgba=[0.25, 0.6, 0.4, 1.0], group=2)
+    skin = spec.skins[0]
     skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()
     skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
