@@ -1,9 +1,10 @@
 """Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid parts and the indenters.
 
     pip install pytetwild pyvista
-    python scripts/make_assets.py [--only coarse default fine rigid indenters]
+    python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
 
-fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run. The surfaces and the quality stay the same.
+fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run; the surfaces and the quality
+stay the same.
 """
 
 import argparse
@@ -14,9 +15,11 @@ import numpy as np
 
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.card import write_card
-from biotac_mj.geometry.importing import write_obj
+from biotac_mj.geometry.importing import read_obj, write_obj
+from biotac_mj.geometry.indenters import INDENTERS, indenter
 from biotac_mj.geometry.meshing import mesh_between
 from biotac_mj.geometry.parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
+from biotac_mj.geometry.skins import load_skin
 from biotac_mj.geometry.tet_mesh import TetMesh
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
@@ -39,7 +42,9 @@ def surface_only(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=[*RESOLUTIONS, "rigid", "indenters"], default=[*RESOLUTIONS, "rigid", "indenters"])
-    only = parser.parse_args().only
+    parser.add_argument("--keep-tetrahedra", action="store_true", help="put the stored skins together again, around new rigid parts")
+    args = parser.parse_args()
+    only = args.only
     bodies = biotac_bodies()
 
     if "rigid" in only:
@@ -47,18 +52,20 @@ def main():
         write_obj(ASSETS / "nail.obj", *_metres(nail_plate()))
         write_obj(ASSETS / "clamp.obj", *_metres(clamp_plate()))
     if "indenters" in only:
-        from biotac_mj.geometry.indenters import INDENTERS, indenter
-
         for name in INDENTERS:
             write_obj(ASSETS / "indenters" / f"{name}.obj", *indenter(name).mesh())
 
-    rigid = {name: read_rigid(ASSETS / f"{name}.obj") for name in ("core", "nail", "clamp")}
+    rigid = {name: read_obj(ASSETS / f"{name}.obj")[0] for name in ("core", "nail", "clamp")}
     position, normal = electrodes(bodies["core"])
     for name, settings in RESOLUTIONS.items():
         if name not in only:
             continue
-        mesh = mesh_between(bodies["outer"], bodies["cavity"], **settings)
-        skin = assemble(name, TetMesh(mesh.vert * 1e-3, mesh.elem), **rigid, electrodes=(position * 1e-3, normal))
+        if args.keep_tetrahedra:
+            mesh = TetMesh(load_skin(name).vert, load_skin(name).elem)
+        else:
+            mesh = mesh_between(bodies["outer"], bodies["cavity"], **settings)
+            mesh = TetMesh(mesh.vert * 1e-3, mesh.elem)
+        skin = assemble(name, mesh, **rigid, electrodes=(position * 1e-3, normal))
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
         made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then biotac_mj.geometry.meshing.improve"
         print(write_card(path.with_suffix(".md"), skin, made).read_text())
@@ -66,14 +73,6 @@ def main():
 
 def _metres(mesh):
     return mesh[0] * 1e-3, mesh[1]
-
-
-def read_rigid(path):
-    """vert (n, 3) [m], face (m, 3) of a closed .obj."""
-    from biotac_mj.geometry.importing import read_obj
-
-    (body,) = read_obj(path)
-    return body
 
 
 if __name__ == "__main__":

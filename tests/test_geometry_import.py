@@ -11,11 +11,15 @@ from biotac_mj.geometry.importing import read_obj, read_tet_mesh, write_obj
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
 TABLE = PAPER.parent / "electrodes_nv_frame_mm.csv"
-needs_paper = pytest.mark.skipif(not PAPER.is_dir(), reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project")
+needs_paper = pytest.mark.skipif(
+    not PAPER.is_dir(), reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project"
+)
 
 
 def write_tet(path, vert, elem):
-    path.write_text("".join(f"v {x:.17g} {y:.17g} {z:.17g} 1\n" for x, y, z in vert) + "".join("t " + " ".join(map(str, t)) + "\n" for t in elem))
+    path.write_text(
+        "".join(f"v {x:.17g} {y:.17g} {z:.17g} 1\n" for x, y, z in vert) + "".join("t " + " ".join(map(str, t)) + "\n" for t in elem)
+    )
     return path
 
 
@@ -178,7 +182,9 @@ def test_papers_mesh():
     assert (len(np.unique(skin.inner_face)), len(skin.inner_face)) == (1586, 3168)
     counts = [len(held_nodes(skin.vert, [body])) for body in _parts(skin)]
     assert counts == [145, 30, 225] and len(skin.fixed) == 400
-    np.testing.assert_allclose(np.array([skin.core_vert.min(0), skin.core_vert.max(0)]) * 1e3, [[-19.324, -5.362, -5.332], [5.105, 3.652, 5.335]], atol=2e-3)
+    np.testing.assert_allclose(
+        np.array([skin.core_vert.min(0), skin.core_vert.max(0)]) * 1e3, [[-19.324, -5.362, -5.332], [5.105, 3.652, 5.335]], atol=2e-3
+    )
 
 
 @needs_paper

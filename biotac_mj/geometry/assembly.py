@@ -27,7 +27,12 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     for part, name in ((outer, "outer surface"), (inner, "inner surface")):
         check_closed(part, name)
     box = [(mesh.vert[part].min(axis=(0, 1)), mesh.vert[part].max(axis=(0, 1))) for part in parts]
-    if enclosed_volume(mesh.vert, outer) <= 0 or enclosed_volume(mesh.vert, inner) >= 0 or (box[0][0] > box[1][0]).any() or (box[0][1] < box[1][1]).any():
+    if (
+        enclosed_volume(mesh.vert, outer) <= 0
+        or enclosed_volume(mesh.vert, inner) >= 0
+        or (box[0][0] > box[1][0]).any()
+        or (box[0][1] < box[1][1]).any()
+    ):
         raise ValueError("the outer surface of the skin does not enclose the inner one: mesh the skin as one shell around one cavity")
     return outer, inner
 
@@ -50,8 +55,8 @@ def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
 def lin_electrodes_on(core_vert, core_face) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19, 3).
 
-    The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is the mean over a disc of faces of 0.5 mm
-    around the point, weighted by area, because one small face of a scanned or tessellated core says little.
+    The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a mean over the faces around the
+    point (area times a Gaussian of 0.25 mm), because one small face of a tessellated core says little.
     """
     x, y, z = LIN_ELECTRODES.T
     point = np.stack([BioTacDimensions().electrode_origin_x - x, z, y], axis=-1) * 1e-3
@@ -81,7 +86,9 @@ def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> Sk
             raise ValueError(f"the {label}'s normals point inwards: flip its faces")
     fixed = held_nodes(mesh.vert, (core, nail, clamp))
     if not len(fixed):
-        raise ValueError(f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the same frame and units?")
+        raise ValueError(
+            f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the same frame and units?"
+        )
     position, normal = lin_electrodes_on(*core) if electrodes is None else electrodes
     return SkinGeometry(
         name=name, vert=mesh.vert, elem=mesh.elem, outer_face=outer, inner_face=inner, fixed=fixed, core_vert=core[0], core_face=core[1],

@@ -21,4 +21,6 @@ def asset_path(name: str) -> pathlib.Path:
         if (root / name).is_file():
             return root / name
     looked = " and ".join(str(root) for root in dict.fromkeys(roots))
-    raise FileNotFoundError(f"missing asset {name!r} (looked in {looked}): reinstall biotac_mj, or run `python scripts/make_assets.py` in a checkout")
+    raise FileNotFoundError(
+        f"missing asset {name!r} (looked in {looked}): reinstall biotac_mj, or run `python scripts/make_assets.py` in a checkout"
+    )

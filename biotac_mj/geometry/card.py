@@ -14,8 +14,8 @@ __all__ = ["skin_numbers", "write_card"]
 def skin_numbers(skin: SkinGeometry) -> dict:
     """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the electrodes to the inner skin [mm].
 
-    Thickness is the distance of each inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the way from the electrode
-    along its normal to the inner surface.
+    Thickness is the distance of each inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the
+    way from the electrode along its normal to the inner surface.
     """
     import trimesh
 
@@ -74,12 +74,16 @@ def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
     low, high = n.pop("box")
     gaps = n.pop("gaps")
     unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
-    rows = [f"| {key} | {value:{'d' if isinstance(value, int) else '.3f'}} {next((u for k, u in unit.items() if k in key), '')} |" for key, value in n.items()]
+    rows = []
+    for key, value in n.items():
+        number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
+        rows.append(f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |")
     rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
     rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
     text = "\n".join([
         f"# Skin `{skin.name}`", "", "| | |", "|---|---|", *rows, "",
-        f"How it was made: {made}; `scripts/make_assets.py`. The shape is `biotac_mj.geometry.BioTacDimensions`, whose docstring gives the source of each number.",
+        f"How it was made: {made}; `scripts/make_assets.py`.",
+        "The shape is `biotac_mj.geometry.BioTacDimensions`, which gives the source of each number.",
         "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
     ])  # fmt: skip
     path = pathlib.Path(path)

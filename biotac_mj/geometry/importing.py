@@ -18,8 +18,8 @@ _MESHES = (".tet", ".msh", ".vtu")
 def import_mesh(path, name: str | None = None) -> SkinGeometry:
     """A skin from a folder, or from a mesh file whose folder also holds the rigid bodies.
 
-    The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of the same folder is read; together they must
-    hold three closed bodies: the core (the largest), the clamp plate (its centre at the largest x of the other two) and the nail plate.
+    The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of the same folder is read;
+    together they must hold three closed bodies: the core (the largest), the nail plate, and the clamp plate (further to +x than the nail).
     Nodes within 1e-5 m of them are held; electrodes are Lin et al. 2013's, projected onto this core.
 
     Raises:
@@ -66,7 +66,9 @@ def read_tet_mesh(path) -> TetMesh:
         raise ValueError(f"{path} cannot be read ({error}): export it again as {path.suffix}") from error
     elem = mesh.cells_dict.get("tetra")
     if elem is None:
-        raise ValueError(f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: mesh the volume with 4-node tetrahedra")
+        raise ValueError(
+            f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: mesh the volume with 4-node tetrahedra"
+        )
     if (elem >= len(mesh.points)).any() or (elem < 0).any():
         return TetMesh(mesh.points, elem)  # check() explains
     used, elem = np.unique(elem, return_inverse=True)  # such files also hold the points of curves and surfaces
@@ -87,7 +89,9 @@ def _read_tet(path) -> TetMesh:
         if word and word[0] in "vt" and len((vert if word[0] == "v" else elem)[-1]) < (3 if word[0] == "v" else 4):
             raise ValueError(f"{path}, line {number} is cut short: lines must read `v x y z w` or `t a b c d`")
     if not vert or not elem:
-        raise ValueError(f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: lines must read `v x y z w` and `t a b c d` (0-based)")
+        raise ValueError(
+            f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: lines must read `v x y z w` and `t a b c d` (0-based)"
+        )
     return TetMesh(np.array(vert), np.array(elem))
 
 
@@ -120,7 +124,9 @@ def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}; export the rigid bodies again as .obj") from error
     if not face or np.max(face) >= len(vert) or np.min(face) < 0:
-        raise ValueError(f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): export the rigid bodies again as .obj")
+        raise ValueError(
+            f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): export the rigid bodies again as .obj"
+        )
     vert, index = np.unique(np.array(vert), axis=0, return_inverse=True)
     face = index.reshape(-1)[np.array(face)]
     graph = sparse.coo_matrix((np.ones(2 * len(face)), (face[:, :2].T.ravel(), face[:, 1:].T.ravel())), shape=(len(vert),) * 2)

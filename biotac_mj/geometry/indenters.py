@@ -1,7 +1,7 @@
 """The eight indenters of Narang et al., ICRA 2021, as MuJoCo shapes. In the names the number is a diameter.
 
-The indenter frame: tip at the origin, pressing direction +y, so that the body lies in y <= 0. Dimensions were measured on the paper's meshes; handles and
-mounts, which never touch the skin, are left out. Edges of cylinders, cube and ring are rounded with 1 mm.
+The indenter frame: tip at the origin, pressing direction +y, so that the body lies in y <= 0. Dimensions were measured on the paper's
+meshes; handles and mounts, which never touch the skin, are left out. Edges of cylinders, cube and ring are rounded with 1 mm.
 """
 
 import dataclasses
@@ -93,7 +93,7 @@ def indenter(name: str) -> Indenter:
 
 
 def _rounded_rectangle(inner, outer, low, high, edge, arc=9):
-    """Profile (n, 2) of (radius, height) from inner to outer radius; counter-clockwise; inner = 0 starts and ends on the axis with sharp corners there."""
+    """Clockwise profile (n, 2) of (radius, height), corners rounded; for inner = 0 it runs from the axis at `high` to the axis at `low`."""
     quarter = np.linspace(0.0, np.pi / 2, arc)
 
     def corner(r, y, start):
@@ -141,9 +141,9 @@ def _rounded_box(half, edge, arc=9):
             grid[:, axis], grid[:, (axis + 1) % 3], grid[:, (axis + 2) % 3] = 2.0 * side, line[u], line[v]
             core = np.clip(grid, -1, 1)
             outwards = grid - core
-            points.append(np.where(np.abs(grid) < 1, grid * (half - edge), core * (half - edge)) + edge * outwards / np.linalg.norm(outwards, axis=1)[:, None])
+            points.append(core * (half - edge) + edge * outwards / np.linalg.norm(outwards, axis=1)[:, None])
             a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-            quads = np.stack([a, a + n, a + n + 1, a + 1], axis=1)[:, :: side]
+            quads = np.stack([a, a + n, a + n + 1, a + 1], axis=1)[:, ::side]
             faces.append(np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]) + len(points[:-1]) * n * n)
     vert, index = np.unique(np.round(np.concatenate(points), 12), axis=0, return_inverse=True)
     return vert, index.reshape(-1)[np.concatenate(faces)].astype(np.int32)

@@ -1,7 +1,7 @@
 """Tetrahedral meshes between parametric bodies, made with fTetWild (development extras `pytetwild` and `pyvista`). Millimetres throughout.
 
-fTetWild keeps within an envelope of the surfaces it is given; afterwards boundary nodes are moved onto the parametric surfaces, and all nodes move,
-along the surfaces and inside, to round the worst tetrahedra.
+fTetWild keeps within an envelope of the surfaces it is given; afterwards boundary nodes are moved onto the parametric surfaces, and all
+nodes move, along the surfaces and inside, to round the worst tetrahedra.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ _REGULAR = np.linalg.inv(np.array([[1.0, 0.5, 0.5], [0.0, np.sqrt(3) / 2, np.sqr
 
 
 def surface_mesh(body, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Closed triangle mesh of a `Body`: vert (n, 3), face (m, 3), a contour on a grid of `spacing` [mm] projected onto the surface; symmetric in z."""
+    """Closed triangle mesh of a `Body`: vert (n, 3), face (m, 3), symmetric in z; a contour on a grid of `spacing` [mm], projected."""
     import pyvista
 
     low, high = np.array([-22.0, -9.0, -8.0]), np.array([7.5, 6.0, 8.0])
@@ -62,8 +62,9 @@ def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coar
 def improve(mesh: TetMesh, bodies, iterations: int = 150, power: float = 8.0) -> TetMesh:
     """Moves nodes to round the tetrahedra; nodes of the boundary part i stay on bodies[i] (parts by decreasing enclosed volume).
 
-    Lowers the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular tetrahedron: 1 for a regular one, infinite
-    for a flat one (mean ratio); the power lets the worst count. Descent with a step per node in the surfaces' tangent planes, projected
+    Lowers the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular tetrahedron: 1 for a
+    regular one, infinite for a flat one (mean ratio); the power lets the worst count.
+    Descent with a step per node in the surfaces' tangent planes, projected
     back onto the surfaces, halved until the energy falls.
     """
     vert, elem = mesh.vert.copy(), mesh.elem

@@ -3,10 +3,9 @@
 The shape is described in millimetres, as it was published and measured; `SkinGeometry`, which the rest of the package sees, is in metres.
 
 Sources of the numbers:
-  [lin]  Lin, Erickson, Fishel, Wettels, Loeb, "Signal processing and fabrication of a biomimetic tactile sensor array with thermal, force and
-         microvibration modalities", and the 19 electrode coordinates of Lin et al. 2013.
-  [nv]   dimensions measured on the mesh of Narang et al., ICRA 2021 (NVlabs/biotac_sim): least-squares fits of the section family below to its
-         surface vertices, rounded to 0.01 mm; residuals 0.02-0.03 mm RMS.
+  [lin]  the 19 electrode coordinates and the 30 degree facet of Lin et al. 2013.
+  [nv]   dimensions measured on the mesh of Narang et al., ICRA 2021 (NVlabs/biotac_sim, MIT): least-squares fits of the section family
+         below to its surface vertices, rounded to 0.01 mm; its vertices lie within 0.06 mm RMS of these surfaces, most of it at the clamp.
 """
 
 import dataclasses
@@ -16,7 +15,14 @@ import numpy as np
 __all__ = ["BioTacDimensions", "Body", "LIN_ELECTRODES", "biotac_bodies", "clamp_plate", "electrodes", "nail_plate"]
 
 # [lin]: E1..E19 in Lin's frame (x to the fingertip, z out of the nail) [mm]; E11..E16 mirror E1..E6 in y.
-_LEFT = ((0.993, -4.855, -1.116), (-2.7, -3.513, -3.67), (-6.2, -3.513, -3.67), (-8.0, -4.956, -1.116), (-10.5, -3.513, -3.67), (-13.4, -4.956, -1.116))
+_LEFT = (
+    (0.993, -4.855, -1.116),
+    (-2.7, -3.513, -3.67),
+    (-6.2, -3.513, -3.67),
+    (-8.0, -4.956, -1.116),
+    (-10.5, -3.513, -3.67),
+    (-13.4, -4.956, -1.116),
+)
 _MIDDLE = ((4.763, 0.0, -2.33), (3.031, -1.95, -3.33), (3.031, 1.95, -3.33), (1.299, 0.0, -4.33))
 _SPINE = ((-2.8, 0.0, -5.08), (-9.8, 0.0, -5.08), (-13.6, 0.0, -5.08))
 LIN_ELECTRODES = np.array(_LEFT + _MIDDLE + tuple((x, -y, z) for x, y, z in _LEFT) + _SPINE)
@@ -81,7 +87,7 @@ class BioTacDimensions:
     core: tuple = _CORE  # rigid core, 10.65 mm in diameter [nv]
     core_tip: float = -13.98  # [nv]
     core_end: float = 5.08  # [nv] has 5.105, 0.025 mm inside the skin; equal to cavity_end here, so that the skin is bonded without overlap
-    core_end_edge: float = 0.50  # [nv]
+    core_end_edge: float = 0.90  # [nv] has 0.5; wider, so that chords of the skin across its own edge of 0.42 do not cut into the core
     facet_normal: tuple = (-0.5, -0.8660254037844386, 0.0)  # flat of electrodes E7-E10, 30 degrees to the axis [lin]
     facet_offset: float = 10.795  # its distance from the origin [nv]
     facet_edge: float = 0.30  # [nv]
@@ -169,7 +175,7 @@ def electrodes(core: Body, dimensions: BioTacDimensions = BioTacDimensions()) ->
 
 
 def nail_plate(dimensions: BioTacDimensions = BioTacDimensions()) -> tuple[np.ndarray, np.ndarray]:
-    """Closed mesh of the nail plate: vert (n, 3) [mm], face (m, 3). It lies on the flat top of the outer skin, with a round end at the tip."""
+    """Closed mesh of the nail plate on the flat top of the outer skin: vert (n, 3) [mm], face (m, 3); its end at the tip is round."""
     d = dimensions
     angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 25)
     centre = d.nail_x[0] + d.nail_half_width

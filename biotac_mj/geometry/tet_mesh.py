@@ -10,7 +10,7 @@ __all__ = ["TetMesh"]
 # Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is opposite to vertex i.
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _FACE_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-_DEGENERATE = 1e-6  # a regular tetrahedron has a volume of 0.118 edge^3; below this share of its longest edge^3 one is flat to rounding of its file
+_DEGENERATE = 1e-6  # volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat to rounding of its file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class TetMesh:
         _, first, count = np.unique(np.sort(face, axis=1), axis=0, return_index=True, return_counts=True)
         if count.max() > 2:
             raise ValueError(
-                f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first has vertices {face[first[count > 2][0]].tolist()}: "
+                f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first: {face[first[count > 2][0]].tolist()}: "
                 "remove duplicate or overlapping tetrahedra"
             )
         return np.ascontiguousarray(face[np.sort(first[count == 1])])
@@ -81,8 +81,8 @@ class TetMesh:
         """Returns itself when it can be simulated.
 
         Raises:
-          ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or non-manifold surface, unused vertices;
-            the text says how many, which comes first and what to do.
+          ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or non-manifold surface, unused
+            vertices; the text says how many, which comes first and what to do.
         """
         bad = np.flatnonzero(~np.isfinite(self.vert).all(axis=1))
         if len(bad):
@@ -90,7 +90,8 @@ class TetMesh:
         bad = np.flatnonzero(((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1))
         if len(bad):
             raise ValueError(
-                f"{len(bad)} tetrahedra name vertices outside 0..{len(self.vert) - 1}, the first is tetrahedron {bad[0]} = {self.elem[bad[0]].tolist()}: "
+                f"{len(bad)} tetrahedra name vertices outside 0..{len(self.vert) - 1}, "
+                f"the first is tetrahedron {bad[0]} = {self.elem[bad[0]].tolist()}: "
                 "indices must be 0-based (subtract 1 if the file counts from 1)"
             )
         corner = self.vert[self.elem]
@@ -103,7 +104,9 @@ class TetMesh:
             )
         inverted = np.flatnonzero(self.volumes < 0)
         if len(inverted):
-            remedy = "swap two indices of every tetrahedron" if len(inverted) == len(self.elem) else "swap two of its indices, or mesh again"
+            remedy = (
+                "swap two indices of every tetrahedron" if len(inverted) == len(self.elem) else "swap two of its indices, or mesh again"
+            )
             raise ValueError(
                 f"{len(inverted)} tetrahedra are inverted (negative volume), the first is tetrahedron {inverted[0]} = "
                 f"{self.elem[inverted[0]].tolist()}: {remedy}"
@@ -116,12 +119,14 @@ class TetMesh:
 
 
 def check_closed(face: np.ndarray, name: str = "surface") -> None:
-    """Raises ValueError unless every edge of `face` (nface, 3) is shared by exactly two faces that run through it in opposite directions."""
+    """Raises ValueError unless every edge of `face` (nface, 3) belongs to exactly two faces that run through it in opposite directions."""
     edge = face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, first, count = np.unique(np.sort(edge, axis=1), axis=0, return_index=True, return_counts=True)
     if (count == 1).any():
         where = edge[first[count == 1][0]].tolist()
-        raise ValueError(f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices {where}: fill the holes")
+        raise ValueError(
+            f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices {where}: fill the holes"
+        )
     if (count > 2).any():
         where = edge[first[count > 2][0]].tolist()
         raise ValueError(
