@@ -1,6 +1,6 @@
 """Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid parts and the indenters.
 
-    pip install pytetwild pyvista
+    pip install -e ".[mesh]"
     python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
 
 fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run; the surfaces and the quality

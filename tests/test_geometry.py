@@ -172,7 +172,7 @@ def test_electrodes(skin):
 
 
 def test_core_stays_inside_the_cavity():
-    """Contact with the core does not begin in overlap: exactly for the surfaces, up to the sag of chords (edge^2 / 8 radius) for the mesh."""
+    """Contact with the core does not begin in overlap: exactly for the surfaces, to the sag of chords (edge^2 / 8 radius) for meshes."""
     bodies, skin = biotac_bodies(), load_skin("default")
     assert bodies["cavity"].distance(bodies["core"].project(skin.core_vert * 1e3)).max() < 0.005
     cavity = trimesh.Trimesh(skin.vert * 1e3, skin.inner_face[:, ::-1], process=False)
