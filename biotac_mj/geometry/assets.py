@@ -12,9 +12,10 @@ def asset_path(name: str) -> pathlib.Path:
     Raises:
       FileNotFoundError: there is no such asset.
     """
-    roots = [pathlib.Path(__file__).parents[2] / "assets"]  # source checkout and editable install
+    checkout = pathlib.Path(__file__).parents[2]
+    roots = [checkout / "assets"] if (checkout / "pyproject.toml").is_file() else []  # a checkout uses its own meshes, whatever is installed
     try:
-        roots.insert(0, pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))))  # wheel
+        roots.append(pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))))  # wheel
     except ModuleNotFoundError:
         pass
     for root in roots:
