@@ -13,7 +13,8 @@ def asset_path(name: str) -> pathlib.Path:
       FileNotFoundError: there is no such asset.
     """
     checkout = pathlib.Path(__file__).parents[2]
-    roots = [checkout / "assets"] if (checkout / "pyproject.toml").is_file() else []  # a checkout uses its own meshes, whatever is installed
+    # a checkout uses its own meshes, whatever is installed beside it
+    roots = [checkout / "assets"] if (checkout / "pyproject.toml").is_file() else []
     try:
         roots.append(pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))))  # wheel
     except ModuleNotFoundError:
