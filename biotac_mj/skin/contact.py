@@ -8,10 +8,10 @@ stays put on the geom, returned radially to mu times the normal force where it s
 import numpy as np
 import warp as wp
 
-from .shapes import Grids, distance
+from .shapes import Grids, distance, distance_bound
 from .types import mat33, real, vec3
 
-__all__ = ["Geoms", "contact_force", "contact_product", "contact_wrench", "face_samples", "rest_gap"]
+__all__ = ["Geoms", "contact_force", "contact_product", "contact_wrench", "depth_in_core", "face_samples", "rest_gap"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -98,8 +98,8 @@ def contact_force(
     # most faces are far from every geom: one distance each tells
     for g in range(geoms.count):
         R = geoms.mat[g, w]
-        dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], wp.transpose(R) * (center - geoms.pos[g, w]))
-        if dn[3] < radius + real(1.0e-4):
+        y = wp.transpose(R) * (center - geoms.pos[g, w])
+        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < radius:
             near = 1
     touching = int(0)
     f0 = vec3()
@@ -249,3 +249,22 @@ def contact_wrench(
     for c in range(3):
         wrench_out[group, w, c] = total[c]
         wrench_out[group, w, 3 + c] = torque[c]
+
+
+@wp.kernel
+def depth_in_core(
+    # In:
+    core_vert: wp.array(dtype=vec3),
+    geoms: Geoms,
+    # Out:
+    depth_out: wp.array2d(dtype=real),
+):
+    """How deep each geom reaches into the rigid core, by the core's vertices inside the geom [geom, world]."""
+    g, w = wp.tid()
+    R = geoms.mat[g, w]
+    deepest = real(0.0)
+    for i in range(core_vert.shape[0]):
+        y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        deepest = wp.min(deepest, bound)
+    depth_out[g, w] = -deepest

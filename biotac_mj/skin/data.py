@@ -80,6 +80,7 @@ class SkinData:
             self.direction = wp.zeros_like(self.x)
             self.product = wp.zeros_like(self.x)
             self.gradient = wp.zeros_like(self.x)
+            self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
             self.rotation = wp.zeros((model.nelem, nworld), dtype=mat33)
             self.jacobian = wp.zeros((model.nelem, nworld), dtype=real)
             self.corner = wp.zeros((4 * model.nelem, nworld), dtype=vec3)
@@ -99,6 +100,8 @@ class SkinData:
         for array in (self.x, self.x_last):
             wp.copy(array, wp.array(rest, dtype=vec3, ndim=2, device=array.device))
         self.velocity.zero_()
+        self.increment.zero_()
+        self.motion = np.zeros((self.nworld, 0, 3))  # of the geoms in the last step
         self.force.zero_()
         self.outer.reset()
         if self.core:
@@ -126,6 +129,56 @@ class SkinData:
     @property
     def reaction(self):
         return -self.force.numpy()[self.model.fixed].sum(0)
+
+    def load(self, x, increment, motion, contacts):
+        """Sets the state of a single world; the inverse of reading it.
+
+        Args:
+          x, increment: (nvert, 3) positions and last increment [m].
+          motion: (ngeom, 3) of the geoms in the last step [m].
+          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts` gives them.
+        """
+        for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
+            wp.copy(array, wp.array(value[:, None], dtype=vec3, ndim=2, device=array.device))
+        self.motion = np.array(motion)[None]
+        geom, anchor = self.outer.anchor_geom.numpy().copy(), self.outer.anchor.numpy().copy()
+        geom[:] = -1
+        sample = contacts[:, 0].astype(int)
+        geom[sample, 0], anchor[sample, 0] = contacts[:, 1].astype(np.int32), contacts[:, 2:]
+        wp.copy(self.outer.anchor_geom, wp.array(geom, dtype=int, ndim=2, device=self.x.device))
+        wp.copy(self.outer.anchor, wp.array(anchor, dtype=vec3, ndim=2, device=self.x.device))
+
+    def load_motion(self, velocity, core_pos, core_mat):
+        """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the core's pose."""
+        wp.copy(self.velocity, wp.array(velocity[:, None], dtype=vec3, ndim=2, device=self.x.device))
+        self.core_pos, self.core_mat = np.array(core_pos)[None], np.array(core_mat)[None]
+
+    def contacts(self) -> np.ndarray:
+        """What touches in the first world: (n, 5) sample, geom and anchor (in the geom's frame) [m]."""
+        geom = self.outer.anchor_geom.numpy()[:, 0]
+        sample = np.flatnonzero(geom >= 0)
+        return np.column_stack([sample, geom[sample], self.outer.anchor.numpy()[sample, 0]])
+
+    def touching_geoms(self, ngeom: int):
+        """Which geoms touched the outer surface when the last step ended: (nworld, ngeom) bool."""
+        geom = self.outer.anchor_geom.numpy()
+        return np.stack([(geom == g).any(0) for g in range(ngeom)], 1) if ngeom else np.zeros((self.nworld, 0), bool)
+
+    def tangent(self, geoms) -> np.ndarray:
+        """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac frame's origin, after a step."""
+        face, touching, block = self.contact_blocks
+        geom = self.outer.trial_geom.numpy().reshape(len(face), -1, self.nworld)
+        x = self.x.numpy()
+        out = np.zeros((self.nworld, geoms.ngroup, 6, 6))
+        for w in range(self.nworld):
+            active = np.flatnonzero(touching[:, w])
+            group = geoms.groups[geom[active, :, w].max(1)]
+            blocks = block[6 * active[:, None] + np.arange(6), w]
+            blocks = blocks if isinstance(blocks, np.ndarray) else blocks.cpu().numpy()
+            for g in np.unique(group):
+                mine = group == g
+                out[w, g] = self.preconditioner.tangent(w, (face[active[mine]], blocks[mine]), x[:, w])
+        return out
 
     def stress(self):
         """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""

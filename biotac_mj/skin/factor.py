@@ -8,22 +8,29 @@ import warp as wp
 
 __all__ = ["DenseFactor", "SparseFactor"]
 
-_CLUSTER = 8  # nodes whose columns are computed together; CHOLMOD takes as long for 8 right-hand sides as for 24
+_CLUSTER = 4  # nodes whose rows are computed together
 
 
 class SparseFactor:
     """CHOLMOD's sparse factor (through cholespy) on the CPU."""
 
-    def __init__(self, stiffness, free, nvert, device):
+    def __init__(self, stiffness, free, vert, device):
         from cholespy import CholeskySolverD, MatrixType
 
         coo = stiffness.tocoo()
         self.size = coo.shape[0]
         self._solver = CholeskySolverD(self.size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO)
         self._free = free
-        self._index = np.full(nvert, -1)
+        self._index = np.full(len(vert), -1)
         self._index[free] = np.arange(len(free))
-        self._clusters = {}
+        # clusters of neighbours: what touches together is computed together
+        order = _bisection_order(vert[free])
+        self._cluster_nodes = np.array_split(order, max(1, len(order) // _CLUSTER))
+        self._cluster = np.empty(len(free), int)
+        self._member = np.empty(len(free), int)
+        for number, members in enumerate(self._cluster_nodes):
+            self._cluster[members], self._member[members] = number, np.arange(len(members))
+        self._rows = {}
 
     def solve(self, rhs):
         """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""
@@ -44,16 +51,16 @@ class SparseFactor:
         """
         local = self._index[nodes]
         out = np.empty((len(nodes), 3, self.size), np.float32)
-        for cluster in np.unique(local // _CLUSTER):
-            if cluster not in self._clusters:
-                first, last = cluster * _CLUSTER, min((cluster + 1) * _CLUSTER, len(self._free))
-                b = np.zeros((self.size, 3 * (last - first)))
-                b[np.arange(3 * first, 3 * last), np.arange(3 * (last - first))] = 1
+        for cluster in np.unique(self._cluster[local]):
+            if cluster not in self._rows:
+                dof = (3 * self._cluster_nodes[cluster][:, None] + np.arange(3)).ravel()
+                b = np.zeros((self.size, len(dof)))
+                b[dof, np.arange(len(dof))] = 1
                 x = np.empty_like(b)
                 self._solver.solve(b, x)
-                self._clusters[cluster] = x.T.reshape(-1, 3, self.size).astype(np.float32)
-            here = local // _CLUSTER == cluster
-            out[here] = self._clusters[cluster][local[here] % _CLUSTER]
+                self._rows[cluster] = x.T.reshape(-1, 3, self.size).astype(np.float32)
+            here = self._cluster[local] == cluster
+            out[here] = self._rows[cluster][self._member[local[here]]]
         return out.reshape(-1, self.size)
 
     def dof(self, nodes) -> np.ndarray:
@@ -64,7 +71,7 @@ class SparseFactor:
 class DenseFactor:
     """The dense inverse in single precision on a CUDA device (torch)."""
 
-    def __init__(self, stiffness, free, nvert, device):
+    def __init__(self, stiffness, free, vert, device):
         import torch
 
         self._device = wp.device_to_torch(device)
@@ -72,7 +79,7 @@ class DenseFactor:
         matrix = torch.tensor(stiffness.toarray(), device=self._device)
         self.inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).float()
         self._free = torch.as_tensor(free, device=self._device)
-        self._index = np.full(nvert, -1)
+        self._index = np.full(len(vert), -1)
         self._index[free] = np.arange(len(free))
 
     def solve(self, rhs):
@@ -91,3 +98,18 @@ class DenseFactor:
         import torch
 
         return torch.as_tensor((3 * self._index[nodes][:, None] + np.arange(3)).ravel(), device=self._device)
+
+
+def _bisection_order(points: np.ndarray) -> np.ndarray:
+    """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and again."""
+    order = np.arange(len(points))
+    stack, out = [order], []
+    while stack:
+        part = stack.pop()
+        if len(part) <= _CLUSTER:
+            out.append(part)
+            continue
+        axis = np.ptp(points[part], axis=0).argmax()
+        part = part[np.argsort(points[part, axis], kind="stable")]
+        stack += [part[len(part) // 2 :], part[: len(part) // 2]]
+    return np.concatenate(out)

@@ -28,6 +28,7 @@ class SkinOptions:
       bulk_modulus: of the liquid [Pa]; water has 2.2e9.
       core_contact: whether the inner surface can touch the rigid core.
       core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core contact [m].
+      max_core_depth: a geom that reaches deeper into the core than this is refused [m].
       contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference solutions' ratio.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
@@ -45,9 +46,10 @@ class SkinOptions:
     bulk_modulus: float = 2.2e9
     core_contact: bool = True
     core_clearance: float = 2e-5
+    max_core_depth: float = 5e-4
     contact_stiffness: float | None = None
     stick_ratio: float = 0.1
-    samples: int = 4
+    samples: int = 3
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
     tolerance: float = 1e-3
@@ -147,6 +149,7 @@ class SkinModel:
         if self.has_core:
             faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
             self.core_surface = Surface.create(vert, faces, self.device)
+            self.core_vert = wp.array(geometry.core_vert, dtype=vec3, device=self.device)
         self.rest_volume, self.liquid_volume = self._volumes()
         stiffness = elasticity.rest_stiffness(self.nvert, elem, inverse_edges, volume, self.material.mu, self.material.lame)
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
@@ -182,7 +185,7 @@ class SkinModel:
     @functools.cached_property
     def factor(self):
         """Inverse of the rest stiffness of the free nodes, as an operator."""
-        return (DenseFactor if self.device.is_cuda else SparseFactor)(self._stiffness, self.free, self.nvert, self.device)
+        return (DenseFactor if self.device.is_cuda else SparseFactor)(self._stiffness, self.free, self.geometry.vert, self.device)
 
 
 @functools.lru_cache(maxsize=8)
@@ -206,4 +209,4 @@ class _Key:
 
 
 def _core_grid(geometry: SkinGeometry):
-    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 3e-4)
+    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 1.5e-4)

@@ -50,16 +50,8 @@ class Preconditioner:
         size = m + (self.gradient is not None)
         if size == 0:
             return None
-        position = np.full(len(self.free_mask), -1)
-        position[nodes] = np.arange(len(nodes))
-        dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
-        for (a, b), k in zip([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)], range(6), strict=True):
-            pa, pb = position[faces[:, a]], position[faces[:, b]]
-            np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
-            if a != b:
-                np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
         D = np.zeros((size, size))
-        D[:m, :m] = dense[:-1, :, :-1].reshape(m, m)
+        D[:m, :m] = self._assemble(nodes, faces, blocks)
         rows, W = self._compliance(w, nodes)
         compliance = np.zeros((size, size))
         compliance[:m, :m] = W / self.scale[w]
@@ -100,6 +92,53 @@ class Preconditioner:
         return z
 
 
+    def tangent(self, w, blocks, x):
+        """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin (translation, rotation vector).
+
+        The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0 + U D U^T)^-1 over T:
+        G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness stands for the tangent here,
+        as in the preconditioner.
+
+        Args:
+          w: world.
+          blocks: (faces (n, 3), stiffness (n, 6, 3, 3)) of the body's contact alone.
+          x: (nvert, 3) nodal positions, host.
+        """
+        small = self.worlds[w]
+        if small is None or not len(blocks[0]):
+            return np.zeros((6, 6))
+        nodes, _, solver, compliance, _ = small
+        size, m = len(compliance), 3 * len(nodes)
+        springs = np.zeros((size, size))
+        springs[:m, :m] = self._assemble(nodes, *blocks)
+        rigid = np.zeros((size, 6))
+        rigid[:m].reshape(-1, 3, 6)[:, :, :3] = np.eye(3)
+        rigid[:m].reshape(-1, 3, 6)[:, :, 3:] = -_skew(x[nodes])
+        pull = springs @ rigid
+        give = compliance @ pull
+        give -= compliance @ _host(solver(give))
+        stiffness = rigid.T @ pull - pull.T @ give
+        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+        return (vectors * np.maximum(values, 0)) @ vectors.T
+
+    def _assemble(self, nodes, faces, blocks):
+        position = np.full(len(self.free_mask), len(nodes))
+        position[nodes] = np.arange(len(nodes))
+        dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
+        for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+            pa, pb = position[faces[:, a]], position[faces[:, b]]
+            np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
+            if a != b:
+                np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
+        return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
+
+
+def _skew(v):
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
 class _Solver:
     """q = (I + D W)^-1 D u on the device of the rows."""
 
@@ -116,7 +155,7 @@ class _Solver:
 
     def __call__(self, u):
         if self._cuda:
-            return self._solution @ u
+            return self._solution @ self._solution.new_tensor(u) if isinstance(u, np.ndarray) else self._solution @ u
         from scipy.linalg import lu_solve
 
         return lu_solve(self._lu, self._D @ u, check_finite=False)

@@ -146,9 +146,9 @@ def _mesh_distance(grids: Grids, k: int, p: vec3):
     """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay sharp."""
     d = _grid_value(grids, k, p)
     h = grids.spacing[k]
-    if d > real(2.0) * h:
+    if d > real(0.5) * h:  # more than the trilinear error at a sharp edge: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    if d < -real(2.0) * h:
+    if d < -h:
         n = vec3(
             _grid_value(grids, k, p + vec3(h, real(0.0), real(0.0))) - _grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
             _grid_value(grids, k, p + vec3(real(0.0), h, real(0.0))) - _grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
@@ -285,3 +285,11 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
     if kind == 6:
         return _rounded_box(size, rounding, p)
     return _mesh_distance(grids, grid, p)
+
+
+@wp.func
+def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
+    """Cheap lower bound of the distance [m]: what is surely not nearer needs no exact distance."""
+    if kind == 7:
+        return _grid_value(grids, grid, p) - real(0.5) * grids.spacing[grid]
+    return distance(kind, size, rounding, grids, grid, p)[3]

@@ -27,11 +27,26 @@ def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = No
         implicit dynamics; None means that it does not move.
 
     Raises:
-      ValueError: geoms of another number of worlds, or implicit dynamics without a positive dt.
+      ValueError: a geom deep inside the rigid core, geoms of another number of worlds, or implicit dynamics without a positive dt.
     """
     if geoms.nworld != data.nworld:
         raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
+    _refuse_core(model, geoms)
     _Step(model, data, geoms, dt, core_pos, core_mat).run()
+
+
+def _refuse_core(model, geoms):
+    if not (model.has_core and geoms.count):
+        return
+    depth = wp.zeros((geoms.count, geoms.nworld), dtype=wp.float64, device=model.device)
+    _launcher(model.device)(contact.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth])
+    depth = depth.numpy()
+    if depth.max() > model.options.max_core_depth:
+        geom, world = np.unravel_index(depth.argmax(), depth.shape)
+        raise ValueError(
+            f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
+            "move it out, press less deep or take smaller steps"
+        )
 
 
 class _Step:
@@ -65,10 +80,27 @@ class _Step:
         self.target = target if like is not None else self.x.new_tensor(target)
         self.inertia = coefficient if like is not None else self.x.new_tensor(coefficient)
 
+    def _motion(self):
+        """How far each geom moves in this step: (nworld, ngeom, 3)."""
+        struct = self.geoms.struct
+        return np.swapaxes(struct.pos.numpy() - struct.pos_last.numpy(), 0, 1)
+
+    def _predict(self):
+        """Starts from the last step's increment, scaled by how much of the touching geoms' last motion this one repeats."""
+        d = self.d
+        if d.motion.shape[1] != self.geoms.count:
+            return
+        touching = d.touching_geoms(self.geoms.count)[..., None]
+        now, last = self._motion() * touching, d.motion * touching
+        square = (last * last).sum((1, 2))
+        repeat = np.clip((now * last).sum((1, 2)) / np.where(square > 0, square, 1), 0, 2)
+        self.x += _like(self.x, repeat)[:, None] * view(d.increment)
+
     def run(self):
         d, options = self.d, self.m.options
         active = np.ones(d.nworld, bool)
         d.iterations[:] = 0
+        self._predict()
         self._evaluate()
         for iteration in range(options.max_newton + 1):
             residual = self.force * self.mask
@@ -202,6 +234,10 @@ class _Step:
                 break
             alpha = running * rz / (curvature + (running == 0))
             dx += alpha[:, None] * p
+            # a first step of length one says that the preconditioner is as good as the tangent
+            running = running * (abs(alpha - 1) > 0.2)
+            if not running.any():
+                break
             r = r - alpha[:, None] * q
             z = self.M.apply(r)
             rz_next = (r * z).sum((0, 2))
@@ -210,8 +246,6 @@ class _Step:
                 break
             p = z + (rz_next / (rz + (rz == 0)))[:, None] * p
             rz = rz_next
-        else:
-            pass
         untouched = _host((dx * dx).sum((0, 2))) == 0
         if (untouched & active).any():  # negative curvature at once: the preconditioner's step
             chosen = _like(self.x, (untouched & active).astype(float))
@@ -235,7 +269,10 @@ class _Step:
                 [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force], [wrench],
             )  # fmt: skip
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
+        d.contact_blocks = self._tangents()[0]
         d.outer.commit()
+        d.motion = self._motion()
+        view(d.increment)[...] = self.x - self.start
         self.geoms.advance()
         wp.copy(d.x_last, d.x)
         if self.inertia is not None:

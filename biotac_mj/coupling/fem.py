@@ -1,0 +1,147 @@
+"""The finite-element skin as the coupling sees it: a function from a state and poses to a new state and wrenches."""
+
+import functools
+
+import numpy as np
+
+from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
+from .stepper import SkinResult
+
+__all__ = ["FemStepper"]
+
+_MAX_CONTACTS = 4096
+
+
+class FemStepper:
+    """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
+
+    The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last step, the sticking
+    contacts (how many, then sample, geom and anchor of each) and, with implicit dynamics, nodal velocities and the core's pose.
+    """
+
+    def __init__(self, config, geometry, geoms):
+        self._config, self._geometry, self._geoms = config, geometry, geoms
+        self._options = SkinOptions(**{**({} if config.liquid is None else {"liquid": config.liquid}), **config.options.get("skin", {})})
+        self._material = Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default")
+        n, g = geometry.nvert, len(geoms)
+        sizes = {"started": 1, "x": 3 * n, "increment": 3 * n, "geom_pos": 3 * g, "geom_mat": 9 * g, "motion": 3 * g, "contacts": 1 + 5 * _MAX_CONTACTS}
+        if self._options.dynamics == "implicit":
+            sizes |= {"velocity": 3 * n, "core_pos": 3, "core_mat": 9}
+        ends = np.cumsum(list(sizes.values()))
+        self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self.nstate = int(ends[-1])
+
+    @functools.cached_property
+    def _model(self):
+        return _model(self._geometry, self._material, self._options, self._config.device)
+
+    @functools.cached_property
+    def _data(self):
+        return SkinData(self._model)
+
+    @functools.cached_property
+    def _geom_set(self):
+        grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type == "mesh"]
+        return GeomSet(
+            [g.type for g in self._geoms],
+            [g.size for g in self._geoms],
+            [g.friction for g in self._geoms],
+            [g.group for g in self._geoms],
+            [g.rounding for g in self._geoms],
+            grids,
+            device=self._config.device,
+        )
+
+    def _part(self, state, name):
+        return state[self._slices[name]]
+
+    def reset(self, state):
+        state[:] = 0
+        self._part(state, "x")[:] = self._geometry.vert.ravel()
+        if "core_mat" in self._slices:
+            self._part(state, "core_mat")[:] = np.eye(3).ravel()
+
+    def vert_xpos(self, state):
+        return self._part(state, "x").reshape(-1, 3)
+
+    def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
+        """See `SkinStepper`.
+
+        Raises:
+          ValueError: NaN in a pose, a geom deep inside the core, or more contact than the state can hold.
+        """
+        d, geoms = self._data, self._geom_set
+        self._unpack(state)
+        geoms.set_pose(geom_pos, geom_mat)
+        if not self._part(state, "started")[0]:
+            geoms.advance()
+        step(self._model, d, geoms, dt, core_pos, core_mat)
+        new = np.zeros_like(state)
+        self._pack(new, geom_pos, geom_mat)
+        return SkinResult(
+            state=new,
+            wrench=d.wrench[0],
+            tangent=d.tangent(geoms)[0],
+            vert_xpos=d.vert_xpos[0],
+            pressure=float(d.pressure[0]),
+            converged=bool(d.converged[0]),
+            iterations=int(d.iterations[0]),
+            residual=float(d.error[0]),
+        )
+
+    def _unpack(self, state):
+        d, geoms = self._data, self._geom_set
+        d.load(
+            x=self._part(state, "x").reshape(-1, 3),
+            increment=self._part(state, "increment").reshape(-1, 3),
+            motion=self._part(state, "motion").reshape(-1, 3),
+            contacts=_contacts(self._part(state, "contacts")),
+        )
+        geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
+        geoms.advance()
+        if "velocity" in self._slices:
+            d.load_motion(
+                self._part(state, "velocity").reshape(-1, 3), self._part(state, "core_pos"), self._part(state, "core_mat").reshape(3, 3)
+            )
+
+    def _pack(self, state, geom_pos, geom_mat):
+        d = self._data
+        contacts = d.contacts()
+        if len(contacts) > _MAX_CONTACTS:
+            raise ValueError(
+                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: sample faces less densely (options samples=) or use a coarser skin"
+            )
+        self._part(state, "started")[:] = 1
+        self._part(state, "x")[:] = d.vert_xpos[0].ravel()
+        self._part(state, "increment")[:] = d.increment.numpy()[:, 0].ravel()
+        self._part(state, "geom_pos")[:] = np.ravel(geom_pos)
+        self._part(state, "geom_mat")[:] = np.ravel(geom_mat)
+        self._part(state, "motion")[:] = d.motion[0].ravel()
+        buffer = self._part(state, "contacts")
+        buffer[0] = len(contacts)
+        buffer[1 : 1 + contacts.size] = contacts.ravel()
+        if "velocity" in self._slices:
+            self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
+            self._part(state, "core_pos")[:] = d.core_pos[0]
+            self._part(state, "core_mat")[:] = d.core_mat[0].ravel()
+
+
+def _contacts(buffer):
+    count = int(buffer[0])
+    return buffer[1 : 1 + 5 * count].reshape(count, 5)
+
+
+@functools.lru_cache(maxsize=16)
+def _grid(vert, face):
+    return bake_distance_grid(np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3))
+
+
+_models = {}
+
+
+def _model(geometry, material_choice, options, device):
+    """One SkinModel per geometry and settings: its factor and compliance are the same for every sensor in the process."""
+    key = (geometry.vert.tobytes(), geometry.elem.tobytes(), geometry.fixed.tobytes(), material_choice, options, device)
+    if key not in _models:
+        _models[key] = SkinModel(geometry, material_choice, options, device)
+    return _models[key]
