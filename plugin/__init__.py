@@ -1,7 +1,7 @@
 """The MuJoCo engine plugin that steps a BioTac's skin inside `mj_step`. Importing it registers it."""
 
-from .engine import ATTRIBUTES, PLUGIN_NAME, check, register
+from .engine import ATTRIBUTES, PLUGIN_NAME, check, clear_errors, register
 
-__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "register"]
+__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
 
 register()

@@ -15,6 +15,7 @@ import numpy as np
 __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
+_EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
 
 
 class Metric:
@@ -50,49 +51,58 @@ class Metric:
         own = data.jacobian(self.core, origin)
         return np.stack([turn @ (data.jacobian(int(b), origin) - own) for b in self.body]) if len(self.body) else np.zeros((0, 6, self.model.nv))
 
-    def write(self, data, jacobian, tangent, horizon):
+    def begin(self, data):
+        """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them."""
+        model = self.model
+        self._rows = {}
+        if not self.slot:
+            return
+        ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
+        for root, slot in self.slot.items():
+            index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
+            if len(index) != 6:
+                raise ValueError("two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, or use coupling='one-way'")
+            here = slice(int(index[0]), int(index[0]) + 6)
+            self._rows[root] = here, data.map_efc2iefc[here] if data.nisland else None
+            data.efc_pos[here] = 0.0
+            data.efc_KBIP[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
+        self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
+        if data.nisland:
+            self._island_weight, self._island_regular = data.iefc_D, data.iefc_R
+        self._columns = None
+        if model.is_sparse:
+            self._columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+        self._filled = dict.fromkeys(self._rows, True)  # by MuJoCo
+
+    def write(self, jacobian, tangent, horizon):
         """Puts the stiffness of tangents (ngroup, 6, 6) over `horizon` [s] into the rows."""
         if not self.slot:
             return
-        rows = {}
+        total = {}
         for group in np.flatnonzero(tangent.any(axis=(1, 2))) if horizon else ():
             root = self.root[group]
             if root in self.slot:  # bodies that are welded together move as one: their stiffnesses add
-                rows[root] = (jacobian[group], tangent[group] + (rows[root][1] if root in rows else 0.0))
-        self._write(data, rows, horizon)
+                total[root] = (jacobian[group], tangent[group] + (total[root][1] if root in total else 0.0))
+        for root in self._rows:
+            if root in total:
+                relative, stiff = total[root]
+                stiffness, basis = np.linalg.eigh(stiff)
+                value = np.maximum(horizon * horizon * stiffness, _MINVAL)
+                rows = (basis * (stiffness > 1e-12 * stiffness[-1])).T @ relative
+                self._fill(root, rows, value)
+            elif self._filled[root]:
+                self._fill(root, np.zeros((6, self.model.nv)), np.full(6, _MINVAL))
+            self._filled[root] = root in total
 
-    def _write(self, data, rows, horizon):
-        model = self.model
-        ids = data.efc_id[: data.ne]
-        kinds = data.efc_type[: data.ne]
-        equality = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-        stiff, sparse = data.efc_J, model.is_sparse
-        weight, regular, pos, gains = data.efc_D, data.efc_R, data.efc_pos, data.efc_KBIP
-        if sparse:
-            count, start, column = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
-        islands = data.nisland
-        if islands:
-            place, island_weight, island_regular = data.map_efc2iefc, data.iefc_D, data.iefc_R
-        for root, slot in self.slot.items():
-            index = np.flatnonzero((ids == slot) & (kinds == equality))
-            if len(index) != 6:
-                raise ValueError("two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, or use coupling='one-way'")
-            first = index[0]
-            here = slice(first, first + 6)
-            jacobian, value = np.zeros((6, model.nv)), np.full(6, _MINVAL)
-            if root in rows:
-                relative, tangent = rows[root]
-                stiffness, basis = np.linalg.eigh(0.5 * (tangent + tangent.T))
-                used = stiffness > 1e-12 * max(stiffness[-1], 0.0)
-                jacobian[used] = basis.T[used] @ relative
-                value[used] = np.maximum(horizon * horizon * stiffness[used], _MINVAL)
-            if sparse:
-                for k in range(6):
-                    a, n = start[first + k], count[first + k]
-                    stiff[a : a + n] = jacobian[k, column[a : a + n]]
-            else:
-                stiff[first * model.nv : (first + 6) * model.nv] = jacobian.ravel()
-            weight[here], regular[here], pos[here] = value, 1.0 / value, 0.0
-            gains[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
-            if islands:
-                island_weight[place[here]], island_regular[place[here]] = value, 1.0 / value
+    def _fill(self, root, rows, value):
+        here, place = self._rows[root]
+        if self._columns is None:
+            self._stiff[here.start * self.model.nv : here.stop * self.model.nv] = rows.ravel()
+        else:
+            count, start, column = self._columns
+            for k, row in enumerate(rows, start=here.start):
+                a, n = start[k], count[k]
+                self._stiff[a : a + n] = row[column[a : a + n]]
+        self._weight[here], self._regular[here] = value, 1.0 / value
+        if place is not None:
+            self._island_weight[place], self._island_regular[place] = value, 1.0 / value

@@ -84,6 +84,7 @@ class _Coupled:
     def __init__(self, instance, data):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
         self.jacobian = instance.metric.jacobians(data)
+        instance.metric.begin(data)
         self.pose = instance.touching.predict(data, self.horizon)
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.solved = False
@@ -101,9 +102,9 @@ class _Coupled:
         self.wrench0, self.tangent, self.pose0, self.solved = result.wrench, result.tangent, (pos, mat), True
 
     def apply(self):
-        if not len(self.wrench0):
-            return
+        if not self.wrench0.any() and not self.tangent.any():
+            return self.instance.metric.write(self.jacobian, self.tangent, 0.0)
         motion = displacement(*self.pose, *self.pose0)
         wrench = self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
-        self.data.qfrc_passive += np.einsum("gi,gij->j", wrench, self.jacobian)
-        self.instance.metric.write(self.data, self.jacobian, self.tangent, self.horizon)
+        self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+        self.instance.metric.write(self.jacobian, self.tangent, self.horizon)
