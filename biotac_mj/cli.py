@@ -182,10 +182,10 @@ def _import_mesh(args):
 
 
 def _calm_warp():
+    """Hides the list of devices and compiled modules; warnings stay."""
     import warp
 
-    warp.config.quiet = True
-    print("solving the skin with Warp; the first run compiles its kernels, which takes about a minute")
+    warp.config.log_level = warp.LOG_WARNING
 
 
 def main(argv=None) -> int:

@@ -71,10 +71,17 @@ def test_versions_agree(repo):
 @pytest.mark.slow
 def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
     """Builds a wheel, unpacks it elsewhere and imports it from there, away from the checkout."""
+    import shutil
     import zipfile
 
+    # from a copy, so that neither an old build folder adds to the wheel nor this test leaves one
+    source = tmp_path / "source"
+    for name in ("biotac_mj", "plugin", "mjcf", "assets"):
+        shutil.copytree(repo / name, source / name)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(repo / name, source)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, repo], check=True, capture_output=True)
+    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source], check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
