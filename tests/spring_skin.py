@@ -42,7 +42,7 @@ def _depth(geom, point):
         normal = np.zeros_like(point)
         normal[np.arange(len(point)), axis] = np.sign(point[np.arange(len(point)), axis])
         return -gap.max(axis=1), normal
-    raise ValueError(f"the skin of springs does not know {geom.type}")
+    return np.full(len(point), -1.0), np.tile([0.0, 0.0, 1.0], (len(point), 1))  # the springs do not feel other shapes
 
 
 class SpringSkin:

@@ -9,6 +9,7 @@ import numpy as np
 from ..plugin import PLUGIN_NAME
 from . import skins
 from .config import Config
+from .stepper import check_names
 
 __all__ = ["Handle", "attach"]
 
@@ -89,6 +90,7 @@ def attach(
         rounding=dict(rounding or {}), priority=int(priority), seed=int(seed), device=device, options=dict(options or {}),
         **({} if friction is None else {"friction": float(friction)}),
     )  # fmt: skip
+    check_names(config)
     names = [g.name for g in spec.geoms]
     for name in (*(config.geoms or ()), *config.rounding):
         if name not in names:

@@ -82,13 +82,13 @@ class Setup:
 
     @property
     def nstate(self):
-        return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
+        return _HEAD + _MODEL * self.touching.capacity + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state):
         """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin state, as views."""
-        a = _HEAD + _MODEL * self.ngroup
+        a = _HEAD + _MODEL * self.touching.capacity
         b = a + self.skin.stepper.nstate
-        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:]
+        return state[:_HEAD], state[_HEAD:a].reshape(-1, _MODEL)[: self.ngroup], state[a:b], state[b:]
 
     def reset(self, state):
         head, models, skin, readings = self.parts(state)

@@ -1,45 +1,60 @@
-"""The sensor of `biotac_mj.sensor` as the coupling's `Readings`."""
+"""The sensor as the coupling sees it: counts of every channel from the deformed skin."""
 
 import functools
 
-import numpy as np
+from ..sensor.acquisition import Acquisition
+from ..sensor.film import FilmConduction
+from ..sensor.readings import PhysicsReadings
 
 __all__ = ["SensorReadings"]
 
 
 class SensorReadings:
-    """Counts of a real sensor's channels from the film's conduction and the liquid's pressure.
+    """`PhysicsReadings` behind the `Readings` protocol; `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature).
 
-    `config.options["sensor"]` holds further arguments of `PhysicsReadings`, for example {"noise": False}.
+    The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """
 
     def __init__(self, config, geometry):
-        self._arguments = dict(config.options.get("sensor", {}))
-        self._seed, self._geometry = config.seed, geometry
+        self._geometry, self._seed = geometry, config.seed
+        self._options = dict(config.options.get("readings", {}))
+        self.nstate = Acquisition.nstate
 
     @functools.cached_property
-    def _sensor(self):
-        from ..sensor import PhysicsReadings
-
-        try:
-            return PhysicsReadings(self._geometry, seed=self._seed, **self._arguments)
-        except TypeError as error:
-            raise ValueError(f"options['sensor'] of the BioTac: {error}; see biotac_mj.sensor.PhysicsReadings") from error
-
-    @property
-    def nstate(self):
-        return self._sensor.nstate
+    def _physics(self):
+        film = _film(_Skin(self._geometry), self._options.get("sensor", "1"))
+        return PhysicsReadings(self._geometry, seed=self._seed, film=film, **self._options)
 
     @functools.cached_property
     def rest(self):
-        """Counts at rest."""
+        import numpy as np
+
         state = np.zeros(self.nstate)
-        self._sensor.reset(state)
-        return self._sensor.readings(state)
+        self._physics.reset(state)
+        return self._physics.readings(state)
 
     def reset(self, state):
-        self._sensor.reset(state)
+        self._physics.reset(state)
 
     def advance(self, state, time, dt, vert_xpos, pressure):
-        self._sensor.advance(state, time, dt, vert_xpos, pressure)
-        return self._sensor.readings(state)
+        self._physics.advance(state, time, dt, vert_xpos, pressure)
+        return self._physics.readings(state)
+
+
+class _Skin:
+    """A geometry, hashable by content."""
+
+    def __init__(self, geometry):
+        self.geometry = geometry
+        self.key = (geometry.vert.tobytes(), geometry.core_vert.tobytes(), geometry.electrode_pos.tobytes())
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return self.key == other.key
+
+
+@functools.lru_cache(maxsize=4)
+def _film(skin, sensor):
+    return FilmConduction(skin.geometry, sensor=sensor)

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Geom", "Readings", "SkinResult", "SkinStepper", "make_readings", "make_stepper", "register_readings", "register_stepper"]
+__all__ = ["Geom", "Readings", "SkinResult", "SkinStepper", "check_names", "make_readings", "make_stepper", "register_readings", "register_stepper"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,7 +57,8 @@ class SkinResult:
 
 
 class SkinStepper(Protocol):
-    """A skin. Making one must be cheap (MuJoCo asks for `nstate` while it compiles); heavy work belongs into the first `reset`."""
+    """A skin. Making one must be cheap, and `nstate` may not depend on the geoms: MuJoCo asks for it while it compiles, before all of the model is
+    there. Heavy work belongs into the first `reset`."""
 
     nstate: int
 
@@ -115,13 +116,18 @@ def register_readings(name, factory):
     _readings[name] = factory
 
 
-def _factory(table, name, what):
-    if name not in table:
-        raise ValueError(f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper")
+def _factory(table, name):
     if isinstance(table[name], str):
         module, attribute = table[name].split(":")
         return getattr(importlib.import_module(module), attribute)
     return table[name]
+
+
+def check_names(config):
+    """Raises ValueError if the settings name a stepper or readings that nobody registered."""
+    for table, name, what in ((_steppers, config.stepper, "stepper"), (_readings, config.readings, "readings")):
+        if name not in table:
+            raise ValueError(f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper")
 
 
 def make_stepper(config, geometry, geoms) -> SkinStepper:
@@ -130,7 +136,8 @@ def make_stepper(config, geometry, geoms) -> SkinStepper:
     Raises:
       ValueError: the name is unknown.
     """
-    return _factory(_steppers, config.stepper, "stepper")(config, geometry, geoms)
+    check_names(config)
+    return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 
 def make_readings(config, geometry) -> Readings:
@@ -139,4 +146,5 @@ def make_readings(config, geometry) -> Readings:
     Raises:
       ValueError: the name is unknown.
     """
-    return _factory(_readings, config.readings, "readings")(config, geometry)
+    check_names(config)
+    return _factory(_readings, config.readings)(config, geometry)

@@ -26,7 +26,7 @@ class Touching:
     Attributes:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
-      body: (ngroup,) ids of the touching bodies.
+      body: (ngroup,) ids of the touching bodies; capacity: how many there could be (ngroup or more).
 
     Raises:
       ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the skin cannot touch.
@@ -34,7 +34,10 @@ class Touching:
 
     def __init__(self, model, core, config):
         self.core = core
-        ids = _select(model, core, config.geoms)
+        candidates = _select(model, core, config.geoms)
+        # contact exclusions are not yet in the model when MuJoCo asks for the size of the state while it compiles: count without them
+        self.capacity = len(np.unique(model.geom_bodyid[candidates]))
+        ids = candidates if config.geoms is not None else _not_excluded(model, core, candidates)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
         self.body, group = np.unique(bodies, return_inverse=True)
@@ -158,15 +161,16 @@ def _select(model, core, names):
         body = model.geom_bodyid[i]
         if not (model.geom_contype[i] or model.geom_conaffinity[i]) or weld[body] == own:
             continue
-        if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own) or _excluded(model, body, core):
+        if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
         out.append(i)
     return np.array(out, dtype=np.int64)
 
 
-def _excluded(model, body, core):
-    a, b = sorted((int(body), int(core)))
-    return bool(np.any(model.exclude_signature == (a << 16) + b)) if model.nexclude else False
+def _not_excluded(model, core, ids):
+    pairs = {tuple(sorted((core, int(model.geom_bodyid[i])))) for i in ids}
+    excluded = {pair for pair in pairs if model.nexclude and np.any(model.exclude_signature == (pair[0] << 16) + pair[1])}
+    return np.array([i for i in ids if tuple(sorted((core, int(model.geom_bodyid[i])))) not in excluded], dtype=np.int64)
 
 
 def _resolve(model, name):

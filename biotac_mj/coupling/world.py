@@ -47,35 +47,34 @@ class World:
             other.failed()
 
     def _step(self):
-        data = self.data
-        outside = data.qfrc_passive.copy()
-        skins = [_Coupled(t, data) for t in self.coupled]
-        horizon = skins[0].horizon
-        moving = horizon and self.model.nv
-        for _ in range(MAX_ROUNDS):
-            moved = not any(s.solved for s in skins)
-            acceleration = self._apply(skins, outside) if moving else None
+        outside = self.data.qfrc_passive.copy()
+        skins = [_Coupled(t, self.data) for t in self.coupled]
+        try:
+            self._newton(skins, outside)
+        except BaseException:
+            self.data.qfrc_passive[:] = outside
             for skin in skins:
-                pose = skin.pose_after(acceleration) if moving else skin.pose
-                if not skin.solved or skin.change(pose) > TOLERANCE:
-                    skin.solve(*pose)
-                    moved = True
-            if not moved or not moving:
+                skin.let_go()
+            raise
+
+    def _newton(self, skins, outside):
+        moving = skins[0].horizon > 0 and self.model.nv > 0
+        for _ in range(MAX_ROUNDS):
+            self._forces(skins, outside)
+            acceleration = self.data.acceleration() if moving else np.zeros(self.model.nv)
+            if not any([skin.follow(acceleration) for skin in skins]):  # all of them, not the first alone
+                return
+            if not moving:
                 break
         self._forces(skins, outside)
 
     def _forces(self, skins, outside):
-        data = self.data
-        data.qfrc_passive[:] = outside
+        self.data.qfrc_passive[:] = outside
         for skin in skins:
             skin.apply()
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
-            data.project_constraints()
-
-    def _apply(self, skins, outside):
-        self._forces(skins, outside)
-        return self.data.acceleration()
+            self.data.project_constraints()
 
 
 class _Coupled:
@@ -87,24 +86,33 @@ class _Coupled:
         instance.metric.begin(data)
         self.pose = instance.touching.predict(data, self.horizon)
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
-        self.solved = False
+        self.solved = self.written = False
+        self.converged = True
 
-    def pose_after(self, acceleration):
+    def follow(self, acceleration):
+        """Solves the skin where its bodies go, unless it has been solved there; returns whether it did."""
         motion = self.horizon**2 * (self.jacobian @ acceleration)
-        return displace(*self.pose, motion)
+        pose = displace(*self.pose, motion)
+        if self.solved and (not self.converged or self._distance(pose) < TOLERANCE):
+            return False
+        result = self.instance.solve(*pose)
+        self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
+        self.solved, self.converged, self.written = True, result.converged, False
+        return True
 
-    def change(self, pose):
+    def _distance(self, pose):
         motion = displacement(*pose, *self.pose0)
         return max(np.abs(motion[:, :3]).max(initial=0.0), _LEVER * np.abs(motion[:, 3:]).max(initial=0.0))
 
-    def solve(self, pos, mat):
-        result = self.instance.solve(pos, mat)
-        self.wrench0, self.tangent, self.pose0, self.solved = result.wrench, result.tangent, (pos, mat), True
-
     def apply(self):
-        if not self.wrench0.any() and not self.tangent.any():
-            return self.instance.metric.write(self.jacobian, self.tangent, 0.0)
-        motion = displacement(*self.pose, *self.pose0)
-        wrench = self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
-        self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
-        self.instance.metric.write(self.jacobian, self.tangent, self.horizon)
+        metric = self.instance.metric
+        if not self.written:
+            metric.write(self.jacobian, self.tangent, self.horizon)
+            self.written = True
+        if self.wrench0.any() or self.tangent.any():
+            motion = displacement(*self.pose, *self.pose0)
+            wrench = self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
+            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+
+    def let_go(self):
+        self.instance.metric.write(self.jacobian, np.zeros_like(self.tangent), self.horizon)

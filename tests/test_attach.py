@@ -1,0 +1,288 @@
+"""`attach` puts a BioTac into any model, and says what is wrong when it cannot."""
+
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+import spring_skin
+
+import biotac_mj
+from biotac_mj.coupling import Config, attach
+from biotac_mj.coupling.instance import Setup
+from biotac_mj.coupling.show import electrode_colors
+from biotac_mj.plugin import structs
+
+WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
+  <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/><geom name="arm" type="capsule" size=".01 .05" pos="0 0 -.08"/>
+    <body name="hand"><joint name="wrist" axis="1 0 0"/><geom name="hand" type="box" size=".01 .01 .01" pos="0 0 .06"/></body></body>
+  <body name="cup" pos="0 0 1"><freejoint/><geom name="cup" type="sphere" size=".02" friction="0.4 0 0"/>
+    <geom type="sphere" size=".01" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+
+
+def spec_of(text=WORLD):
+    return mujoco.MjSpec.from_string(text)
+
+
+def springs(spec, **settings):
+    return attach(spec, **({"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings))
+
+
+def touching(model, index=0):
+    setup = Setup(structs.ModelView(model._address), index)
+    return [g.name for g in setup.touching.geoms], setup
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    yield
+    biotac_mj.plugin.check()
+
+
+def test_pose_is_that_of_the_site_then_pos_and_quat():
+    spec = spec_of()
+    handle = springs(spec, site="mount", pos=[0.01, 0.02, 0.03], quat=[np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turn, own = np.empty(9), np.empty(9)
+    mujoco.mju_quat2Mat(turn, [0.6, 0.8, 0, 0])
+    mujoco.mju_quat2Mat(own, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    np.testing.assert_allclose(data.body(handle.body).xpos, [0, 0, 0.1] + turn.reshape(3, 3) @ [0.01, 0.02, 0.03], atol=1e-12)
+    np.testing.assert_allclose(data.body(handle.body).xmat.reshape(3, 3), turn.reshape(3, 3) @ own.reshape(3, 3), atol=1e-12)
+
+
+def test_model_carries_the_skins_parts():
+    spec, geometry = spec_of(), spring_skin.pad_geometry()
+    handle = springs(spec, body="hand", prefix="tip_", skin=geometry)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for i, position in enumerate(geometry.electrode_pos, start=1):
+        np.testing.assert_allclose(model.site(f"tip_e{i}").pos, position)
+    node = np.unique(geometry.outer_face)
+    np.testing.assert_allclose(model.skin_vert, geometry.vert[node], atol=1e-7)
+    assert model.body(handle.body).parentid == model.body("hand").id
+    dims = {c: model.sensor(handle.sensor(c)).dim[0] for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")}
+    assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=4)
+    # the rigid core's mesh lies where the geometry says, whatever frame MuJoCo stores it in
+    mujoco.mj_forward(model, data)
+    geom = model.geom("tip_core")
+    mesh = model.mesh(geom.dataid[0])
+    world = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]] @ data.geom(geom.id).xmat.reshape(3, 3).T + data.geom(geom.id).xpos
+    local = (world - data.body(handle.body).xpos) @ data.body(handle.body).xmat.reshape(3, 3)
+    np.testing.assert_allclose(sorted(local.round(6).tolist()), sorted(geometry.core_vert.round(6).tolist()), atol=1e-6)
+
+
+def test_geoms_that_touch_by_default():
+    """Colliding geoms, but those of the link it is fixed to, of the link's parent (as in MuJoCo's own filter), and of excluded bodies."""
+    spec = spec_of()
+    springs(spec, body="hand")
+    assert touching(spec.compile())[0] == ["cup"]
+    spec = spec_of(WORLD.replace("</worldbody>", '<geom name="floor" type="plane" size="1 1 1"/></worldbody>'))
+    springs(spec, body="hand")
+    names, setup = touching(spec.compile())
+    assert sorted(names) == ["cup", "floor"]
+    assert setup.touching.geoms[names.index("cup")].friction == pytest.approx(0.783414394)  # MuJoCo's rule: the larger
+    spec = spec_of(WORLD.replace("</mujoco>", '<contact><exclude body1="hand" body2="arm"/></contact></mujoco>'))
+    springs(spec, geoms=["arm"], body="hand", rounding={"arm": 1e-3})
+    names, setup = touching(spec.compile())
+    assert names == ["arm"] and setup.touching.geoms[0].rounding == 1e-3
+
+
+def test_excluded_bodies_do_not_touch():
+    spec = spec_of()
+    springs(spec, body="hand")
+    spec.add_exclude(bodyname1="biotac_core", bodyname2="cup")
+    assert touching(spec.compile())[0] == []
+
+
+def test_meshes_arrive_in_the_geoms_frame():
+    text = WORLD.replace("<worldbody>", '<asset><mesh name="tetra" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .02"/></asset><worldbody>')
+    text = text.replace("</worldbody>", '<body name="t" pos="1 0 0"><freejoint/><geom name="t" type="mesh" mesh="tetra"/></body></worldbody>')
+    spec = spec_of(text)
+    springs(spec, body="hand", geoms=["t"])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    geom = touching(model)[1].touching.geoms[0]
+    world = geom.vert @ data.geom("t").xmat.reshape(3, 3).T + data.geom("t").xpos - [1, 0, 0]
+    np.testing.assert_allclose(sorted(world.round(6).tolist()), [[0, 0, 0], [0, 0, 0.02], [0, 0.02, 0], [0.02, 0, 0]], atol=1e-6)
+    assert geom.face.shape == (4, 3)
+
+
+def test_saved_xml_says_everything(tmp_path):
+    spec = spec_of()
+    handle = springs(spec, body="hand", rounding={"cup": 2e-3}, options={"stiffness": 500.0}, seed=7, coupling="one-way")
+    model = spec.compile()
+    (tmp_path / "model.xml").write_text(spec.to_xml())
+    again = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert touching(again)[1].config == handle.config == touching(model)[1].config
+    a, b = mujoco.MjData(model), mujoco.MjData(again)
+    mujoco.mj_step(model, a, 10)
+    mujoco.mj_step(again, b, 10)
+    np.testing.assert_allclose(a.sensordata, b.sensordata, rtol=1e-6)
+
+
+def test_a_hand_with_biotacs_can_itself_be_attached():
+    hand = spec_of('<mujoco><worldbody><body name="palm"><geom type="box" size=".01 .01 .01" pos="0 0 -.03"/></body></worldbody></mujoco>')
+    for side in ("left", "right"):
+        springs(hand, body="palm", prefix=f"{side}_", slots=4)
+    scene = spec_of(WORLD)
+    scene.attach(hand, frame=scene.worldbody.add_frame(pos=[0, 0, 0.5]), prefix="robot_")
+    model = scene.compile()
+    assert model.nplugin == 2
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 3)
+    for side in ("left", "right"):
+        assert data.sensor(f"robot_{side}_electrodes").data[0] == 3003  # "sum" counts steps
+        assert data.sensor(f"robot_{side}_status").data[0] == 1
+
+
+def test_room_for_more_bodies_must_be_there():
+    spec = spec_of()
+    springs(spec, body="hand", slots=0)
+    with pytest.warns(RuntimeWarning, match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding the objects"):
+        with pytest.raises((ValueError, mujoco.FatalError)):
+            mujoco.MjData(spec.compile())
+    with pytest.raises(ValueError, match="room for 0"):
+        biotac_mj.plugin.check()
+
+
+@pytest.mark.parametrize(
+    "settings, text",
+    [
+        (dict(site="top"), r"no site 'top' to attach to: the model has mount"),
+        (dict(body="foot"), r"no body 'foot' to attach to: the model has world, arm, hand, cup"),
+        (dict(site="mount", body="arm"), r"both site 'mount' and body 'arm' are given"),
+        (dict(coupling="both"), r"unknown coupling 'both': choose one of two-way, one-way"),
+        (dict(geoms=["cups"]), r"no geom 'cups' to touch: the model has arm, hand, cup"),
+        (dict(rounding={"edge": 1e-3}), r"no geom 'edge' to touch"),
+        (dict(friction=-1.0), r"the skin's friction is -1.0: give a number >= 0"),
+        (dict(friction=float("nan")), r"the skin's friction is nan"),
+        (dict(stepper="femm"), r"unknown stepper 'femm': choose one of .*springs"),
+        (dict(readings="volts"), r"unknown readings 'volts': choose one of biotac, none"),
+        (dict(skin="/no/such/skin.npz"), r"no skin at .*skin.npz"),
+    ],
+)
+def test_bad_settings(settings, text):
+    with pytest.raises((ValueError, FileNotFoundError), match=text):
+        springs(spec_of(), **settings)
+
+
+def test_a_prefix_serves_one_biotac():
+    spec = spec_of()
+    springs(spec, body="hand")
+    with pytest.raises(ValueError, match="prefix 'biotac_' is taken by another BioTac"):
+        springs(spec, body="arm")
+
+
+def test_unknown_channel():
+    handle = springs(spec_of())
+    with pytest.raises(ValueError, match="a BioTac has no channel 'e20': choose one of electrodes, pdc"):
+        handle.sensor("e20")
+
+
+def test_own_geoms_cannot_be_named():
+    spec = spec_of()
+    springs(spec, body="hand", geoms=["hand"])
+    with pytest.warns(RuntimeWarning, match="geom 'hand' is fixed to the BioTac and cannot touch it"), pytest.raises((ValueError, mujoco.FatalError)):
+        mujoco.MjData(spec.compile())
+    biotac_mj.plugin.clear_errors()
+
+
+def test_settings_survive_as_text():
+    config = Config(geoms=["a"], rounding={"a": 1e-3}, material={"young": 1e6}, seed=3, liquid=False)
+    strings = config.strings()
+    assert Config.parse(lambda name: strings.get(name, "")) == config
+    assert Config.parse(lambda name: "") == Config()
+    with pytest.raises(ValueError, match="plugin setting skin='coarse' is not JSON"):
+        Config.parse(lambda name: "coarse" if name == "skin" else "")
+
+
+def test_plain_mjcf_loads_without_the_plugin():
+    code = (
+        "import importlib.util, pathlib, mujoco\n"
+        "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else pathlib.Path(r'{}')\n"
+        "m = mujoco.MjModel.from_xml_path(str(folder / 'biotac.xml'))\n"
+        "assert m.nplugin == 0 and m.nsensordata == 54 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) < 1e-9\n"
+        "mujoco.MjModel.from_xml_path(str(folder / 'scene_press.xml'))\n"
+    )
+    import importlib.resources
+
+    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
+        subprocess.run([sys.executable, "-c", code.format(folder)], check=True)
+
+
+def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
+    """Mass, centre and inertia from the parts' volumes, by the divergence theorem over their surfaces and sums over the tetrahedra."""
+    geometry = biotac_mj.load_skin("default")
+    mass, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+
+    def add(density, corner, sign=1.0):
+        nonlocal mass, first, second
+        m = sign * density * np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+        total = corner.sum(axis=1)
+        mass, first = mass + m.sum(), first + np.einsum("n,ni->i", m, total) / 4
+        second = second + (np.einsum("n,nai,naj->ij", m, corner, corner) + np.einsum("n,ni,nj->ij", m, total, total)) / 20
+
+    def cone(vert, face):
+        return np.concatenate([np.zeros((len(face), 1, 3)), vert[face]], axis=1)
+
+    add(1050.0, geometry.vert[geometry.elem])
+    for part in ("core", "nail", "clamp"):
+        add(1200.0, cone(getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")))
+    add(1000.0, cone(geometry.vert, geometry.inner_face), -1.0)  # liquid: the cavity, whose face normals point inwards,
+    add(1000.0, cone(geometry.core_vert, geometry.core_face), -1.0)  # without the core
+    center = first / mass
+    inertia = np.trace(second) * np.eye(3) - second - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    import importlib.resources
+
+    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
+        model = mujoco.MjModel.from_xml_path(str(folder / "biotac.xml"))
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[1])
+    stored = axes.reshape(3, 3) @ np.diag(model.body_inertia[1]) @ axes.reshape(3, 3).T
+    assert model.body_mass[1] == pytest.approx(mass, rel=0.02)
+    np.testing.assert_allclose(model.body_ipos[1], center, atol=1e-4)
+    np.testing.assert_allclose(stored, inertia, atol=0.02 * inertia.max())
+
+
+def test_electrode_colors():
+    colors = electrode_colors(np.array([0.0, -300.0, 900.0]))
+    np.testing.assert_allclose(colors, [[0.85, 0.85, 0.85, 1], [0.8, 0.15, 0.1, 1], [0.1, 0.3, 0.85, 1]])
+
+
+def test_scene_update_shows_skin_and_electrodes():
+    spec = spec_of('<mujoco><worldbody><body name="ball" mocap="true" pos="-.01 -.0175 0"><geom type="sphere" size=".01"/></body></worldbody></mujoco>')
+    springs(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    scene = mujoco.MjvScene(model, maxgeom=100)
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene)
+    dent = np.abs(model.skin_vert[:, 1] - spring_skin.HEIGHT).max()
+    assert dent == pytest.approx(0.5e-3, rel=0.05)  # the ball is half a millimetre deep
+    # what is drawn, after MuJoCo's own skinning, is the dented surface of this very update
+    drawn = np.array(scene.skinvert).reshape(-1, 3)[: model.nskinvert]
+    np.testing.assert_allclose(drawn, model.skin_vert, atol=1e-6)
+    assert len(np.unique(model.site_rgba[[model.site(f"biotac_e{i}").id for i in range(1, 20)]], axis=0)) > 1
+
+
+def test_dm_control_loads_and_steps_it(tmp_path):
+    dm_control = pytest.importorskip("dm_control.mujoco", reason="needs dm_control (extra control)")
+    spec = spec_of()
+    springs(spec, body="hand")
+    spec.compile()
+    physics = dm_control.Physics.from_xml_string(spec.to_xml())
+    for _ in range(3):
+        physics.step()
+    # dm_control ends a step with mj_step1, which already shows the readings of the next one
+    assert physics.named.data.sensordata["biotac_electrodes"][0] == 3004
+    assert physics.named.data.sensordata["biotac_status"][0] == 1
+    copied = physics.copy(share_model=True)
+    physics.step()
+    copied.step()
+    assert np.array_equal(physics.data.sensordata, copied.data.sensordata)
+    physics.reset()
+    assert physics.data.plugin_state[0] == 0
