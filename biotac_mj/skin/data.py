@@ -103,6 +103,7 @@ class SkinData:
         self.increment.zero_()
         self.motion = np.zeros((self.nworld, 0, 3))  # of the geoms in the last step
         self.force.zero_()
+        self.external = None
         self.outer.reset()
         if self.core:
             self.core.reset()
@@ -113,6 +114,23 @@ class SkinData:
         self.nonconverged = np.zeros(self.nworld, int)
         self.iterations = np.zeros(self.nworld, int)
         self.error = np.zeros(self.nworld)
+
+    def set_external(self, force):
+        """Loads the nodes in every step from now on, until `reset`.
+
+        Args:
+          force: (nworld, nvert, 3) [N], or None for no load.
+
+        Raises:
+          ValueError: a wrong shape or NaN.
+        """
+        if force is None:
+            self.external = None
+            return
+        force = np.asarray(force, float)
+        if force.shape != (self.nworld, self.model.nvert, 3) or not np.isfinite(force).all():
+            raise ValueError(f"external forces have shape {force.shape}: pass finite numbers of shape {(self.nworld, self.model.nvert, 3)}")
+        self.external = view(wp.array(np.ascontiguousarray(np.swapaxes(force, 0, 1)), dtype=vec3, ndim=2, device=self.x.device))
 
     @property
     def vert_xpos(self):

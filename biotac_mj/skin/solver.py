@@ -108,7 +108,7 @@ class _Step:
             self.M.update(self._tangents(), self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             z = self.M.apply(residual)
             error = _host((residual * z).sum((0, 2)))
-            load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0)
+            load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
             active = finite & ~(error <= options.tolerance**2 * work)
@@ -155,12 +155,14 @@ class _Step:
             alpha = np.where(enough, alpha, secant)
 
     def _evaluate(self):
-        """Forces at x: elastic, contact, core, liquid, inertia."""
+        """Forces at x: elastic, external, contact, core, liquid, inertia."""
         m, d = self.m, self.d
         n, w = m.nvert, d.nworld
         launch = _launcher(m.device)
         launch(elasticity.elastic_force, (m.nelem, w), [m.law, d.mu, d.lam, m.elem, m.inverse_edges, m.volume, d.x], [d.rotation, d.corner, d.jacobian])
         launch(elasticity.gather, (n, w), [m.start, m.slot, d.corner, 1.0, 0], [d.force])
+        if d.external is not None:
+            self.force += d.external
         self._contact(d.outer, self.geoms)
         if m.has_core:
             self._contact(d.core, m.core(w))
