@@ -1,7 +1,7 @@
 """The engine plugin "biotac_mj.skin": MuJoCo's plugin interface, served from Python through ctypes.
 
-MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter lock for each call. Nothing may be
-raised into C, so an exception is kept, reported once as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
+MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter lock for each call. Nothing
+may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
 """
 
 import ctypes
@@ -18,7 +18,7 @@ __all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
 
 PLUGIN_NAME = "biotac_mj.skin"
 
-# Everything that makes one BioTac, as strings in the model: a saved XML or MJB says it all. `biotac_mj.coupling.config` gives their meaning.
+# Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see `biotac_mj.coupling.config`.
 ATTRIBUTES = (
     "skin",
     "stepper",
@@ -182,8 +182,15 @@ def register():
         if _alive:
             return
         functions = dict(
-            nstate=_nstate, nsensordata=_nsensordata, init=_init, destroy=_destroy, copy=_copy, reset=_reset, compute=_compute,
-            advance=_advance, visualize=_visualize,
+            nstate=_nstate,
+            nsensordata=_nsensordata,
+            init=_init,
+            destroy=_destroy,
+            copy=_copy,
+            reset=_reset,
+            compute=_compute,
+            advance=_advance,
+            visualize=_visualize,
         )
         callbacks = {name: _CALLBACKS[name](function) for name, function in functions.items()}
         names = (ctypes.c_char_p * len(ATTRIBUTES))(*(name.encode() for name in ATTRIBUTES))

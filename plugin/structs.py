@@ -149,7 +149,6 @@ class ModelView(_View):
         names = self.names
         return names[start : start + int(np.argmax(names[start:] == 0))].tobytes().decode()
 
-
     def config(self, instance, attribute):
         """Configuration string of a plugin instance, "" where the model gives none."""
         value = LIBRARY.mj_getPluginConfig(self.address, instance, attribute.encode())
@@ -192,7 +191,8 @@ class DataView(_View):
     def acceleration(self):
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint rows as they are now.
 
-        Runs MuJoCo's own later stages, which mj_forward runs again; what it would not overwrite (the input of mj_inverse, the warm start) is put back.
+        Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of mj_inverse, warm start) is
+        put back.
         """
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart

@@ -1,7 +1,7 @@
 """A skin of independent springs on a flat pad: the coupling's test double, simple enough to know by heart.
 
-Every node of a square grid in the plane y = -8 mm resists the depth d of a geom over it with the force k d along the geom's normal there, and
-sliding with a tangential spring (stiffness k / 2) that is anchored in the geom and yields at mu k d.
+Every node of a square grid in the plane y = -8 mm resists the depth d of a geom over it with the force k d along the geom's normal there,
+and sliding with a tangential spring (stiffness k / 2) that is anchored in the geom and yields at mu k d.
 """
 
 import numpy as np
@@ -20,7 +20,9 @@ def pad_geometry(count=9, spacing=0.001, name="pad of springs"):
     a = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     outer = np.concatenate([np.stack([a, a + count, a + 1], 1), np.stack([a + 1, a + count, a + count + 1], 1)])
     corner = np.array([[x, y, z] for x in (-0.019, 0.005) for y in (-0.005, 0.003) for z in (-0.005, 0.005)])
-    box = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+    box = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    )
     electrode = np.stack([np.linspace(-0.015, 0.0, 19), np.full(19, -0.005), np.zeros(19)], axis=1)
     return SkinGeometry(
         name=name, vert=vert, elem=np.zeros((0, 4)), outer_face=outer, inner_face=np.zeros((0, 3)), fixed=np.zeros(0),
@@ -89,7 +91,7 @@ class SpringSkin:
             project = out[:, :, None] * out[:, None, :]
             across = np.eye(3) - project
             along = slip / np.maximum(np.linalg.norm(slip, axis=1), 1e-300)[:, None]
-            # a sliding spring gives no resistance along its motion, only across it; how its force follows the normal force is left out (not symmetric)
+            # a sliding spring resists across its motion only; how its force follows the normal force is left out (not symmetric)
             across -= np.where(share < 1.0, 1.0, 0.0)[:, None, None] * along[:, :, None] * along[:, None, :]
             stiff = self.k * project + 0.5 * self.k * share[:, None, None] * across
             at = np.zeros((len(node), 3, 6))  # velocity at x of a body that moves by (t, w): t + w x x
@@ -118,7 +120,11 @@ class SumReadings:
     def advance(self, state, time, dt, vert_xpos, pressure):
         state[0] += 1
         state[1] += np.random.default_rng([self.seed, int(state[0])]).normal()
-        return {"electrodes": 3000.0 + 1e5 * (vert_xpos[:19, 1] - HEIGHT) + (np.arange(19) == 0) * state[0], "pdc": pressure, "pac": state[1]}
+        return {
+            "electrodes": 3000.0 + 1e5 * (vert_xpos[:19, 1] - HEIGHT) + (np.arange(19) == 0) * state[0],
+            "pdc": pressure,
+            "pac": state[1],
+        }
 
 
 register_stepper("springs", SpringSkin)

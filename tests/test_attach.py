@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
+from biotac_mj.plugin import structs
 
 import biotac_mj
 from biotac_mj.coupling import Config, attach
 from biotac_mj.coupling.instance import Setup
 from biotac_mj.coupling.show import electrode_colors
-from biotac_mj.plugin import structs
 
 WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
   <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/><geom name="arm" type="capsule" size=".01 .05" pos="0 0 -.08"/>
@@ -69,7 +69,10 @@ def test_model_carries_the_skins_parts():
     mujoco.mj_forward(model, data)
     geom = model.geom("tip_core")
     mesh = model.mesh(geom.dataid[0])
-    world = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]] @ data.geom(geom.id).xmat.reshape(3, 3).T + data.geom(geom.id).xpos
+    world = (
+        model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]] @ data.geom(geom.id).xmat.reshape(3, 3).T
+        + data.geom(geom.id).xpos
+    )
     local = (world - data.body(handle.body).xpos) @ data.body(handle.body).xmat.reshape(3, 3)
     np.testing.assert_allclose(sorted(local.round(6).tolist()), sorted(geometry.core_vert.round(6).tolist()), atol=1e-6)
 
@@ -99,7 +102,9 @@ def test_excluded_bodies_do_not_touch():
 
 def test_meshes_arrive_in_the_geoms_frame():
     text = WORLD.replace("<worldbody>", '<asset><mesh name="tetra" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .02"/></asset><worldbody>')
-    text = text.replace("</worldbody>", '<body name="t" pos="1 0 0"><freejoint/><geom name="t" type="mesh" mesh="tetra"/></body></worldbody>')
+    text = text.replace(
+        "</worldbody>", '<body name="t" pos="1 0 0"><freejoint/><geom name="t" type="mesh" mesh="tetra"/></body></worldbody>'
+    )
     spec = spec_of(text)
     springs(spec, body="hand", geoms=["t"])
     model = spec.compile()
@@ -142,7 +147,9 @@ def test_a_hand_with_biotacs_can_itself_be_attached():
 def test_room_for_more_bodies_must_be_there():
     spec = spec_of()
     springs(spec, body="hand", slots=0)
-    with pytest.warns(RuntimeWarning, match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding the objects"):
+    with pytest.warns(
+        RuntimeWarning, match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding the objects"
+    ):
         with pytest.raises((ValueError, mujoco.FatalError)):
             mujoco.MjData(spec.compile())
     with pytest.raises(ValueError, match="room for 0"):
@@ -186,7 +193,10 @@ def test_unknown_channel():
 def test_own_geoms_cannot_be_named():
     spec = spec_of()
     springs(spec, body="hand", geoms=["hand"])
-    with pytest.warns(RuntimeWarning, match="geom 'hand' is fixed to the BioTac and cannot touch it"), pytest.raises((ValueError, mujoco.FatalError)):
+    with (
+        pytest.warns(RuntimeWarning, match="geom 'hand' is fixed to the BioTac and cannot touch it"),
+        pytest.raises((ValueError, mujoco.FatalError)),
+    ):
         mujoco.MjData(spec.compile())
     biotac_mj.plugin.clear_errors()
 
@@ -254,7 +264,9 @@ def test_electrode_colors():
 
 
 def test_scene_update_shows_skin_and_electrodes():
-    spec = spec_of('<mujoco><worldbody><body name="ball" mocap="true" pos="-.01 -.0175 0"><geom type="sphere" size=".01"/></body></worldbody></mujoco>')
+    spec = spec_of(
+        '<mujoco><worldbody><body name="ball" mocap="true" pos="-.01 -.0175 0"><geom type="sphere" size=".01"/></body></worldbody></mujoco>'
+    )
     springs(spec)
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -10,16 +10,27 @@ from biotac_mj.coupling import attach
 from biotac_mj.coupling.touching import displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
+GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with
 PAD_DOWN = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
 G = 9.81
 HINGED = """<body name="finger"><joint name="hinge" type="hinge" axis="0 1 0" pos="-.04 0 0" {}/>
   <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/></body>"""
 
 
-def scene(bodies, timestep=0.002, gravity="0 0 -9.81", integrator="implicitfast", finger='<body name="finger"/>', stiffness=1e3, flags="", **settings):
+def scene(
+    bodies,
+    timestep=0.002,
+    gravity="0 0 -9.81",
+    integrator="implicitfast",
+    finger='<body name="finger"/>',
+    stiffness=1e3,
+    flags="",
+    **settings,
+):
     """A pad of springs, facing up in the plane z = 8 mm around the origin, under other bodies."""
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="{integrator}">{flags}</option><worldbody>{finger}{bodies}</worldbody></mujoco>'
+        f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="{integrator}"/>'
+        f"<worldbody>{finger}{bodies}</worldbody></mujoco>"
     )
     settings = dict(stepper="springs", readings="none", friction=0.3, options={"stiffness": stiffness}) | settings
     handle = attach(spec, body="finger", quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(), **settings)
@@ -97,10 +108,10 @@ def _momentum(model, data):
 @pytest.mark.parametrize("masses", [(0.02, 0.001), (0.05, 0.03), (0.02, 1.0)])
 def test_momentum_of_free_finger_and_object_is_conserved(masses, integrator, timestep):
     """A spinning ball hits a free finger off its centre and slides."""
-    finger = '<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{}" contype="0" conaffinity="0"/></body>'.format(masses[0])
+    finger = f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" {GHOST}/></body>'
     model, data, handle = scene(ball(masses[1], pos=".002 .001 .0185"), timestep, "0 0 0", integrator, finger, stiffness=2e3)
-    # MuJoCo's own step of a free body errs by 1e-3 at 4 ms, with its own contacts too, where its centre of mass is off its joint or its inertia
-    # has unequal axes: such a finger would test MuJoCo
+    # MuJoCo's own step of a free body errs by 1e-3 at 4 ms, with its own contacts too, where its centre of mass is off its joint or its
+    # inertia has unequal axes: such a finger would test MuJoCo
     core = model.body("biotac_core").id
     model.body_ipos[core] = [-0.01, 0, 0]
     model.body_inertia[core] = model.body_inertia[core].mean()
@@ -122,7 +133,7 @@ def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
     """Energy, too, comes close to what it was as the step shrinks: implicit Euler's loss is of first order."""
     losses = []
     for timestep in (0.0001, 0.00005):
-        finger = '<body name="finger"><joint type="slide" axis="0 0 1"/><geom type="box" size=".01 .01 .01" mass=".03" contype="0" conaffinity="0"/></body>'
+        finger = f'<body name="finger"><joint type="slide" axis="0 0 1"/><geom type="box" size=".01 .01 .01" mass=".03" {GHOST}/></body>'
         model, data, _ = scene(ball(0.03, '<joint type="slide" axis="0 0 1"/>', "0 0 .0181"), timestep, "0 0 0", "Euler", finger, 1e2)
         data.qvel[1] = -0.2
         mujoco.mj_step(model, data, int(0.04 / timestep))
@@ -173,7 +184,8 @@ def test_priority_decides_whose_friction_counts():
 def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
     """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction there is."""
     fingers = "".join(
-        f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/><geom size=".003" mass=".03" contype="0" conaffinity="0"/></body>'
+        f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/>'
+        f'<geom size=".003" mass=".03" {GHOST}/></body>'
         for i, (z, s) in enumerate(((-0.0131, 1), (0.0131, -1)))
     )
     spec = mujoco.MjSpec.from_string(
@@ -181,8 +193,8 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
         '<body name="box"><freejoint/><geom type="box" size=".004 .004 .005" mass=".005"/></body></worldbody></mujoco>'
     )
     handles = [
-        attach(spec, body=f"finger{i}", quat=quat, pos=[0.01, 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(), stepper="springs", readings="none",
-               friction=0.5, options={"stiffness": 1e3})
+        attach(spec, body=f"finger{i}", quat=quat, pos=[0.01, 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(), stepper="springs",
+               readings="none", friction=0.5, options={"stiffness": 1e3})
         for i, quat in enumerate((PAD_UP, PAD_DOWN))
     ]  # fmt: skip
     model = spec.compile()
@@ -200,7 +212,8 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
 
 def test_several_bodies_touch_one_skin():
     bodies = "".join(
-        f'<body pos="{x} 0 .0129"><freejoint/><geom type="box" size=".0025 .004 .005" mass="{mass}"/></body>' for x, mass in ((-0.003, 0.002), (0.003, 0.05))
+        f'<body pos="{x} 0 .0129"><freejoint/><geom type="box" size=".0025 .004 .005" mass="{mass}"/></body>'
+        for x, mass in ((-0.003, 0.002), (0.003, 0.05))
     )
     model, data, handle = scene(bodies, 0.002)
     mujoco.mj_step(model, data, 150)
@@ -260,4 +273,6 @@ def test_displacement_undoes_displace():
     motion = rng.normal(size=(5, 6)) * 1e-5
     np.testing.assert_allclose(displacement(*displace(pos, mat, motion), pos, mat), motion, atol=1e-11)
     large = rotation(np.array([[0.0, 0.0, 3.0], [1.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(displacement(np.zeros((2, 3)), large, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))[:, 3:], [[0, 0, 3], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        displacement(np.zeros((2, 3)), large, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))[:, 3:], [[0, 0, 3], [1, 0, 0]], atol=1e-12
+    )

@@ -10,10 +10,10 @@ import mujoco.rollout
 import numpy as np
 import pytest
 import spring_skin
+from biotac_mj.plugin import structs
 
 import biotac_mj
 from biotac_mj.coupling import SkinResult, attach, register_stepper
-from biotac_mj.plugin import structs
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -22,15 +22,16 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 def two_biotacs(count=2, stepper="springs", readings="sum", extra="", **settings):
     """`count` pads of springs side by side, facing up; a ball rolls and slides on each."""
     bodies = "".join(
-        f'<body name="ball{i}" pos="{i} 0 .0179"><freejoint/><geom name="ball{i}" type="sphere" size=".01" mass=".0{i + 1}" friction=".3"/></body>'
+        f'<body name="ball{i}" pos="{i} 0 .0179"><freejoint/>'
+        f'<geom name="ball{i}" type="sphere" size=".01" mass=".0{i + 1}" friction=".3"/></body>'
         for i in range(count)
     )
     spec = mujoco.MjSpec.from_string(
         f'<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>{bodies}{extra}</worldbody></mujoco>'
     )
     handles = [
-        attach(spec, pos=[0.01 + i, 0, 0], quat=[np.sqrt(0.5), -np.sqrt(0.5), 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(), stepper=stepper,
-               readings=readings, friction=0.3, seed=i, **settings)
+        attach(spec, pos=[0.01 + i, 0, 0], quat=[np.sqrt(0.5), -np.sqrt(0.5), 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(),
+               stepper=stepper, readings=readings, friction=0.3, seed=i, **settings)
         for i in range(count)
     ]  # fmt: skip
     return spec.compile(), handles
@@ -65,9 +66,9 @@ def test_views_show_what_mujoco_holds():
     model, _ = two_biotacs(extra='<geom type="plane" size="2 2 .1"/>')
     data = start(model)
     mujoco.mj_step(model, data, 5)
-    view = structs.ModelView(model._address)
+    model_view = structs.ModelView(model._address)
     compared = 0
-    for view, real in ((view, model), (structs.DataView(data._address, view), data)):
+    for view, real in ((model_view, model), (structs.DataView(data._address, model_view), data)):
         for name, (dtype, extents) in view._field.items():
             if dtype is None or not hasattr(real, name) or any("*" in str(e) for e in extents):
                 continue
@@ -258,7 +259,11 @@ def test_nan_pose_names_the_geom():
 
 def test_a_model_that_cannot_work_fails_when_its_data_is_made():
     with pytest.warns(RuntimeWarning, match="cannot touch: it knows plane, sphere"), pytest.raises((mujoco.FatalError, ValueError)):
-        two_biotacs(1, extra='<body mocap="true"><geom name="field" type="hfield" hfield="f" pos="0 0 -1"/></body></worldbody><asset><hfield name="f" nrow="2" ncol="2" size="1 1 .1 .1"/></asset><worldbody>')
+        two_biotacs(
+            1,
+            extra='<body mocap="true"><geom name="field" type="hfield" hfield="f" pos="0 0 -1"/></body></worldbody>'
+            '<asset><hfield name="f" nrow="2" ncol="2" size="1 1 .1 .1"/></asset><worldbody>',
+        )
     biotac_mj.plugin.clear_errors()
 
 

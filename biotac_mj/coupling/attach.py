@@ -71,7 +71,8 @@ def attach(
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
     Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching bodies as there are now (see `slots`).
+      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching bodies as there are now
+        (see `slots`).
       site, body: name of the site or the body it is fixed to; neither is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds, so that a model may hold several.
@@ -116,7 +117,9 @@ def _check_place(spec, site, body, prefix):
         raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
         if name is not None and name not in [p.name for p in present]:
-            raise ValueError(f"no {kind} {name!r} to attach to: the model has {', '.join(p.name for p in present if p.name) or f'no named {kind}'}")
+            raise ValueError(
+                f"no {kind} {name!r} to attach to: the model has {', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
+            )
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix")
 

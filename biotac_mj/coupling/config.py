@@ -21,7 +21,8 @@ class Config:
       coupling: "two-way" (the touching bodies and the BioTac feel the skin) or "one-way" (readings only).
       geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own links.
       rounding: geom name -> radius of its rounded edges [m].
-      friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with the geom's. Default: the paper's 0.783.
+      friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with the geom's. Default: the
+        paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
       seed: of the sensor's noise.
       device: Warp device of the skin.
@@ -68,5 +69,7 @@ class Config:
                 try:
                     values[field.name] = json.loads(text)
                 except json.JSONDecodeError as error:
-                    raise ValueError(f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, as in '\"default\"'") from error
+                    raise ValueError(
+                        f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, as in '\"default\"'"
+                    ) from error
         return cls(**values)

@@ -1,7 +1,7 @@
 """One BioTac in one mjData: poses in, skin solved, wrenches and readings out.
 
-What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from it, so that mj_getState, mj_copyData,
-mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
+What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from it, so that mj_getState,
+mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
 """
 
 import ctypes
@@ -28,7 +28,7 @@ STATUS = ("converged", "failed_steps", "iterations", "residual")
 
 
 class _Skin:
-    """A stepper and readings with the lock that lets one thread at a time use them (their constants are shared, their scratch memory too)."""
+    """A stepper and readings with the lock that lets one thread at a time use them: they share constants and scratch memory."""
 
     def __init__(self, config, geoms):
         self.geometry = skins.load(config.skin)
@@ -69,26 +69,27 @@ class Setup:
       ValueError: no body refers to the instance, or its settings do not fit the model.
     """
 
-    def __init__(self, model, index):
+    def __init__(self, model, index, compiling=False):
         self.model, self.index = model, index
         cores = np.flatnonzero(model.body_plugin == index)
         if len(cores) != 1:
             raise ValueError(f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with biotac_mj.attach")
         self.core = int(cores[0])
         self.config = Config.parse(lambda attribute: model.config(index, attribute))
-        self.touching = Touching(model, self.core, self.config)
+        self.touching = Touching(model, self.core, self.config, compiling)
         self.skin = _skin(self.config, self.touching)
         self.ngroup = len(self.touching.body)
 
     @property
     def nstate(self):
-        return _HEAD + _MODEL * self.touching.capacity + self.skin.stepper.nstate + self.skin.readings.nstate
+        return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state):
         """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin state, as views."""
-        a = _HEAD + _MODEL * self.touching.capacity
+        a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate
-        return state[:_HEAD], state[_HEAD:a].reshape(-1, _MODEL)[: self.ngroup], state[a:b], state[b:]
+        c = b + self.skin.readings.nstate
+        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:c]
 
     def reset(self, state):
         head, models, skin, readings = self.parts(state)
@@ -108,8 +109,8 @@ class Setup:
 
 
 def state_size(model, index):
-    """Doubles of plugin state that instance `index` needs."""
-    return Setup(model, index).nstate
+    """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the model."""
+    return Setup(model, index, compiling=True).nstate
 
 
 def reset_state(model, address, index):
@@ -136,8 +137,10 @@ class Instance:
             slots = sorted((int(n[6:]), i) for n, i in setup.named("eq").items() if n.startswith("couple") and n[6:].isdigit())
             self.metric = Metric(model, setup.touching, [i for _, i in slots])
         start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
-        if size != setup.nstate:
-            raise ValueError(f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec")
+        if size < setup.nstate:
+            raise ValueError(
+                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec"
+            )
         self._state = slice(start, start + size)
         self._result = self._reading = self._pose = None
         self._solved = {}
@@ -151,14 +154,16 @@ class Instance:
 
     @property
     def horizon(self):
-        """How far ahead [s] the skin is solved: the end of the step; 0 in Runge-Kutta stages, which set their own poses (the skin is explicit there)."""
+        """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set their own poses: explicit."""
         return 0.0 if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else self.model.opt.timestep
 
     def begin(self):
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
         self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
-            raise ValueError("the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or Euler, or coupling='one-way'")
+            raise ValueError(
+                "the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or Euler, or coupling='one-way'"
+            )
 
     def last_model(self):
         """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3), (ngroup, 3, 3)."""

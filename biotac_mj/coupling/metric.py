@@ -1,10 +1,10 @@
 """The skin's stiffness in MuJoCo's dynamics: rows of constraints that add h^2 J' S J to the inertia, across kinematic trees.
 
-The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached without acceleration, S = -dW/dx and J
-the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The rest is
-exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference acceleration zero gives, one row for each of the six
-eigenvalues s of S. MuJoCo's solver so finds the accelerations of object and finger together, with every other contact and limit: equal
-and opposite forces whatever the masses, nothing at rest, where a = 0. `docs/coupling.md` compares this with the alternatives.
+The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached without acceleration,
+S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The rest is exactly what a
+constraint row with regularisation R = 1 / (h^2 s) and reference acceleration zero gives, one row for each of the six eigenvalues s of S.
+MuJoCo's solver so finds the accelerations of object and finger together, with every other contact and limit: equal and opposite forces
+whatever the masses, nothing at rest, where a = 0. `docs/coupling.md` compares this with the alternatives.
 
 `attach` leaves inactive weld constraints in the model ("slots") to make room for the rows; each body that can touch gets one.
 """
@@ -49,7 +49,11 @@ class Metric:
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = frame.T
         own = data.jacobian(self.core, origin)
-        return np.stack([turn @ (data.jacobian(int(b), origin) - own) for b in self.body]) if len(self.body) else np.zeros((0, 6, self.model.nv))
+        return (
+            np.stack([turn @ (data.jacobian(int(b), origin) - own) for b in self.body])
+            if len(self.body)
+            else np.zeros((0, 6, self.model.nv))
+        )
 
     def begin(self, data):
         """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them."""
@@ -61,7 +65,10 @@ class Metric:
         for root, slot in self.slot.items():
             index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
             if len(index) != 6:
-                raise ValueError("two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, or use coupling='one-way'")
+                raise ValueError(
+                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, "
+                    "or use coupling='one-way'"
+                )
             here = slice(int(index[0]), int(index[0]) + 6)
             self._rows[root] = here, data.map_efc2iefc[here] if data.nisland else None
             data.efc_pos[here] = 0.0

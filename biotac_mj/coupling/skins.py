@@ -20,7 +20,7 @@ def load(name) -> SkinGeometry:
 
 
 def reference(skin):
-    """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object without a file is stored in the user's cache, named by its content.
+    """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache, named by its content.
 
     Raises:
       FileNotFoundError, ValueError: no such skin.

@@ -6,7 +6,17 @@ from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Geom", "Readings", "SkinResult", "SkinStepper", "check_names", "make_readings", "make_stepper", "register_readings", "register_stepper"]
+__all__ = [
+    "Geom",
+    "Readings",
+    "SkinResult",
+    "SkinStepper",
+    "check_names",
+    "make_readings",
+    "make_stepper",
+    "register_readings",
+    "register_stepper",
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,8 +67,8 @@ class SkinResult:
 
 
 class SkinStepper(Protocol):
-    """A skin. Making one must be cheap, and `nstate` may not depend on the geoms: MuJoCo asks for it while it compiles, before all of the model is
-    there. Heavy work belongs into the first `reset`."""
+    """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions are not yet known, perhaps with
+    more geoms than there will be (so more geoms may not need less state). Heavy work belongs into the first `reset` or `solve`."""
 
     nstate: int
 
@@ -66,7 +76,8 @@ class SkinStepper(Protocol):
         """Writes the rest state into state (nstate,)."""
 
     def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
-        """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step. A function of its arguments alone; keeps `state` as it is."""
+        """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its arguments alone, which keeps
+        `state` as it is."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
@@ -127,7 +138,9 @@ def check_names(config):
     """Raises ValueError if the settings name a stepper or readings that nobody registered."""
     for table, name, what in ((_steppers, config.stepper, "stepper"), (_readings, config.readings, "readings")):
         if name not in table:
-            raise ValueError(f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper")
+            raise ValueError(
+                f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper"
+            )
 
 
 def make_stepper(config, geometry, geoms) -> SkinStepper:

@@ -26,25 +26,24 @@ class Touching:
     Attributes:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
-      body: (ngroup,) ids of the touching bodies; capacity: how many there could be (ngroup or more).
+      body: (ngroup,) ids of the touching bodies.
 
     Raises:
       ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the skin cannot touch.
     """
 
-    def __init__(self, model, core, config):
+    def __init__(self, model, core, config, compiling=False):
         self.core = core
-        candidates = _select(model, core, config.geoms)
-        # contact exclusions are not yet in the model when MuJoCo asks for the size of the state while it compiles: count without them
-        self.capacity = len(np.unique(model.geom_bodyid[candidates]))
-        ids = candidates if config.geoms is not None else _not_excluded(model, core, candidates)
+        ids = _select(model, core, config.geoms)
+        if config.geoms is None and not compiling:  # contact exclusions are not yet in the model while it is compiled
+            ids = _not_excluded(model, core, ids)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         self.geoms = [_describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)]
         self.group = group
-        # the bodies whose motion is predicted: the BioTac's, then the touching ones; MuJoCo gives velocities at their trees' centres of mass
+        # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees' centres of mass
         self._body = np.concatenate([[core], self.body]).astype(np.int64)
         self._root = model.body_rootid[self._body]
         self._geom_pos, self._geom_mat = model.geom_pos[ids], _matrix(model.geom_quat[ids])
@@ -124,13 +123,16 @@ def rotation(vector):
 def _matrix(quat):
     """(n, 3, 3) rotations of (n, 4) unit quaternions."""
     w, x, y, z = quat.T
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
     return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
 def displacement(pos, mat, pos0, mat0):
-    """(n, 6) small motions (translation of the origin's point, rotation vector) that take poses (n, 3), (n, 3, 3) from pos0, mat0 to pos, mat."""
+    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0 (n, 3, 3) to pos, mat."""
     turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
     vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
     sine = np.sqrt((vector * vector).sum(axis=1))
@@ -175,10 +177,14 @@ def _not_excluded(model, core, ids):
 
 def _resolve(model, name):
     names = [model.name("geom", i) for i in range(model.ngeom)]
-    matches = [i for i, n in enumerate(names) if n == name] or [i for i, n in enumerate(names) if n.endswith(name)]  # after a further attach
+    matches = [i for i, n in enumerate(names) if n == name] or [
+        i for i, n in enumerate(names) if n.endswith(name)
+    ]  # after a further attach
     if len(matches) != 1:
         found = "none" if not matches else ", ".join(names[i] for i in matches)
-        raise ValueError(f"geom {name!r} of the BioTac's settings matches {found}: the model has {', '.join(n for n in names if n) or 'no named geom'}")
+        raise ValueError(
+            f"geom {name!r} of the BioTac's settings matches {found}: the model has {', '.join(n for n in names if n) or 'no named geom'}"
+        )
     return matches[0]
 
 

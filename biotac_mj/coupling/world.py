@@ -1,9 +1,9 @@
 """All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
 
-A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, MuJoCo's accelerations a under it. Newton's
-method on x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which says where the bodies go, and
-solves the skins there, which gives new linear models. The models of the last step start it. A resting or smoothly moving contact takes one solve of
-the skin per step; an impact, or a light object that meets the skin within the step, takes two or three.
+A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, MuJoCo's accelerations a under it.
+Newton's method on x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which says where
+the bodies go, and solves the skins there, which gives new linear models. The models of the last step start it. A resting or smoothly
+moving contact takes one solve of the skin per step; an impact, or a light object that meets the skin within the step, two or three.
 """
 
 import mujoco
@@ -62,7 +62,8 @@ class World:
         for _ in range(MAX_ROUNDS):
             self._forces(skins, outside)
             acceleration = self.data.acceleration() if moving else np.zeros(self.model.nv)
-            if not any([skin.follow(acceleration) for skin in skins]):  # all of them, not the first alone
+            solved = [skin.follow(acceleration) for skin in skins]
+            if not any(solved):
                 return
             if not moving:
                 break
