@@ -67,6 +67,7 @@ class SkinGeometry:
         try:
             with os.fdopen(handle, "wb") as file:
                 np.savez_compressed(file, **dataclasses.asdict(self))
+            os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner may read
             os.replace(temporary, path)
         except BaseException:
             os.unlink(temporary)

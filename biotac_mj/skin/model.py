@@ -209,4 +209,4 @@ class _Key:
 
 
 def _core_grid(geometry: SkinGeometry):
-    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 3e-4)
+    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), 4e-4)

@@ -36,6 +36,11 @@ class Preconditioner:
         nworld = contacts[0][1].shape[1]
         self.worlds = [self._small(w, contacts) for w in range(nworld)]
 
+    def clear(self):
+        """For a skin that nothing touches."""
+        self.gradient, self.along = None, None
+        self.worlds = [None] * len(self.scale)
+
     def _small(self, w, contacts):
         faces, blocks = [], []
         for face, touching, block in contacts:

@@ -53,7 +53,7 @@ class DistanceGrid:
 def _bake(mesh: wp.uint64, origin: wp.vec3, spacing: float, ny: int, nz: int, reach: float, value_out: wp.array(dtype=wp.float32)):
     i = wp.tid()
     p = origin + spacing * wp.vec3(float(i // (ny * nz)), float((i // nz) % ny), float(i % nz))
-    query = wp.mesh_query_point_sign_winding_number(mesh, p, reach)
+    query = wp.mesh_query_point_sign_normal(mesh, p, reach)
     q = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
     value_out[i] = query.sign * wp.length(p - q)
 
@@ -83,7 +83,7 @@ def bake_distance_grid(vert: np.ndarray, face: np.ndarray, cells: int = 64, marg
     low, high = vert.min(0), vert.max(0)
     if spacing is None:
         spacing = float((high - low).max() / cells)
-    mesh = _mesh(vert, face, "cpu", support_winding_number=True)
+    mesh = _mesh(vert, face, "cpu")
     scale = 1e3
     shape = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
     origin = low - margin
@@ -94,9 +94,9 @@ def bake_distance_grid(vert: np.ndarray, face: np.ndarray, cells: int = 64, marg
     return DistanceGrid((value.numpy() / scale).reshape(shape), origin, spacing, vert, face)
 
 
-def _mesh(vert, face, device, **options) -> wp.Mesh:
+def _mesh(vert, face, device) -> wp.Mesh:
     """In millimetres: single-precision queries drop triangles that are tiny in metres."""
-    return wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device), **options)
+    return wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device))
 
 
 def pack_grids(grids, device):

@@ -12,6 +12,8 @@ from .types import vec3
 
 __all__ = ["step"]
 
+_BALANCED = 1e-9  # [N] of residual on every node: rounding, where nothing touches
+
 
 def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
@@ -97,26 +99,40 @@ class _Step:
         self.x += _like(self.x, repeat)[:, None] * view(d.increment)
 
     def run(self):
-        d, options = self.d, self.m.options
-        active = np.ones(d.nworld, bool)
-        d.iterations[:] = 0
+        self.d.iterations[:] = 0
         self._predict()
+        good = self._newton(np.ones(self.d.nworld, bool))
+        if not good.all():  # the guess may have been the trouble
+            for w in np.flatnonzero(~good):
+                self.x[:, w] = self.start[:, w]
+            good |= self._newton(~good)
+        self._finish(good)
+
+    def _newton(self, active):
+        """Newton's method in the active worlds; which of them are now in balance."""
+        d, options = self.d, self.m.options
+        asked = active
         self._evaluate()
         for iteration in range(options.max_newton + 1):
             residual = self.force * self.mask
             finite = np.isfinite(_host(residual.sum((0, 2))))
-            self.M.update(self._tangents(), self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
+            tangents = self._tangents()
+            if not any(touching.any() for _, touching, _ in tangents) and abs(residual).max() < _BALANCED:
+                self.M.clear()
+                d.error = np.zeros(d.nworld)
+                return asked
+            self.M.update(tangents, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             z = self.M.apply(residual)
             error = _host((residual * z).sum((0, 2)))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
-            active = finite & ~(error <= options.tolerance**2 * work)
+            active = asked & finite & ~(error <= options.tolerance**2 * work)
             if not active.any() or iteration == options.max_newton:
                 break
             d.iterations += active
             self._line_search(self._conjugate_gradients(residual, z, active), residual, active)
-        self._finish(finite & ~active)
+        return asked & finite & ~active
 
     def _line_search(self, dx, residual, active):
         """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the full step overshoots.
