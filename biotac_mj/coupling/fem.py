@@ -15,8 +15,9 @@ _MAX_CONTACTS = 4096
 class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
-    The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last step, the sticking
-    contacts (how many, then sample, geom and anchor of each) and, with implicit dynamics, nodal velocities and the core's pose.
+    The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last
+    step, the sticking contacts (how many, then sample, geom and anchor of each) and, with implicit dynamics, nodal velocities
+    and the core's pose.
     """
 
     def __init__(self, config, geometry, geoms):
@@ -24,7 +25,15 @@ class FemStepper:
         self._options = SkinOptions(**{**({} if config.liquid is None else {"liquid": config.liquid}), **config.options.get("skin", {})})
         self._material = Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default")
         n, g = geometry.nvert, len(geoms)
-        sizes = {"started": 1, "x": 3 * n, "increment": 3 * n, "geom_pos": 3 * g, "geom_mat": 9 * g, "motion": 3 * g, "contacts": 1 + 5 * _MAX_CONTACTS}
+        sizes = {
+            "started": 1,
+            "x": 3 * n,
+            "increment": 3 * n,
+            "geom_pos": 3 * g,
+            "geom_mat": 9 * g,
+            "motion": 3 * g,
+            "contacts": 1 + 5 * _MAX_CONTACTS,
+        }
         if self._options.dynamics == "implicit":
             sizes |= {"velocity": 3 * n, "core_pos": 3, "core_mat": 9}
         ends = np.cumsum(list(sizes.values()))
@@ -109,7 +118,8 @@ class FemStepper:
         contacts = d.contacts()
         if len(contacts) > _MAX_CONTACTS:
             raise ValueError(
-                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: sample faces less densely (options samples=) or use a coarser skin"
+                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: "
+                "sample faces less densely (options samples=) or use a coarser skin"
             )
         self._part(state, "started")[:] = 1
         self._part(state, "x")[:] = d.vert_xpos[0].ravel()

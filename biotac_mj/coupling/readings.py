@@ -10,7 +10,9 @@ __all__ = ["SensorReadings"]
 
 
 class SensorReadings:
-    """`PhysicsReadings` behind the `Readings` protocol; `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature).
+    """`PhysicsReadings` behind the `Readings` protocol.
+
+    `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature).
 
     The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """

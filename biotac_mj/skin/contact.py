@@ -1,8 +1,8 @@
 """Contact of a skin surface with geoms: linear pressure-overclosure sampled inside the faces, Coulomb friction with stick and slip.
 
-Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too (as surface-to-surface
-contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that
-stays put on the geom, returned radially to mu times the normal force where it slips.
+Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too (as
+surface-to-surface contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an elastic stick of
+k * stick_ratio about an anchor that stays put on the geom, returned radially to mu times the normal force where it slips.
 """
 
 import numpy as np

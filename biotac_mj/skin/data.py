@@ -81,9 +81,7 @@ class SkinData:
             self.product = wp.zeros_like(self.x)
             self.gradient = wp.zeros_like(self.x)
             self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
-            self.rotation = wp.zeros((model.nelem, nworld), dtype=mat33)
-            self.jacobian = wp.zeros((model.nelem, nworld), dtype=real)
-            self.corner = wp.zeros((4 * model.nelem, nworld), dtype=vec3)
+            self.elastic = model.elasticity.allocate(nworld)
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
             self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
             ninner = len(model.inner.face) if model.inner else 0
@@ -200,13 +198,7 @@ class SkinData:
 
     def stress(self):
         """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
-        from .elasticity import tet_stress
-
-        m = self.model
-        cauchy = wp.zeros((m.nelem, self.nworld), dtype=mat33, device=m.device)
-        mises = wp.zeros((m.nelem, self.nworld), dtype=real, device=m.device)
-        wp.launch(tet_stress, dim=mises.shape, inputs=[m.law, self.mu, self.lam, m.elem, m.inverse_edges, self.x],
-                  outputs=[cauchy, mises], device=m.device)  # fmt: skip
+        cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
         return _leading(cauchy), _leading(mises)
 
 

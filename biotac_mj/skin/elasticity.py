@@ -1,5 +1,7 @@
 """Elastic forces of linear tetrahedra. Arrays are [item, world], so that neighbouring threads read neighbouring worlds."""
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
@@ -7,7 +9,7 @@ import warp as wp
 from . import material as mat
 from .types import mat33, real, vec3
 
-__all__ = ["elastic_energy", "elastic_force", "gather", "hessian_product", "rest_shape", "rest_stiffness", "tet_stress"]
+__all__ = ["LinearTetrahedra", "elastic_energy", "elastic_force", "gather", "hessian_product", "rest_shape", "rest_stiffness", "tet_stress"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -189,3 +191,82 @@ def incidence(nvert: int, cells: np.ndarray):
     start = np.zeros(nvert + 1, np.int32)
     np.cumsum(np.bincount(flat, minlength=nvert), out=start[1:])
     return start, slot
+
+
+class LinearTetrahedra:
+    """Four-node tetrahedra with constant strain (the paper's, CalculiX's C3D4).
+
+    An element formulation offers what the solver asks for: `node_volume`, `rest_stiffness`, `allocate`, `force`, `product`,
+    `smallest_jacobian` and `stress`.
+
+    Args:
+      vert: (nvert, 3) rest positions [m].
+      elem: (nelem, 4).
+      law: number of the material law, see `material.LAWS`.
+      device: Warp device.
+
+    Raises:
+      ValueError: a tetrahedron is inverted or degenerate.
+    """
+
+    def __init__(self, vert, elem, law, device):
+        self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
+        self._elem = elem
+        self._inverse_edges, self._volume = rest_shape(vert, elem)
+        self.node_volume = np.bincount(elem.ravel(), np.repeat(self._volume / 4, 4), self.nvert)
+        start, slot = incidence(self.nvert, elem)
+        with wp.ScopedDevice(device):
+            self.elem = wp.array(elem, dtype=wp.vec4i)
+            self.inverse_edges = wp.array(self._inverse_edges, dtype=mat33)
+            self.volume = wp.array(self._volume, dtype=real)
+            self.start = wp.array(start, dtype=int)
+            self.slot = wp.array(slot, dtype=int)
+
+    def rest_stiffness(self, mu, lame) -> sp.csc_matrix:
+        """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]."""
+        return rest_stiffness(self.nvert, self._elem, self._inverse_edges, self._volume, mu, lame)
+
+    def allocate(self, nworld):
+        """Scratch memory of one SkinData: what `force` leaves for `product`."""
+        with wp.ScopedDevice(self.device):
+            return _Scratch(
+                wp.zeros((self.nelem, nworld), dtype=mat33),
+                wp.zeros((self.nelem, nworld), dtype=real),
+                wp.zeros((4 * self.nelem, nworld), dtype=vec3),
+            )
+
+    def force(self, scratch, mu, lam, x, force_out):
+        """Elastic nodal forces at x: [nvert, nworld] vec3 -> the same [N]."""
+        n, w = x.shape
+        self._launch(elastic_force, (self.nelem, w), [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x],
+                     [scratch.rotation, scratch.corner, scratch.jacobian])  # fmt: skip
+        self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [force_out])
+
+    def product(self, scratch, mu, lam, x, p, product_out):
+        """Tangent stiffness at x, where `force` was evaluated last, times p [N]."""
+        n, w = x.shape
+        self._launch(hessian_product, (self.nelem, w),
+                     [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x, scratch.rotation, p], [scratch.corner])  # fmt: skip
+        self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [product_out])
+
+    def smallest_jacobian(self, scratch) -> np.ndarray:
+        """(nworld,) smallest det F where `force` was evaluated last."""
+        if self.device.is_cuda:
+            return wp.to_torch(scratch.jacobian).amin(0).cpu().numpy()
+        return scratch.jacobian.numpy().min(0)
+
+    def stress(self, mu, lam, x):
+        """Cauchy stress [nelem, nworld] mat33 and von Mises stress [nelem, nworld] [Pa]."""
+        cauchy = wp.zeros((self.nelem, x.shape[1]), dtype=mat33, device=self.device)
+        mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
+        self._launch(tet_stress, mises.shape, [self.law, mu, lam, self.elem, self.inverse_edges, x], [cauchy, mises])
+        return cauchy, mises
+
+    def _launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class _Scratch(NamedTuple):
+    rotation: wp.array
+    jacobian: wp.array
+    corner: wp.array

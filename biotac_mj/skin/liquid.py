@@ -1,7 +1,7 @@
 """The liquid between core and skin: one pressure per sensor that resists a change of the enclosed volume.
 
-The inner surface of the skin is closed, so the divergence theorem gives its volume and the volume's gradient; the core inside is rigid and only
-subtracts a constant. p = p0 - K (V - V0) / V0 with the bulk modulus K and the liquid's rest volume V0.
+The inner surface of the skin is closed, so the divergence theorem gives its volume and the volume's gradient; the core inside
+is rigid and only subtracts a constant. p = -K (V - V0) / V0 with the bulk modulus K and the liquid's rest volume V0.
 """
 
 import warp as wp

@@ -138,7 +138,9 @@ def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
         return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
     if law == 2:
         J = wp.determinant(F)
-        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(0.5) * lam * (J - real(1.0)) * (J - real(1.0))
+        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(0.5) * lam * (J - real(1.0)) * (
+            J - real(1.0)
+        )
     e = real(0.5) * (F + wp.transpose(F)) - eye
     return real(0.5) * lam * wp.trace(e) * wp.trace(e) + mu * wp.ddot(e, e)
 

@@ -13,7 +13,7 @@ from .factor import DenseFactor, SparseFactor
 from .geoms import GeomSet
 from .material import LAWS, Material, material
 from .shapes import bake_distance_grid
-from .types import mat33, real, vec3
+from .types import real, vec3
 
 __all__ = ["SkinModel", "SkinOptions", "Surface"]
 
@@ -108,7 +108,15 @@ class SkinModel:
       ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed.
     """
 
-    def __init__(self, geometry: SkinGeometry, material_choice="default", options: SkinOptions | None = None, device="cpu", fixed=None, core_faces=None):
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        material_choice="default",
+        options: SkinOptions | None = None,
+        device="cpu",
+        fixed=None,
+        core_faces=None,
+    ):
         self.geometry = geometry
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
@@ -117,7 +125,9 @@ class SkinModel:
         self.law = LAWS[self.material.law]
         vert, elem = geometry.vert, geometry.elem
         if not np.isfinite(vert).all():
-            raise ValueError(f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh")
+            raise ValueError(
+                f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh"
+            )
         self.nvert, self.nelem = len(vert), len(elem)
         self.fixed = np.asarray(geometry.fixed if fixed is None else fixed, int)
         if not len(self.fixed):
@@ -126,20 +136,11 @@ class SkinModel:
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
         self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
 
-        inverse_edges, volume = elasticity.rest_shape(vert, elem)
-        mass = np.zeros(self.nvert)
-        np.add.at(mass, elem.ravel(), np.repeat(volume / 4, 4))
-        start, slot = elasticity.incidence(self.nvert, elem)
+        self.elasticity = elasticity.LinearTetrahedra(vert, elem, self.law, self.device)
         mask = np.zeros(self.nvert)
         mask[self.free] = 1
         with wp.ScopedDevice(self.device):
             self.vert = wp.array(vert[:, None], dtype=vec3)
-            self.elem = wp.array(elem, dtype=wp.vec4i)
-            self.inverse_edges = wp.array(inverse_edges, dtype=mat33)
-            self.volume = wp.array(volume, dtype=real)
-            self.node_volume = wp.array(mass, dtype=real)
-            self.start = wp.array(start, dtype=int)
-            self.slot = wp.array(slot, dtype=int)
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(contact.face_samples(self.options.samples), dtype=vec3)
             self.outer = Surface.create(vert, geometry.outer_face, self.device)
@@ -151,7 +152,7 @@ class SkinModel:
             self.core_surface = Surface.create(vert, faces, self.device)
             self.core_vert = wp.array(geometry.core_vert, dtype=vec3, device=self.device)
         self.rest_volume, self.liquid_volume = self._volumes()
-        stiffness = elasticity.rest_stiffness(self.nvert, elem, inverse_edges, volume, self.material.mu, self.material.lame)
+        stiffness = self.elasticity.rest_stiffness(self.material.mu, self.material.lame)
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
         self._stiffness = stiffness[dof][:, dof]
 
@@ -179,7 +180,10 @@ class SkinModel:
         a, b, c = np.moveaxis(self.geometry.core_vert[self.geometry.core_face], 1, 0)
         core = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6) if len(a) else 0.0
         if cavity - core <= 0:
-            raise ValueError(f"the core ({core * 1e9:.0f} mm^3) does not fit into the cavity ({cavity * 1e9:.0f} mm^3): check the meshes' frames and units")
+            raise ValueError(
+                f"the core ({core * 1e9:.0f} mm^3) does not fit into the cavity ({cavity * 1e9:.0f} mm^3): "
+                "check the meshes' frames and units"
+            )
         return cavity, cavity - core
 
     @functools.cached_property

@@ -1,7 +1,7 @@
 """Preconditioner of the linear solves: the rest stiffness' inverse, corrected exactly for contact and liquid.
 
-Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume. With U = [unit vectors of T, g] and
-the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's identity gives
+Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume. With
+U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's identity gives
 
   (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T and g).
 """
@@ -95,7 +95,6 @@ class Preconditioner:
             if self.gradient is not None:
                 z[:, w] -= q[m] * self.along[:, w]
         return z
-
 
     def tangent(self, w, blocks, x):
         """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin (translation, rotation vector).

@@ -58,7 +58,9 @@ def _bake(mesh: wp.uint64, origin: wp.vec3, spacing: float, ny: int, nz: int, re
     value_out[i] = query.sign * wp.length(p - q)
 
 
-def bake_distance_grid(vert: np.ndarray, face: np.ndarray, cells: int = 64, margin: float = 2e-3, spacing: float | None = None) -> DistanceGrid:
+def bake_distance_grid(
+    vert: np.ndarray, face: np.ndarray, cells: int = 64, margin: float = 2e-3, spacing: float | None = None
+) -> DistanceGrid:
     """Distance grid of a closed triangle mesh.
 
     Args:

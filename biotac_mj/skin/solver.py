@@ -18,8 +18,8 @@ _BALANCED = 1e-9  # [N] of residual on every node: rounding, where nothing touch
 def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
-    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted in `data.nonconverged` and
-    flagged in `data.converged`.
+    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted in
+    `data.nonconverged` and flagged in `data.converged`.
 
     Args:
       model, data: the skin.
@@ -46,8 +46,8 @@ def _refuse_core(model, geoms):
     if depth.max() > model.options.max_core_depth:
         geom, world = np.unravel_index(depth.argmax(), depth.shape)
         raise ValueError(
-            f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
-            "move it out, press less deep or take smaller steps"
+            f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: "
+            "no skin fits between them; move it out, press less deep or take smaller steps"
         )
 
 
@@ -76,7 +76,7 @@ class _Step:
         was, velocity = d.x.numpy(), d.velocity.numpy()  # where free flight would take the nodes, seen from the moved frame
         world = np.einsum("wij,nwj->nwi", d.core_mat, was) + d.core_pos
         target = np.einsum("wji,nwj->nwi", mat, world + dt * velocity - pos)
-        coefficient = self.m.material.density * self.m.node_volume.numpy()[:, None, None] / dt**2
+        coefficient = self.m.material.density * self.m.elasticity.node_volume[:, None, None] / dt**2
         self.pose, self.world, self.dt = (pos, mat), world, dt
         like = self.x if isinstance(self.x, np.ndarray) else None
         self.target = target if like is not None else self.x.new_tensor(target)
@@ -151,7 +151,7 @@ class _Step:
             now = _host((self.force * dx).sum((0, 2)))
             valid = np.isfinite(now)
             if self.m.material.law == "neo_hookean":
-                valid &= _host(view(self.d.jacobian).min(0) if isinstance(self.x, np.ndarray) else view(self.d.jacobian).amin(0)) > 0.02
+                valid &= self.m.elasticity.smallest_jacobian(self.d.elastic) > 0.02
             enough = ~active | (valid & (now >= -0.5 * slope))
             enough &= ~active | np.isnan(high) | (now <= 0.5 * slope)
             if enough.all():
@@ -175,8 +175,7 @@ class _Step:
         m, d = self.m, self.d
         n, w = m.nvert, d.nworld
         launch = _launcher(m.device)
-        launch(elasticity.elastic_force, (m.nelem, w), [m.law, d.mu, d.lam, m.elem, m.inverse_edges, m.volume, d.x], [d.rotation, d.corner, d.jacobian])
-        launch(elasticity.gather, (n, w), [m.start, m.slot, d.corner, 1.0, 0], [d.force])
+        m.elasticity.force(d.elastic, d.mu, d.lam, d.x, d.force)
         if d.external is not None:
             self.force += d.external
         self._contact(d.outer, self.geoms)
@@ -199,10 +198,12 @@ class _Step:
         m, d = self.m, self.d
         surface, launch = state.surface, _launcher(m.device)
         launch(
-            contact.contact_force, state.touching.shape,
-            [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last, state.anchor_geom, state.anchor],
+            contact.contact_force,
+            state.touching.shape,
+            [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
+            + [state.anchor_geom, state.anchor],
             [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
-        )  # fmt: skip
+        )
         launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
         self.force += view(state.node_force)
 
@@ -213,12 +214,7 @@ class _Step:
     def _elastic_product(self, p):
         m, d = self.m, self.d
         view(d.direction)[...] = p
-        launch = _launcher(m.device)
-        launch(
-            elasticity.hessian_product, (m.nelem, d.nworld),
-            [m.law, d.mu, d.lam, m.elem, m.inverse_edges, m.volume, d.x, d.rotation, d.direction], [d.corner],
-        )  # fmt: skip
-        launch(elasticity.gather, (m.nvert, d.nworld), [m.start, m.slot, d.corner, 1.0, 0], [d.product])
+        m.elasticity.product(d.elastic, d.mu, d.lam, d.x, d.direction, d.product)
         return view(d.product)
 
     def _product(self, p):
