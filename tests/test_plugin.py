@@ -1,5 +1,6 @@
 """The engine plugin: everything a BioTac remembers is MuJoCo's own state, and nothing it does wrong crosses into C."""
 
+import _thread
 import copy
 import pickle
 import threading
@@ -193,6 +194,27 @@ def test_rollout_with_two_threads_equals_the_loop(model):
             assert np.array_equal(sensors[i, k], data.sensordata)
 
 
+class _Free:
+    """A linear spring that costs next to nothing, with a state as large as the real skin's."""
+
+    nstate = 15000
+
+    def __init__(self, config, geometry, geoms):
+        self.vert, self.tangent = geometry.vert, np.diag([0.0, 500, 0, 0, 0, 0])[None]
+
+    def reset(self, state):
+        state[:] = 0.0
+
+    def vert_xpos(self, state):
+        return self.vert
+
+    def solve(self, state, geom_pos, geom_mat, dt):
+        return SkinResult(state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert)
+
+
+register_stepper("free", _Free)
+
+
 class _Breaking(spring_skin.SpringSkin):
     """Does not converge, or raises, once it is pressed with more than 1 N."""
 
@@ -246,6 +268,29 @@ def test_an_exception_is_kept_warned_of_and_raised_on_request():
     biotac_mj.plugin.check()  # told once
 
 
+def test_ctrl_c_reaches_the_loop_around_mj_step():
+    """The interpreter delivers it inside the skin's solver, below MuJoCo's C code; it must come out of the loop all the same."""
+
+    class Slow(_Free):
+        def solve(self, state, geom_pos, geom_mat, dt):
+            end = time.perf_counter() + 0.01
+            while time.perf_counter() < end:
+                pass
+            return super().solve(state, geom_pos, geom_mat, dt)
+
+    register_stepper("slow", Slow)
+    model, _ = two_biotacs(1, "slow", "none")
+    data = mujoco.MjData(model)
+    threading.Timer(0.1, _thread.interrupt_main).start()
+    with pytest.raises(KeyboardInterrupt):
+        for _ in range(100000):
+            mujoco.mj_step(model, data)
+    time.sleep(0.2)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_step(model, data)
+    assert data.sensor("b0_status").data[0] == 1
+
+
 def test_nan_pose_names_the_geom():
     model, _ = two_biotacs(1, extra='<body name="probe" mocap="true"><geom name="tip" type="sphere" size=".01"/></body>')
     data = start(model)
@@ -283,27 +328,6 @@ def test_disabled_equalities_are_refused_two_way(model):
     with pytest.warns(RuntimeWarning, match="needs MuJoCo's equality constraints"):
         mujoco.mj_step(other, mujoco.MjData(other))
     biotac_mj.plugin.clear_errors()
-
-
-class _Free:
-    """A linear spring that costs next to nothing, with a state as large as the real skin's."""
-
-    nstate = 15000
-
-    def __init__(self, config, geometry, geoms):
-        self.vert, self.tangent = geometry.vert, np.diag([0.0, 500, 0, 0, 0, 0])[None]
-
-    def reset(self, state):
-        state[:] = 0.0
-
-    def vert_xpos(self, state):
-        return self.vert
-
-    def solve(self, state, geom_pos, geom_mat, dt):
-        return SkinResult(state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert)
-
-
-register_stepper("free", _Free)
 
 
 @pytest.mark.parametrize("coupling, limit", [("one-way", 0.4e-3), ("two-way", 2e-3)])
