@@ -13,6 +13,8 @@ from .types import vec3
 __all__ = ["step"]
 
 _BALANCED = 1e-9  # [N] of residual on every node: rounding, where nothing touches
+_PRESSURE_TOLERANCE = 0.01
+_PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
 
 def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None) -> None:
@@ -127,12 +129,19 @@ class _Step:
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
-            active = asked & finite & ~(error <= options.tolerance**2 * work)
+            active = asked & finite & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
             if not active.any() or iteration == options.max_newton:
                 break
             d.iterations += active
             self._line_search(self._conjugate_gradients(residual, z, active), residual, active)
         return asked & finite & ~active
+
+    def _pressure_settled(self, z):
+        """Whether the step z would hardly change the liquid's pressure. Its energy cannot tell: the liquid is almost incompressible."""
+        if not self.m.has_liquid:
+            return True
+        change = self.kappa * np.abs(_host((self.gradient * self.mask * z).sum((0, 2))))
+        return change <= _PRESSURE_TOLERANCE * np.abs(self.d.pressure) + _PRESSURE_NOISE
 
     def _line_search(self, dx, residual, active):
         """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the full step overshoots.
