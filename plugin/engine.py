@@ -4,12 +4,10 @@ MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps
 may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
 """
 
-import _thread
 import ctypes
 import functools
 import importlib
 import threading
-import time
 import warnings
 
 import mujoco
@@ -71,7 +69,6 @@ _lock = threading.RLock()
 _worlds = {}  # mjData address -> World, all BioTacs in it; holds only what the state and the model determine
 _errors = []
 _MAX_ERRORS = 100
-_interrupted = threading.Event()
 _alive = []  # what C points to
 
 
@@ -81,27 +78,13 @@ def _coupling(module):
 
 
 def _keep(error):
-    if isinstance(error, KeyboardInterrupt):
-        return _interrupt()
     with _lock:
         if len(_errors) < _MAX_ERRORS:
             _errors.append(error)
     try:
-        warnings.warn(f"BioTac: {error} (biotac_mj.plugin.check() raises it)", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"BioTac: {str(error) or type(error).__name__} (biotac_mj.plugin.check() raises it)", RuntimeWarning, stacklevel=3)
     except RuntimeWarning:  # the user turned warnings into errors: it is kept above
         pass
-
-
-def _interrupt():
-    """Ctrl-C while a skin is solved, which is where most of the time goes: skins stand still until Python code outside has seen it."""
-    _interrupted.set()
-
-    def deliver():
-        _thread.interrupt_main()
-        time.sleep(0.05)
-        _interrupted.clear()
-
-    threading.Timer(0.01, deliver).start()
 
 
 def _guarded(on_error):
@@ -170,8 +153,6 @@ def _reset(model, state, plugin_data, index):
 
 def _compute(model, data, index, capability):
     try:
-        if _interrupted.is_set():
-            return _worlds[data].failed(index) if data in _worlds else None
         world = _world(model, data, index)
         if capability == _PASSIVE:
             world.passive(index)
@@ -230,7 +211,10 @@ def register():
 
 
 def check():
-    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was none."""
+    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was none.
+
+    Call it in long loops: a KeyboardInterrupt that came while a skin was solved is among the errors, for it cannot pass through C either.
+    """
     with _lock:
         errors = list(_errors)
         _errors.clear()
