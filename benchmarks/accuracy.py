@@ -270,7 +270,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--samples", type=int, default=3, help="contact is sampled at samples^2 points per face")
     parser.add_argument("--substeps", type=int, default=1, help="steps per stored increment")
     options = parser.parse_args(arguments)
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     files = sorted(options.cases.glob("*.npz")) if options.cases.is_dir() else [options.cases]
     if not files or not files[0].is_file():
         parser.error(f"no .npz cases in {options.cases}: pass the folder that holds them")

@@ -1,0 +1,225 @@
+"""Speed of the standard press, and MuJoCo's own flex on the same mesh and press beside it.
+
+    python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine] [--no-peer]
+
+The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of the outer surface
+there, the paper's material, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the core; with liquid and
+without. A CPU run is held to one core. Kernels are compiled and the factor is made before the clock starts (`setup_s` is the
+model and its factor); what is timed is the first press of a fresh skin, with every cost that a user's press has. `cpu_ms_per_press`
+is the processor time of the same press: where it is well below the wall time, other programs shared the core.
+
+force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press solved to a
+tolerance of 1e-6 in the same double precision: what stopping early costs, not what the mesh costs.
+"""
+
+import os
+
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+
+import argparse
+import pathlib
+import platform
+import sys
+import time
+
+import numpy as np
+import warp as wp
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+
+import peer_flex
+from accuracy import write_json
+
+from biotac_mj.approach import nearest_point, surface_point
+from biotac_mj.geometry import SKINS, SkinGeometry, load_skin
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+
+__all__ = ["main", "press", "standard_path", "time_skin"]
+
+RADIUS = 3.5e-3  # [m]
+PLACE = -12e-3  # x of the press [m]
+INCREMENT = 4e-5  # [m]
+INCREMENTS = 60
+TIGHT = 1e-6  # tolerance of the press that force errors are measured against
+PEER_TRAVEL = 1e-3  # [m]; deeper the skin meets the core, which the flex does not have
+COLUMNS = (
+    "device",
+    "solver",
+    "skin",
+    "tier",
+    "liquid",
+    "worlds",
+    "ms_per_press",
+    "ms_per_step",
+    "setup_s",
+    "force_error_rel",
+    "not_converged",
+)
+
+
+def standard_path(geometry: SkinGeometry, increments: int = INCREMENTS) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the sphere (increments + 1, 3) [m], the first at first touch, and the unit direction (3,) of the press."""
+    point, normal = surface_point(geometry, PLACE, 0.0)
+    center = point + (RADIUS + 1e-3) * normal
+    for _ in range(200):  # the gap is never more than the way left
+        gap = np.linalg.norm(nearest_point(geometry, center)[0] - center) - RADIUS
+        center = center - gap * normal
+        if gap < 1e-9:
+            break
+    return center - np.outer(np.arange(increments + 1) * INCREMENT, normal), -normal
+
+
+def _clocks() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarray, np.ndarray, int]:
+    """One press in all worlds: forces (increments, worlds, 3) [N], (wall, processor) seconds (increments, 2), steps that did not converge."""
+    data = SkinData(model, worlds)
+    geoms = GeomSet(["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device))
+    geoms.set_pose(path[:1])
+    force, seconds = [], []
+    for center in path[1:]:
+        begin = _clocks()
+        geoms.set_pose(center[None])
+        step(model, data, geoms)
+        force.append(data.wrench[:, 0, :3].copy())  # on the host: nothing is left running
+        seconds.append(_clocks() - begin)
+    return np.array(force), np.array(seconds), int(data.nonconverged.sum())
+
+
+def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int) -> dict:
+    """A row of the table, with the forces of the first world (increments, 3) beside it."""
+    geometry = load_skin(skin)
+    path, _ = standard_path(geometry, increments)
+
+    def make(tolerance):
+        options = SkinOptions(liquid=liquid, tolerance=tolerance, max_newton=60 if tolerance < 1e-4 else SkinOptions.max_newton)
+        model = SkinModel(geometry, PRESETS["paper"], options, device=device)
+        model.factor  # noqa: B018  made once for each model
+        return model
+
+    press(make(SkinOptions.tolerance), path[:2], worlds)  # compiles
+    begin = time.perf_counter()
+    model = make(SkinOptions.tolerance)
+    setup = time.perf_counter() - begin
+    force, seconds, lost = press(model, path, worlds)
+    again = press(model, path, worlds)[1]
+    tight, _, lost_tight = press(make(TIGHT), path)
+    wrong = np.linalg.norm(force - tight, axis=2).mean(1)
+    return {
+        "device": device,
+        "solver": "biotac_mj",
+        "skin": skin,
+        "tier": "full",
+        "liquid": liquid,
+        "worlds": worlds,
+        "ms_per_press": 1e3 * seconds[:, 0].sum(),
+        "cpu_ms_per_press": 1e3 * seconds[:, 1].sum(),
+        "ms_per_step": 1e3 * seconds[:, 0].mean(),
+        "ms_slowest_step": 1e3 * seconds[:, 0].max(),
+        "ms_per_press_again": 1e3 * again[:, 0].sum(),
+        "setup_s": setup,
+        "force_error_rel": float(wrong.mean() / np.linalg.norm(tight, axis=2).max()),
+        "not_converged": lost,
+        "not_converged_tight": lost_tight,
+        "increments": increments,
+        "peak_force_N": float(np.linalg.norm(force[:, 0], axis=1).max()),
+        "force": force[:, 0].tolist(),
+    }
+
+
+def time_peer(ours: dict) -> dict:
+    """MuJoCo's flex on the mesh and path of one of our rows, to where the core would be met; its row."""
+    geometry = load_skin(ours["skin"])
+    increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
+    path, direction = standard_path(geometry, increments)
+    result = peer_flex.press(geometry, PRESETS["paper"], RADIUS, path, direction)
+    wanted = np.array(ours["force"][increments - 1])
+    return {
+        "device": "cpu",
+        "solver": f"mujoco {peer_flex.VERSION} flex",
+        "skin": ours["skin"],
+        "tier": "full",
+        "liquid": False,
+        "worlds": 1,
+        "ms_per_press": result["ms_per_step"] * ours["increments"],
+        "cpu_ms_per_press": result["cpu_ms_per_step"] * ours["increments"],
+        "ms_per_step": result["ms_per_step"],
+        "setup_s": result["setup_s"],
+        "force_error_rel": float(np.linalg.norm(result["force"] - wanted) / np.linalg.norm(wanted)),
+        "not_converged": None,
+        "steps": result["steps"],
+        "travel_m": increments * INCREMENT,
+        "force_N": np.linalg.norm(result["force"]),
+        "force_ours_N": float(np.linalg.norm(wanted)),
+    }
+
+
+def _cpu_name() -> str:
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _print_row(row):
+    cells = []
+    for column in COLUMNS:
+        value = row[column]
+        if column == "force_error_rel":
+            value = f"{value:.2%}"
+        elif isinstance(value, float):
+            value = f"{value:.1f}"
+        cells.append(f"{value!s:>{max(9, len(column) + 1)}}" if column != "solver" else f"{value:>20}")
+    print("".join(cells), flush=True)
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--device", default="cpu", help="cpu, or a CUDA device of Warp such as cuda:0")
+    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument("--skins", default="default", help=f"comma-separated: {', '.join(SKINS)}")
+    parser.add_argument("--worlds", default="1", help="comma-separated numbers of skins solved together")
+    parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
+    parser.add_argument("--no-peer", action="store_true", help="leave MuJoCo's flex out")
+    options = parser.parse_args(arguments)
+    skins = options.skins.split(",")
+    if unknown := [skin for skin in skins if skin not in SKINS]:
+        parser.error(f"unknown skin {', '.join(unknown)}: choose from {', '.join(SKINS)}")
+    if options.increments < 1:
+        parser.error("--increments must be at least 1")
+    wp.config.log_level = wp.LOG_WARNING
+    machine = _cpu_name()
+    if options.device == "cpu" and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        machine += ", held to one core"
+    elif options.device != "cpu":
+        machine = f"{wp.get_device(options.device).name}, host {machine}"
+    print(f"standard press, {options.increments} increments of 0.04 mm, on {machine}")
+    print("".join(f"{c:>{max(9, len(c) + 1)}}" if c != "solver" else f"{c:>20}" for c in COLUMNS))
+    rows = []
+    for skin in skins:
+        for liquid in (False, True):
+            for worlds in map(int, options.worlds.split(",")):
+                rows.append({**time_skin(skin, liquid, options.device, worlds, options.increments), "machine": machine})
+                _print_row(rows[-1])
+    if not options.no_peer and options.device == "cpu":
+        for ours in [row for row in rows if not row["liquid"] and row["worlds"] == 1]:
+            peer = {**time_peer(ours), "machine": machine}
+            peer["ratio_ms_per_step"] = peer["ms_per_step"] / ours["ms_per_step"]
+            peer["ratio_cpu"] = peer["cpu_ms_per_press"] / ours["cpu_ms_per_press"]
+            _print_row(peer)
+            print(
+                f"  flex after {1e3 * peer['travel_m']:.2f} mm, held until it rests: {peer['force_N']:.3f} N, "
+                f"ours {peer['force_ours_N']:.3f} N (its force_error_rel is against ours)\n"
+                f"  flex / ours: {peer['ratio_ms_per_step']:.1f} in time per step, {peer['ratio_cpu']:.1f} in processor time"
+            )
+            rows.append(peer)
+    write_json(options.json, {"rows": rows})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
