@@ -22,7 +22,9 @@ class FemStepper:
 
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
-        self._options = SkinOptions(**{**({} if config.liquid is None else {"liquid": config.liquid}), **config.options.get("skin", {})})
+        # half of a lone press's tolerance: two-way, the error of single steps is heard as chatter
+        liquid = {} if config.liquid is None else {"liquid": config.liquid}
+        self._options = SkinOptions(**({"tolerance": 5e-4} | liquid | config.options.get("skin", {})))
         self._material = Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default")
         n, g = geometry.nvert, len(geoms)
         sizes = {
