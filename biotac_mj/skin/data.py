@@ -177,20 +177,20 @@ class SkinData:
 
     def touching_geoms(self, ngeom: int):
         """Which geoms touched the outer surface when the last step ended: (nworld, ngeom) bool."""
-        geom = self.outer.anchor_geom.numpy()
-        return np.stack([(geom == g).any(0) for g in range(ngeom)], 1) if ngeom else np.zeros((self.nworld, 0), bool)
+        geom = view(self.outer.anchor_geom)
+        return np.array([_host((geom == g).any(0)) for g in range(ngeom)], bool).reshape(ngeom, self.nworld).T
 
     def tangent(self, geoms) -> np.ndarray:
         """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac frame's origin, after a step."""
         face, touching, block = self.contact_blocks
+        touching = _host(touching)
         geom = self.outer.trial_geom.numpy().reshape(len(face), -1, self.nworld)
         x = self.x.numpy()
         out = np.zeros((self.nworld, geoms.ngroup, 6, 6))
         for w in range(self.nworld):
             active = np.flatnonzero(touching[:, w])
             group = geoms.groups[geom[active, :, w].max(1)]
-            blocks = block[6 * active[:, None] + np.arange(6), w]
-            blocks = blocks if isinstance(blocks, np.ndarray) else blocks.cpu().numpy()
+            blocks = _host(block[6 * active[:, None] + np.arange(6), w])
             for g in np.unique(group):
                 mine = group == g
                 out[w, g] = self.preconditioner.tangent(w, (face[active[mine]], blocks[mine]), x[:, w])
@@ -200,6 +200,10 @@ class SkinData:
         """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
         cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
         return _leading(cauchy), _leading(mises)
+
+
+def _host(array):
+    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
 
 
 def _leading(array: wp.array) -> np.ndarray:

@@ -191,3 +191,43 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         return mu * iso + lam * J * ((real(2.0) * J - real(1.0)) * GdF * G + (J - real(1.0)) * dG)
     de = real(0.5) * (dF + wp.transpose(dF))
     return lam * wp.trace(de) * eye + real(2.0) * mu * de
+
+
+@wp.func
+def dilatation(law: int, F: mat33, R: mat33):
+    """The measure theta of volume change that multiplies `lam` in the energy: W = W(lam = 0) + lam/2 theta^2."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        return wp.trace(wp.transpose(R) * F) - real(3.0)
+    if law == 1:
+        return real(0.5) * (wp.ddot(F, F) - real(3.0))
+    if law == 2:
+        return wp.determinant(F) - real(1.0)
+    return wp.trace(F - eye)
+
+
+@wp.func
+def dilatation_gradient(law: int, F: mat33, R: mat33):
+    """d theta / dF."""
+    if law == 0:
+        return R
+    if law == 1:
+        return F
+    if law == 2:
+        return wp.determinant(F) * wp.transpose(wp.inverse(F))
+    return wp.identity(n=3, dtype=real)
+
+
+@wp.func
+def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
+    """Directional derivative of `dilatation_gradient`, (d2 theta / dF2) : dF."""
+    if law == 0:
+        Rt = wp.transpose(R)
+        S = Rt * F
+        return R * wp.skew(wp.inverse(wp.trace(S) * wp.identity(n=3, dtype=real) - S) * axial(Rt * dF))
+    if law == 1:
+        return dF
+    if law == 2:
+        G = wp.transpose(wp.inverse(F))
+        return wp.determinant(F) * (wp.ddot(G, dF) * G - G * wp.transpose(dF) * G)
+    return mat33()

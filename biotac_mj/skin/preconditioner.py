@@ -7,8 +7,9 @@ U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over 
 """
 
 import numpy as np
+from scipy.linalg import lu_factor, lu_solve
 
-__all__ = ["Preconditioner"]
+__all__ = ["Preconditioner", "assemble", "body_tangent"]
 
 
 class Preconditioner:
@@ -20,7 +21,6 @@ class Preconditioner:
         self.free_mask[model.free] = True
         self.free = model.free
         self.scale = scale
-        self.cuda = model.device.is_cuda
         self._rows = {}
 
     def update(self, contacts, gradient, kappa):
@@ -47,7 +47,7 @@ class Preconditioner:
             active = np.flatnonzero(touching[:, w])
             faces.append(face[active])
             index = 6 * active[:, None] + np.arange(6)
-            blocks.append(_host(block[index, w]))
+            blocks.append(block[index, w])
         faces, blocks = np.concatenate(faces), np.concatenate(blocks)
         nodes = np.unique(faces)
         nodes = nodes[self.free_mask[nodes]]
@@ -56,16 +56,16 @@ class Preconditioner:
         if size == 0:
             return None
         D = np.zeros((size, size))
-        D[:m, :m] = self._assemble(nodes, faces, blocks)
+        D[:m, :m] = assemble(nodes, faces, blocks, len(self.free_mask))
         rows, W = self._compliance(w, nodes)
         compliance = np.zeros((size, size))
         compliance[:m, :m] = W / self.scale[w]
         if self.gradient is not None:
             D[m, m] = self.kappa
-            along = _host(self.along[:, w]) / self.scale[w]
+            along = self.along[:, w] / self.scale[w]
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
-            compliance[m, m] = np.vdot(_host(self.gradient[:, w]), along)
-        solver = _Solver(np.eye(size) + D @ compliance, D, self.cuda, rows)
+            compliance[m, m] = np.vdot(self.gradient[:, w], along)
+        solver = _Solver(np.eye(size) + D @ compliance, D)
         return nodes, rows, solver, compliance, D
 
     def _compliance(self, w, nodes):
@@ -73,7 +73,7 @@ class Preconditioner:
         key = nodes.tobytes()
         if w not in self._rows or self._rows[w][0] != key:
             rows = self.factor.rows(nodes)
-            self._rows[w] = key, rows, _host(rows[:, self.factor.dof(nodes)]).astype(float)
+            self._rows[w] = key, rows, rows[:, self.factor.dof(nodes)].astype(float)
         return self._rows[w][1:]
 
     def apply(self, r):
@@ -87,54 +87,65 @@ class Preconditioner:
             m = 3 * len(nodes)
             u = z[:, w][nodes].reshape(-1)
             if self.gradient is not None:
-                total = (self.gradient[:, w] * z[:, w]).sum().reshape(1)
-                u = _concatenate(u, total)
+                u = np.append(u, np.vdot(self.gradient[:, w], z[:, w]))
             q = solver(u) / self.scale[w]
             if m:
-                z[self.free, w] -= (rows.T @ _single(q[:m])).reshape(-1, 3)
+                z[self.free, w] -= (rows.T @ q[:m].astype(np.float32)).reshape(-1, 3)
             if self.gradient is not None:
                 z[:, w] -= q[m] * self.along[:, w]
         return z
 
     def tangent(self, w, blocks, x):
-        """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin (translation, rotation vector).
-
-        The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0 + U D U^T)^-1 over T:
-        G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness stands for the tangent here,
-        as in the preconditioner.
-
-        Args:
-          w: world.
-          blocks: (faces (n, 3), stiffness (n, 6, 3, 3)) of the body's contact alone.
-          x: (nvert, 3) nodal positions, host.
-        """
+        """Stiffness (6, 6) of the skin against rigid motions of a body that touches it, see `body_tangent`."""
         small = self.worlds[w]
-        if small is None or not len(blocks[0]):
+        if small is None:
             return np.zeros((6, 6))
         nodes, _, solver, compliance, _ = small
-        size, m = len(compliance), 3 * len(nodes)
-        springs = np.zeros((size, size))
-        springs[:m, :m] = self._assemble(nodes, *blocks)
-        rigid = np.zeros((size, 6))
-        rigid[:m].reshape(-1, 3, 6)[:, :, :3] = np.eye(3)
-        rigid[:m].reshape(-1, 3, 6)[:, :, 3:] = -_skew(x[nodes])
-        pull = springs @ rigid
-        give = compliance @ pull
-        give -= compliance @ _host(solver(give))
-        stiffness = rigid.T @ pull - pull.T @ give
-        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
-        return (vectors * np.maximum(values, 0)) @ vectors.T
+        return body_tangent(nodes, compliance, solver, blocks, x, len(self.free_mask))
 
-    def _assemble(self, nodes, faces, blocks):
-        position = np.full(len(self.free_mask), len(nodes))
-        position[nodes] = np.arange(len(nodes))
-        dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
-        for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
-            pa, pb = position[faces[:, a]], position[faces[:, b]]
-            np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
-            if a != b:
-                np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
-        return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
+
+def body_tangent(nodes, compliance, solver, blocks, x, nvert):
+    """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin (translation, rotation vector).
+
+    The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0 + U D U^T)^-1 over
+    T: G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness stands for the tangent
+    here, as in the preconditioner.
+
+    Args:
+      nodes: (m,) touching free nodes.
+      compliance: (3m [+ 1], ...) W over them (and the liquid).
+      solver: u -> (I + D W)^-1 D u.
+      blocks: (faces (n, 3), stiffness (n, 6, 3, 3)) of the body's contact alone.
+      x: (nvert, 3) nodal positions.
+      nvert: number of nodes.
+    """
+    if not len(blocks[0]):
+        return np.zeros((6, 6))
+    size, m = len(compliance), 3 * len(nodes)
+    springs = np.zeros((size, size))
+    springs[:m, :m] = assemble(nodes, *blocks, nvert)
+    rigid = np.zeros((size, 6))
+    rigid[:m].reshape(-1, 3, 6)[:, :, :3] = np.eye(3)
+    rigid[:m].reshape(-1, 3, 6)[:, :, 3:] = -_skew(x[nodes])
+    pull = springs @ rigid
+    give = compliance @ pull
+    give -= compliance @ solver(give)
+    stiffness = rigid.T @ pull - pull.T @ give
+    values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+    return (vectors * np.maximum(values, 0)) @ vectors.T
+
+
+def assemble(nodes, faces, blocks, nvert):
+    """Contact stiffness (3m, 3m) over `nodes` from the blocks (n, 6, 3, 3) of faces (n, 3)."""
+    position = np.full(nvert, len(nodes))
+    position[nodes] = np.arange(len(nodes))
+    dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
+    for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+        pa, pb = position[faces[:, a]], position[faces[:, b]]
+        np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
+        if a != b:
+            np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
+    return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
 
 
 def _skew(v):
@@ -144,38 +155,10 @@ def _skew(v):
 
 
 class _Solver:
-    """q = (I + D W)^-1 D u on the device of the rows."""
+    """q = (I + D W)^-1 D u."""
 
-    def __init__(self, matrix, D, cuda, rows):
-        if cuda:
-            import torch
-
-            self._solution = torch.as_tensor(np.linalg.solve(matrix, D), device=rows.device)
-        else:
-            from scipy.linalg import lu_factor
-
-            self._lu, self._D = lu_factor(matrix, check_finite=False), D
-        self._cuda = cuda
+    def __init__(self, matrix, D):
+        self._lu, self._D = lu_factor(matrix, check_finite=False), D
 
     def __call__(self, u):
-        if self._cuda:
-            return self._solution @ self._solution.new_tensor(u) if isinstance(u, np.ndarray) else self._solution @ u
-        from scipy.linalg import lu_solve
-
         return lu_solve(self._lu, self._D @ u, check_finite=False)
-
-
-def _host(array):
-    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
-
-
-def _single(array):
-    return array.astype(np.float32) if isinstance(array, np.ndarray) else array.float()
-
-
-def _concatenate(a, b):
-    if isinstance(a, np.ndarray):
-        return np.concatenate([a, b])
-    import torch
-
-    return torch.cat([a, b])

@@ -63,7 +63,7 @@ class _Step:
         self.gradient = view(data.gradient)
         self.kappa = model.options.bulk_modulus / model.liquid_volume if model.has_liquid else 0.0
         if not hasattr(data, "preconditioner"):
-            data.preconditioner = Preconditioner(model, data.stiffness_scale)
+            data.preconditioner = _preconditioner(model)(model, data.stiffness_scale)
         self.M = data.preconditioner
         self.inertia = None
         if model.options.dynamics == "implicit":
@@ -218,7 +218,7 @@ class _Step:
 
     def _tangents(self):
         states = [self.d.outer] + ([self.d.core] if self.m.has_core else [])
-        return [(s.surface.face_np, s.touching.numpy(), view(s.block)) for s in states]
+        return [(s.surface.face_np, view(s.touching), view(s.block)) for s in states]
 
     def _elastic_product(self, p):
         m, d = self.m, self.d
@@ -303,6 +303,14 @@ class _Step:
             world = np.einsum("wij,nwj->nwi", mat, d.x.numpy()) + pos
             wp.copy(d.velocity, wp.array((world - self.world) / self.dt, dtype=vec3, ndim=2, device=self.m.device))
             d.core_pos, d.core_mat = pos.copy(), mat.copy()
+
+
+def _preconditioner(model):
+    if not model.device.is_cuda:
+        return Preconditioner
+    from .batch_preconditioner import BatchPreconditioner  # torch is for CUDA only
+
+    return BatchPreconditioner
 
 
 def _launcher(device):

@@ -1,0 +1,134 @@
+"""The preconditioner of `preconditioner.py` for all worlds at once on a CUDA device, in torch's batched linear algebra."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from .preconditioner import body_tangent
+
+__all__ = ["BatchPreconditioner"]
+
+_PAD = 16  # touching nodes are padded to a multiple of this, so that few shapes of matrices occur
+_STIFF = 1e5  # [N/m]
+
+
+class BatchPreconditioner:
+    """(A0 + U D U^T)^-1 by Woodbury's identity, one small system for each world, all of the size of the largest."""
+
+    def __init__(self, model, scale):
+        self.factor = model.factor
+        self.device = wp.device_to_torch(model.device)
+        self.scale = torch.as_tensor(scale, device=self.device)
+        self.nvert = model.nvert
+        index = torch.full((model.nvert + 1,), -1, device=self.device)
+        index[torch.as_tensor(model.free, device=self.device)] = torch.arange(len(model.free), device=self.device)
+        self.free_index = index
+        self._inverse = self.factor.inverse.view(len(model.free), 3, len(model.free), 3)
+        self._faces = {}
+
+    def clear(self):
+        """For skins that nothing touches."""
+        self.size, self.gradient = 0, None
+
+    def update(self, contacts, gradient, kappa):
+        """Takes the tangents of contact and liquid; arguments as in `Preconditioner.update`, on the device."""
+        # the liquid's direction is scaled so that its stiffness is like that of contact: single precision then suffices
+        self.kappa = _STIFF
+        self.gradient = None if gradient is None else gradient * (kappa / _STIFF) ** 0.5
+        gradient = self.gradient
+        nworld = len(self.scale)
+        faces = [self._face(face) for face, _, _ in contacts]
+        flag = torch.zeros(self.nvert, nworld, device=self.device, dtype=torch.int32)
+        for face, (_, touching, _) in zip(faces, contacts):
+            for corner in range(3):
+                flag.index_add_(0, face[:, corner], touching)
+        touched = (flag > 0) & (self.free_index[:-1, None] >= 0)
+        slot = torch.cumsum(touched, 0) - 1
+        count = int(touched.sum(0).max())
+        m = -(-count // _PAD) * _PAD
+        slot = torch.where(touched, slot, m)  # slot m catches what is not touched
+        nodes = torch.full((m + 1, nworld), self.nvert, device=self.device)
+        nodes.scatter_(0, slot, torch.arange(self.nvert, device=self.device)[:, None].expand(-1, nworld))
+        self.nodes = nodes[:m].T.contiguous()  # (nworld, m), nvert where unused
+        self.size = 3 * m + (gradient is not None)
+        if not self.size:
+            return
+        self.used = (self.nodes < self.nvert).repeat_interleave(3, 1)
+        D = self._stiffness(faces, contacts, slot, m)
+        W = self._compliance(m)
+        system = D @ W
+        system.diagonal(dim1=1, dim2=2).add_(1)
+        self.D, self.W, (self.lu, self.pivots) = D, W, torch.linalg.lu_factor(system)
+
+    def _face(self, face):
+        key = id(face)
+        if key not in self._faces:
+            self._faces[key] = face, torch.as_tensor(face, device=self.device, dtype=torch.int64)
+        return self._faces[key][1]
+
+    def _stiffness(self, faces, contacts, slot, m):
+        nworld = len(self.scale)
+        D = torch.zeros(nworld, self.size, self.size, device=self.device)
+        dense = torch.zeros(nworld, m + 1, 3, m + 1, 3, device=self.device)
+        axis = torch.arange(3, device=self.device)
+        for face, (_, touching, block) in zip(faces, contacts):
+            f, w = touching.nonzero(as_tuple=True)
+            for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+                value = block[6 * f + k, w].float()
+                sa, sb = slot[face[f, a], w], slot[face[f, b], w]
+                for i, j in ((sa, sb),) if a == b else ((sa, sb), (sb, sa)):
+                    dense.index_put_(
+                        (w[:, None, None], i[:, None, None], axis[:, None], j[:, None, None], axis[None]), value, accumulate=True
+                    )
+        D[:, : 3 * m, : 3 * m] = dense[:, :m, :, :m].reshape(nworld, 3 * m, 3 * m)
+        if self.gradient is not None:
+            D[:, -1, -1] = self.kappa
+        return D
+
+    def _compliance(self, m):
+        nworld = len(self.scale)
+        W = torch.zeros(nworld, self.size, self.size, device=self.device)
+        if m:
+            local = self.free_index[self.nodes].clamp_min(0)
+            block = self._inverse[local[:, :, None], :, local[:, None, :], :]  # (nworld, m, m, 3, 3)
+            W[:, : 3 * m, : 3 * m] = block.transpose(2, 3).reshape(nworld, 3 * m, 3 * m)
+            W[:, : 3 * m, : 3 * m] *= self.used[:, :, None] * self.used[:, None, :]
+        if self.gradient is not None:
+            along = self.factor.solve(self.gradient)
+            W[:, -1, -1] = (self.gradient * along).sum((0, 2)).float()
+            W[:, : 3 * m, -1] = W[:, -1, : 3 * m] = self._at_nodes(along).float()
+        return W / self.scale[:, None, None].float()
+
+    def _at_nodes(self, z):
+        padded = torch.cat([z, z.new_zeros(1, *z.shape[1:])])
+        world = torch.arange(z.shape[1], device=self.device)[:, None]
+        return padded[self.nodes, world].reshape(z.shape[1], -1)
+
+    def tangent(self, w, blocks, x):
+        """See `Preconditioner.tangent`."""
+        if not self.size:
+            return np.zeros((6, 6))
+        used = (self.nodes[w] < self.nvert).cpu().numpy()
+        keep = np.concatenate([np.repeat(used, 3), np.ones(self.size - 3 * len(used), bool)])
+        D, W = (a[w].double().cpu().numpy()[keep][:, keep] for a in (self.D, self.W))
+        return body_tangent(
+            self.nodes[w].cpu().numpy()[used], W, lambda u: np.linalg.solve(np.eye(len(D)) + D @ W, D @ u), blocks, x, self.nvert
+        )
+
+    def apply(self, r):
+        """Approximate inverse of the tangent times r: (nvert, nworld, 3), zero at fixed nodes."""
+        z = self.factor.solve(r) / self.scale[:, None]
+        if not self.size:
+            return z
+        u = self._at_nodes(z)
+        if self.gradient is not None:
+            u = torch.cat([u, (self.gradient * z).sum((0, 2))[:, None]], 1)
+        q = torch.linalg.lu_solve(self.lu, self.pivots, (self.D @ u.float()[..., None])).squeeze(-1).double()
+        push = z.new_zeros(self.nvert + 1, z.shape[1], 3)
+        m = self.nodes.shape[1]
+        world = torch.arange(z.shape[1], device=self.device)[:, None].expand(-1, m)
+        push[self.nodes, world] = q[:, : 3 * m].reshape(-1, m, 3)
+        push = push[:-1]
+        if self.gradient is not None:
+            push = push + q[:, -1, None] * self.gradient
+        return z - self.factor.solve(push) / self.scale[:, None]
