@@ -74,7 +74,11 @@ def _clocks() -> np.ndarray:
 
 
 def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarray, np.ndarray, int]:
-    """One press in all worlds: forces (increments, worlds, 3) [N], (wall, processor) seconds (increments, 2), steps that did not converge."""
+    """One press in all worlds.
+
+    Returns:
+      forces (increments, worlds, 3) [N], wall and processor seconds (increments, 2), number of steps that did not converge.
+    """
     data = SkinData(model, worlds)
     geoms = GeomSet(["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device))
     geoms.set_pose(path[:1])

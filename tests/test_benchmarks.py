@@ -1,0 +1,167 @@
+"""The benchmarks run as documented, meet the bounds on stored cases and write the promised JSON."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+
+def _run(repo, script, *arguments):
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(repo), os.environ.get("PYTHONPATH")]))}
+    return subprocess.run([sys.executable, repo / "benchmarks" / script, *map(str, arguments)], capture_output=True, text=True, env=env)
+
+
+@pytest.fixture(scope="module")
+def accuracy(repo):
+    sys.path.insert(0, str(repo / "benchmarks"))
+    import accuracy
+
+    yield accuracy
+    sys.path.remove(str(repo / "benchmarks"))
+
+
+def test_accuracy_of_stored_cases(repo, shared, tmp_path):
+    cases = tmp_path / "cases"
+    cases.mkdir()
+    names = ("B_sphere3.5_pad_0.5mm", "L_sphere3.5_pad")
+    for name in names:
+        (cases / f"{name}.npz").symlink_to(shared / "reference" / f"{name}.npz")
+    skin = shared / "data" / "nvlabs_biotac_sim"
+    done = _run(repo, "accuracy.py", "--cases", cases, "--json", tmp_path / "out.json", "--skin", skin, "--picture", tmp_path / "out.png")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(" pass") == 2
+    rows = json.loads((tmp_path / "out.json").read_text())["cases"]
+    assert [row["name"] for row in rows] == list(names)
+    for row in rows:
+        assert 0 < row["force_error_rel"] <= 0.03
+        assert 0 < row["displacement_error_rel"] <= 0.02
+        assert row["seconds"] > 0
+        assert row["not_converged"] == 0
+        # the error is what the file says, not what the benchmark says
+        stored = np.load(shared / "reference" / f"{row['name']}.npz")["force"]
+        wrong = np.linalg.norm(np.array(row["force"]) - stored, axis=1).mean() / np.linalg.norm(stored, axis=1).max()
+        assert row["force_error_rel"] == pytest.approx(wrong)
+    assert (tmp_path / "out.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_case_that_cannot_be_solved_is_told(repo, shared, tmp_path):
+    case = dict(np.load(shared / "reference" / "L_sphere3.5_pad.npz"))
+    case["indenter"] = json.dumps({**json.loads(str(case["indenter"])), "shape": "cone"})
+    np.savez(tmp_path / "odd.npz", **case)
+    done = _run(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json", "--skin", shared / "data" / "nvlabs_biotac_sim")
+    assert done.returncode == 1
+    assert "unknown indenter shape 'cone': the case must hold a sphere, cube, cylinder or annulus" in done.stdout
+    assert json.loads((tmp_path / "out.json").read_text())["cases"][0]["force_error_rel"] is None
+
+
+def test_no_cases(repo, tmp_path):
+    done = _run(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json")
+    assert done.returncode == 2
+    assert "pass the folder that holds them" in done.stderr
+    assert not (tmp_path / "out.json").exists()
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"shape": "sphere", "radius": 0.00175},
+        {"shape": "cylinder on its side, axis = indenter x", "radius": 0.0035, "length": 0.028, "edge_radius": 0.001},
+        {"shape": "cylinder on its side", "radius": 0.0035, "half_length": 0.014, "edge_radius": 0.001},
+        {"shape": "cylinder on its side", "radius": 0.00175, "edge_radius": 0.001, "seed_mesh": "cylinder_short_3-5mm.obj"},
+        {"shape": "cube, flat top at y=0", "half_width": 0.007, "edge_radius": 0.001},
+        {"shape": "annulus about indenter y", "inner_radius": 0.0035, "outer_radius": 0.007, "edge_radius": 0.001},
+    ],
+    ids=lambda shape: f"{shape['shape'].split()[0]} {len(shape)} {shape.get('seed_mesh', '')}",
+)
+def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
+    """The distance of points to each indenter, against formulas for the surface written from the cases' description."""
+    import warp as wp
+
+    from biotac_mj.skin.contact import rest_gap
+
+    geoms, pos, mat = accuracy.case_geoms(shape, 0.0)
+    point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [0, 5e-4, 0]  # around the front
+    if shape["shape"].startswith("cylinder"):
+        point *= [2, 1, 0.5]
+    local = (point - pos[0]) @ mat[0]
+    face = np.arange(len(local))[:, None] * [1, 1, 1]  # each face is a point
+    gap = wp.zeros(len(local), dtype=wp.float64)
+    inputs = [
+        wp.array(face, dtype=wp.vec3i),
+        wp.array([[1 / 3] * 3], dtype=wp.vec3d),
+        geoms.struct,
+        wp.array(local[:, None], dtype=wp.vec3d),
+    ]
+    wp.launch(rest_gap, dim=(len(local), 1), inputs=inputs, outputs=[gap], device="cpu")
+    gap, expected = gap.numpy(), _distance(shape, point)
+    near = (expected < 0) & (expected > -2e-4)  # where it would press
+    assert near.sum() > 50
+    np.testing.assert_allclose(gap[near], expected[near], atol=1.5e-6 if "annulus" in shape["shape"] else 1e-12)
+
+
+def _distance(shape, p):
+    kind, x, y, z = shape["shape"], *p.T
+    edge = shape.get("edge_radius", 0)
+
+    def rounded(*q):  # a box in any number of dimensions, shrunk by the edge's radius and grown again
+        q = np.stack(q) + edge
+        return np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0) - edge
+
+    if kind == "sphere":
+        r = shape["radius"]
+        return np.sqrt(x**2 + (y + r) ** 2 + z**2) - r
+    if kind.startswith("cylinder"):
+        r = shape["radius"]
+        half = shape.get("half_length", shape.get("length", 0.007) / 2)
+        return rounded(np.hypot(y + r, z) - r, np.abs(x) - half)
+    if kind.startswith("cube"):
+        h = shape["half_width"]
+        return rounded(np.abs(x) - h, np.abs(y + h) - h, np.abs(z) - h)
+    mean, half = (shape["outer_radius"] + shape["inner_radius"]) / 2, (shape["outer_radius"] - shape["inner_radius"]) / 2
+    return rounded(np.abs(np.hypot(x, z) - mean) - half, y)
+
+
+def test_a_cylinder_without_length_is_refused(accuracy):
+    with pytest.raises(ValueError, match="cylinder of unknown length.*give radius and length"):
+        accuracy.case_geoms({"shape": "cylinder", "radius": 0.002}, 0.0)
+
+
+def test_speed_writes_rows(repo, tmp_path):
+    done = _run(repo, "speed.py", "--device", "cpu", "--json", tmp_path / "speed.json", "--increments", 5, "--no-peer", "--skins", "coarse")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "speed.json").read_text())["rows"]
+    assert [row["liquid"] for row in rows] == [False, True]
+    for row in rows:
+        assert (row["device"], row["solver"], row["skin"], row["tier"], row["worlds"]) == ("cpu", "biotac_mj", "coarse", "full", 1)
+        assert row["ms_per_press"] == pytest.approx(5 * row["ms_per_step"])
+        assert row["not_converged"] == row["not_converged_tight"] == 0
+        assert 0 < row["force_error_rel"] < 0.01
+        assert np.all(np.diff(np.linalg.norm(row["force"], axis=1)) > 0)  # a deeper press is a harder press
+    assert rows[1]["peak_force_N"] > rows[0]["peak_force_N"]  # the liquid carries load
+
+
+def test_standard_path_starts_at_first_touch(repo, accuracy):
+    """No point of the skin, sampled in faces by another library, is inside the sphere at the start, and one is as soon as it moves."""
+    import speed
+    import trimesh
+
+    from biotac_mj.geometry import load_skin
+
+    geometry = load_skin("coarse")
+    path, direction = speed.standard_path(geometry, 3)
+    surface = trimesh.Trimesh(geometry.vert, geometry.outer_face, process=False)
+    for k, center in enumerate(path[:2]):
+        _, distance, _ = trimesh.proximity.closest_point(surface, center[None])
+        assert distance[0] - speed.RADIUS == pytest.approx(-k * speed.INCREMENT, abs=2e-6 if k else 1e-8)
+    np.testing.assert_allclose(np.diff(path, axis=0), speed.INCREMENT * np.tile(direction, (3, 1)), atol=1e-12)
+    assert abs(path[0] @ [0, 0, 1]) < 1e-3
+    assert direction[1] > 0.9  # from the pad towards the nail
+
+
+def test_unknown_skin_is_refused(repo, tmp_path):
+    done = _run(repo, "speed.py", "--json", tmp_path / "speed.json", "--skins", "huge")
+    assert done.returncode == 2
+    assert "unknown skin huge: choose from coarse, default, fine" in done.stderr
