@@ -5,11 +5,44 @@ import torch
 import warp as wp
 
 from .preconditioner import body_tangent
+from .types import mat33
 
 __all__ = ["BatchPreconditioner"]
 
+wp.set_module_options({"enable_backward": False})
+
 _PAD = 16  # touching nodes are padded to a multiple of this, so that few shapes of matrices occur
 _STIFF = 1e5  # [N/m]
+
+
+@wp.kernel
+def scatter_blocks(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    touching: wp.array2d(dtype=int),
+    block: wp.array2d(dtype=mat33),
+    slot: wp.array2d(dtype=int),
+    nslot: int,
+    # Out:
+    stiffness_out: wp.array3d(dtype=wp.float32),
+):
+    """Adds the contact tangents of the touching faces to each world's matrix over its touching nodes."""
+    f, w = wp.tid()
+    if touching[f, w] == 0:
+        return
+    k = int(0)
+    for a in range(3):
+        i = slot[face[f][a], w]
+        for b in range(a, 3):
+            j = slot[face[f][b], w]
+            if i < nslot and j < nslot:
+                K = block[6 * f + k, w]
+                for c in range(3):
+                    for d in range(3):
+                        wp.atomic_add(stiffness_out, w, 3 * i + c, 3 * j + d, wp.float32(K[c, d]))
+                        if a != b:
+                            wp.atomic_add(stiffness_out, w, 3 * j + d, 3 * i + c, wp.float32(K[c, d]))
+            k += 1
 
 
 class BatchPreconditioner:
@@ -30,18 +63,18 @@ class BatchPreconditioner:
         """For skins that nothing touches."""
         self.size, self.gradient = 0, None
 
-    def update(self, contacts, gradient, kappa):
+    def update(self, states, gradient, kappa):
         """Takes the tangents of contact and liquid; arguments as in `Preconditioner.update`, on the device."""
         # the liquid's direction is scaled so that its stiffness is like that of contact: single precision then suffices
         self.kappa = _STIFF
         self.gradient = None if gradient is None else gradient * (kappa / _STIFF) ** 0.5
         gradient = self.gradient
         nworld = len(self.scale)
-        faces = [self._face(face) for face, _, _ in contacts]
+        faces = [self._face(s.surface.face_np) for s in states]
         flag = torch.zeros(self.nvert, nworld, device=self.device, dtype=torch.int32)
-        for face, (_, touching, _) in zip(faces, contacts):
+        for face, state in zip(faces, states):
             for corner in range(3):
-                flag.index_add_(0, face[:, corner], touching)
+                flag.index_add_(0, face[:, corner], wp.to_torch(state.touching))
         touched = (flag > 0) & (self.free_index[:-1, None] >= 0)
         slot = torch.cumsum(touched, 0) - 1
         count = int(touched.sum(0).max())
@@ -54,7 +87,7 @@ class BatchPreconditioner:
         if not self.size:
             return
         self.used = (self.nodes < self.nvert).repeat_interleave(3, 1)
-        D = self._stiffness(faces, contacts, slot, m)
+        D = self._stiffness(states, slot)
         W = self._compliance(m)
         system = D @ W
         system.diagonal(dim1=1, dim2=2).add_(1)
@@ -66,21 +99,18 @@ class BatchPreconditioner:
             self._faces[key] = face, torch.as_tensor(face, device=self.device, dtype=torch.int64)
         return self._faces[key][1]
 
-    def _stiffness(self, faces, contacts, slot, m):
+    def _stiffness(self, states, slot):
         nworld = len(self.scale)
         D = torch.zeros(nworld, self.size, self.size, device=self.device)
-        dense = torch.zeros(nworld, m + 1, 3, m + 1, 3, device=self.device)
-        axis = torch.arange(3, device=self.device)
-        for face, (_, touching, block) in zip(faces, contacts):
-            f, w = touching.nonzero(as_tuple=True)
-            for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
-                value = block[6 * f + k, w].float()
-                sa, sb = slot[face[f, a], w], slot[face[f, b], w]
-                for i, j in ((sa, sb),) if a == b else ((sa, sb), (sb, sa)):
-                    dense.index_put_(
-                        (w[:, None, None], i[:, None, None], axis[:, None], j[:, None, None], axis[None]), value, accumulate=True
-                    )
-        D[:, : 3 * m, : 3 * m] = dense[:, :m, :, :m].reshape(nworld, 3 * m, 3 * m)
+        slot = wp.from_torch(slot.int().contiguous())
+        for state in states:
+            wp.launch(
+                scatter_blocks,
+                dim=state.touching.shape,
+                inputs=[state.surface.face, state.touching, state.block, slot, self.nodes.shape[1]],
+                outputs=[wp.from_torch(D)],
+                device=slot.device,
+            )
         if self.gradient is not None:
             D[:, -1, -1] = self.kappa
         return D

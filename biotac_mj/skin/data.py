@@ -36,6 +36,11 @@ class ContactState:
             array.zero_()
         self.trial_geom.fill_(-1)
 
+    def active(self, w):
+        """Faces of world w that touch (n,) and their tangents (n, 6, 3, 3), on the host."""
+        faces = np.flatnonzero(_host(view(self.touching)[:, w]))
+        return faces, _host(view(self.block)[6 * faces[:, None] + np.arange(6), w])
+
     def commit(self):
         wp.copy(self.anchor_geom, self.trial_geom)
         wp.copy(self.anchor, self.trial_anchor)
@@ -182,15 +187,13 @@ class SkinData:
 
     def tangent(self, geoms) -> np.ndarray:
         """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac frame's origin, after a step."""
-        face, touching, block = self.contact_blocks
-        touching = _host(touching)
+        face = self.outer.surface.face_np
         geom = self.outer.trial_geom.numpy().reshape(len(face), -1, self.nworld)
         x = self.x.numpy()
         out = np.zeros((self.nworld, geoms.ngroup, 6, 6))
         for w in range(self.nworld):
-            active = np.flatnonzero(touching[:, w])
+            active, blocks = self.outer.active(w)
             group = geoms.groups[geom[active, :, w].max(1)]
-            blocks = _host(block[6 * active[:, None] + np.arange(6), w])
             for g in np.unique(group):
                 mine = group == g
                 out[w, g] = self.preconditioner.tangent(w, (face[active[mine]], blocks[mine]), x[:, w])

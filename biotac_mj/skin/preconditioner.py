@@ -23,31 +23,29 @@ class Preconditioner:
         self.scale = scale
         self._rows = {}
 
-    def update(self, contacts, gradient, kappa):
+    def update(self, states, gradient, kappa):
         """Takes the tangents of contact and liquid.
 
         Args:
-          contacts: list of (faces (nface, 3) host, touching (nface, nworld) host, blocks (6 nface, nworld, 3, 3)) of the surfaces.
+          states: ContactState of each surface that can touch, just evaluated.
           gradient: (nvert, nworld, 3) of the liquid's volume, zero at fixed nodes [m^2], or None.
           kappa: K / V0 [Pa/m^3].
         """
         self.gradient, self.kappa = gradient, kappa
         self.along = self.factor.solve(gradient) if gradient is not None else None
-        nworld = contacts[0][1].shape[1]
-        self.worlds = [self._small(w, contacts) for w in range(nworld)]
+        self.worlds = [self._small(w, states) for w in range(len(self.scale))]
 
     def clear(self):
         """For a skin that nothing touches."""
         self.gradient, self.along = None, None
         self.worlds = [None] * len(self.scale)
 
-    def _small(self, w, contacts):
+    def _small(self, w, states):
         faces, blocks = [], []
-        for face, touching, block in contacts:
-            active = np.flatnonzero(touching[:, w])
-            faces.append(face[active])
-            index = 6 * active[:, None] + np.arange(6)
-            blocks.append(block[index, w])
+        for state in states:
+            active, block = state.active(w)
+            faces.append(state.surface.face_np[active])
+            blocks.append(block)
         faces, blocks = np.concatenate(faces), np.concatenate(blocks)
         nodes = np.unique(faces)
         nodes = nodes[self.free_mask[nodes]]

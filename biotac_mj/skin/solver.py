@@ -118,12 +118,12 @@ class _Step:
         for iteration in range(options.max_newton + 1):
             residual = self.force * self.mask
             finite = np.isfinite(_host(residual.sum((0, 2))))
-            tangents = self._tangents()
-            if not any(touching.any() for _, touching, _ in tangents) and abs(residual).max() < _BALANCED:
+            states = self._contacts()
+            if not any(view(s.touching).any() for s in states) and abs(residual).max() < _BALANCED:
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
                 return asked
-            self.M.update(tangents, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
+            self.M.update(states, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             z = self.M.apply(residual)
             error = _host((residual * z).sum((0, 2)))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
@@ -216,9 +216,8 @@ class _Step:
         launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
         self.force += view(state.node_force)
 
-    def _tangents(self):
-        states = [self.d.outer] + ([self.d.core] if self.m.has_core else [])
-        return [(s.surface.face_np, view(s.touching), view(s.block)) for s in states]
+    def _contacts(self):
+        return [self.d.outer] + ([self.d.core] if self.m.has_core else [])
 
     def _elastic_product(self, p):
         m, d = self.m, self.d
@@ -234,7 +233,7 @@ class _Step:
             q *= 1 + m.options.stiffness_damping / self.dt
             q += (1 + m.options.mass_damping * self.dt) * self.inertia * p
         launch = _launcher(m.device)
-        for s in [d.outer] + ([d.core] if m.has_core else []):
+        for s in self._contacts():
             launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
             launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
         if m.has_liquid:
@@ -292,7 +291,6 @@ class _Step:
                 [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force], [wrench],
             )  # fmt: skip
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
-        d.contact_blocks = self._tangents()[0]
         d.outer.commit()
         d.motion = self._motion()
         view(d.increment)[...] = self.x - self.start
