@@ -24,7 +24,7 @@ class GeomSet:
       device: Warp device.
 
     Raises:
-      ValueError: unknown type, a size that is not positive, NaN, or a mesh without a grid.
+      ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh without a grid.
     """
 
     def __init__(self, types, sizes, friction=None, groups=None, rounding=None, grids=(), nworld=1, device="cpu"):
@@ -43,6 +43,9 @@ class GeomSet:
                 raise ValueError(f"a {kind} of size {row.tolist()} is not a solid: sizes must be positive and finite")
         friction = np.zeros(count) if friction is None else np.asarray(friction, float)
         rounding = np.zeros(count) if rounding is None else np.asarray(rounding, float)
+        for kind, row, radius in zip(types, size, rounding, strict=True):
+            if not 0 <= radius <= row[: used[kind]].min(initial=np.inf):
+                raise ValueError(f"rounding of a {kind} is {radius}: a fillet's radius lies between 0 and the smallest size")
         groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
         if not (np.isfinite(friction).all() and (friction >= 0).all()):
             raise ValueError(f"friction {friction.tolist()} must be finite and not negative")
