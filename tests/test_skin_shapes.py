@@ -1,0 +1,284 @@
+"""Signed distances against MuJoCo's, closed forms and trimesh."""
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from scipy.optimize import minimize_scalar
+
+from biotac_mj.geometry import indenter
+from biotac_mj.skin import GeomSet, bake_distance_grid
+from biotac_mj.skin.contact import Geoms
+from biotac_mj.skin.shapes import distance, distance_bound
+
+SIZES = {"sphere": (0.8, 0, 0), "capsule": (0.5, 0.7, 0), "cylinder": (0.6, 0.9, 0), "ellipsoid": (0.5, 0.8, 1.1), "box": (0.5, 0.8, 1.1)}
+
+
+@wp.kernel
+def _distances(geoms: Geoms, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d), bound: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    out[i] = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], point[i])
+    bound[i] = distance_bound(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], point[i])
+
+
+def evaluate(kind, size, points, rounding=0.0, grids=()):
+    """Normals (n, 3), distances (n,) and their lower bounds (n,)."""
+    geoms = GeomSet([kind], [size], rounding=[rounding], grids=grids)
+    out, bound = wp.zeros(len(points), dtype=wp.vec4d), wp.zeros(len(points), dtype=wp.float64)
+    wp.launch(_distances, dim=len(points), inputs=[geoms.struct, wp.array(points, dtype=wp.vec3d)], outputs=[out, bound], device="cpu")
+    return out.numpy()[:, :3], out.numpy()[:, 3], bound.numpy()
+
+
+def cloud(n=300, reach=1.8, seed=0):
+    return np.random.default_rng(seed).uniform(-reach, reach, (n, 3))
+
+
+def gradient(kind, size, points, h=1e-6, **options):
+    """Of the distance by central differences."""
+    out = np.empty_like(points)
+    for axis in range(3):
+        offset = h * np.eye(3)[axis]
+        out[:, axis] = (evaluate(kind, size, points + offset, **options)[1] - evaluate(kind, size, points - offset, **options)[1]) / (2 * h)
+    return out
+
+
+@pytest.mark.parametrize("kind", [*SIZES, "plane"])
+def test_outside_equals_mujoco(kind):
+    """mj_geomDistance to a tiny sphere as the probe; its convex solver is told to be as exact as doubles allow."""
+    size = SIZES.get(kind, (1, 1, 1))
+    text = " ".join(map(str, size))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option ccd_tolerance="1e-10" ccd_iterations="500"/><worldbody><geom name="shape" type="{kind}" size="{text}"/>'
+        '<body mocap="true"><geom name="probe" type="sphere" size="1e-4"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    points = cloud()
+    _, ours, _ = evaluate(kind, () if kind == "plane" else size, points)
+    outside = ours > 1e-3
+    theirs = []
+    for p in points[outside]:
+        data.mocap_pos[0] = p
+        mujoco.mj_kinematics(model, data)
+        theirs.append(mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None) + 1e-4)
+    assert outside.sum() > 100
+    # sizes are about one; on ellipsoids some of MuJoCo's iterations stop early: see the next test
+    error = abs(ours[outside] - theirs)
+    assert np.quantile(error, 0.95) < 1e-6
+    assert error.max() < (1e-4 if kind == "ellipsoid" else 1e-6)
+
+
+def test_ellipsoid_equals_a_search():
+    radii, points = np.array(SIZES["ellipsoid"]), cloud(60, seed=5)
+    normal, ours, _ = evaluate("ellipsoid", radii, points)
+    for p, n, d in zip(points, normal, ours):
+        foot = p - d * n
+        assert ((foot / radii) ** 2).sum() == pytest.approx(1, abs=1e-9)  # on the surface
+        slope = foot / radii**2
+        np.testing.assert_allclose(n, slope / np.linalg.norm(slope), atol=1e-9)  # and at right angles to it
+        assert (d > 0) == (((p / radii) ** 2).sum() > 1)
+
+
+def inside_distance(kind, size, p):
+    """Minus the distance to the surface from inside, in closed form or by a scalar search."""
+    a, b, c = size
+    if kind == "sphere":
+        return np.linalg.norm(p) - a
+    if kind == "capsule":
+        return np.linalg.norm(p - [0, 0, np.clip(p[2], -b, b)]) - a
+    if kind == "cylinder":
+        return max(np.hypot(*p[:2]) - a, abs(p[2]) - b)
+    return max(abs(p) - size)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box"])
+def test_inside(kind):
+    points = cloud(2000)
+    _, ours, _ = evaluate(kind, SIZES[kind], points)
+    expected = np.array([inside_distance(kind, np.array(SIZES[kind]), p) for p in points])
+    inside = expected < 0
+    assert inside.sum() > 40
+    np.testing.assert_allclose(ours[inside], expected[inside], atol=1e-12)
+    np.testing.assert_array_equal(ours < 0, inside)
+
+
+def test_inside_ellipsoid():
+    """The nearest of very many points of the surface."""
+    radii = np.array(SIZES["ellipsoid"])
+    surface = trimesh.creation.icosphere(subdivisions=6).vertices * radii
+    points = cloud(200, 1.1)
+    inside = ((points / radii) ** 2).sum(1) < 0.98
+    _, ours, _ = evaluate("ellipsoid", radii, points[inside])
+    nearest = np.linalg.norm(points[inside][:, None] - surface[None], axis=2).min(1)
+    assert (ours < 0).all()
+    assert (-ours <= nearest + 1e-9).all()  # no surface point is nearer than the distance
+    np.testing.assert_allclose(-ours, nearest, atol=5e-3)  # the surface's points are 0.02 apart
+
+
+@pytest.mark.parametrize("kind", [*SIZES, "plane"])
+def test_normal_is_the_gradient(kind):
+    points = cloud(seed=1)
+    normal, d, bound = evaluate(kind, SIZES.get(kind, ()), points)
+    expected = gradient(kind, SIZES.get(kind, ()), points)
+    smooth = abs(np.linalg.norm(expected, axis=1) - 1) < 1e-6  # off the medial axis
+    assert smooth.mean() > 0.95
+    np.testing.assert_allclose(normal[smooth], expected[smooth], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+    assert (bound <= d + 1e-12).all()
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_rounding(kind):
+    """Outside, a rounded solid is the smaller one grown by r: MuJoCo's distance less r."""
+    r, points = 0.2, cloud(seed=2)
+    size = np.array(SIZES[kind])
+    size[: 3 if kind == "box" else 2] -= r
+    _, sharp, _ = evaluate(kind, SIZES[kind], points)
+    _, small, _ = evaluate(kind, size, points)
+    normal, rounded, _ = evaluate(kind, SIZES[kind], points, rounding=r)
+    np.testing.assert_allclose(rounded, small - r, atol=1e-12)
+    assert (rounded >= sharp - 1e-12).all()  # it loses its edges only
+    face = np.array([[0.51, 0, 0], [0.2, 0.1, 1.2]]) if kind == "box" else np.array([[0.61, 0, 0], [0.1, 0.1, 1.0]])
+    np.testing.assert_allclose(evaluate(kind, SIZES[kind], face, rounding=r)[1], evaluate(kind, SIZES[kind], face)[1], atol=1e-12)
+    smooth = rounded > 1e-6
+    np.testing.assert_allclose(normal[smooth], gradient(kind, SIZES[kind], points[smooth], rounding=r), atol=1e-5)
+
+
+def test_points_on_axes_have_a_normal():
+    """Centres and axes, where the direction is not unique, still give a unit normal and the right distance."""
+    for kind, depth in (("sphere", 0.8), ("capsule", 0.5), ("cylinder", 0.6), ("box", 0.5), ("ellipsoid", 0.5)):
+        normal, d, _ = evaluate(kind, SIZES[kind], np.zeros((1, 3)))
+        assert d[0] == pytest.approx(-depth, rel=1e-4)  # the ellipsoid's root is ill-conditioned at its very centre
+        assert np.linalg.norm(normal) == pytest.approx(1)
+
+
+def test_ellipsoid_far_and_flat():
+    """A needle and a far point: the distance by a search over the ellipse."""
+    radii, p = np.array([2e-3, 2e-3, 9e-3]), np.array([3e-3, 0, 10e-3])
+
+    def away(t):
+        return np.hypot(radii[0] * np.sin(t) - p[0], radii[2] * np.cos(t) - p[2])
+
+    expected = minimize_scalar(away, bounds=(0, np.pi / 2), method="bounded", options=dict(xatol=1e-12)).fun
+    _, d, _ = evaluate("ellipsoid", radii, p[None])
+    assert d[0] == pytest.approx(expected, rel=1e-9)
+
+
+# --- meshes -------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ring():
+    vert, face = indenter("ring_7mm").mesh()
+    return trimesh.Trimesh(vert, face, process=False), bake_distance_grid(vert, face)
+
+
+def test_ring_equals_trimesh(ring):
+    """Near the surface the distance is the triangles'; trimesh works in millimetres, as its tolerances are absolute."""
+    mesh, grid = ring
+    rng = np.random.default_rng(0)
+    on, index = trimesh.sample.sample_surface(mesh, 400, seed=1)
+    points = on + mesh.face_normals[index] * rng.uniform(-2e-4, 5e-5, (400, 1))
+    large = trimesh.Trimesh(mesh.vertices * 1e3, mesh.faces, process=False)
+    expected = -trimesh.proximity.signed_distance(large, points * 1e3) * 1e-3
+    normal, ours, bound = evaluate("mesh", (), points, grids=[grid])
+    near = expected < 0.25 * grid.spacing  # farther out only a bound is needed
+    assert near.sum() > 200
+    np.testing.assert_allclose(ours[near], expected[near], atol=2e-8)  # single precision of a few millimetres is 1e-7 of them
+    assert (bound <= expected + 1e-8).all()
+    assert ((ours > 0) == (expected > 0))[abs(expected) > 1e-8].all()
+    # normals lead away from the nearest point
+    closest, _, _ = trimesh.proximity.closest_point(large, points * 1e3)
+    away = (points * 1e3 - closest) * np.sign(expected)[:, None]
+    clear = near & (abs(expected) > 1e-5)
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    assert (np.einsum("ij,ij->i", away, normal)[clear] > 0.999).mean() > 0.98  # the rest lies at equal distance of two triangles
+
+
+def test_ring_has_a_hole(ring):
+    """A tunnel, not its convex hull: the middle of the ring is outside, by the radius of the hole."""
+    mesh, grid = ring
+    centre = mesh.bounding_box.centroid[None]
+    large = trimesh.Trimesh(mesh.vertices * 1e3, mesh.faces, process=False)
+    expected = -trimesh.proximity.signed_distance(large, centre * 1e3)[0] * 1e-3
+    _, d, _ = evaluate("mesh", (), centre, grids=[grid])
+    assert expected > 1e-4
+    assert d[0] == pytest.approx(expected, abs=0.5 * grid.spacing)  # from the grid
+
+
+def test_deep_inside_and_far_away():
+    cube = trimesh.creation.box(extents=[1e-2] * 3)
+    grid = bake_distance_grid(cube.vertices, cube.faces, cells=20)
+    points = np.array([[0, 0, 3e-3], [0, 3.5e-3, 1e-3], [1.0, 0, 0], [6e-3, 0, 0]])
+    normal, d, _ = evaluate("mesh", (), points, grids=[grid])
+    np.testing.assert_allclose(d[[0, 1, 3]], [-2e-3, -1.5e-3, 1e-3], atol=1e-6)
+    np.testing.assert_allclose(normal[:2], [[0, 0, 1], [0, 1, 0]], atol=1e-3)
+    assert d[2] > 0.9  # surely no contact
+
+
+def test_mesh_sphere_equals_sphere():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=3.5e-3)
+    grid = bake_distance_grid(ball.vertices, ball.faces, cells=24)
+    direction = np.random.default_rng(3).standard_normal((200, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = direction * np.random.default_rng(4).uniform(2.5e-3, 3.52e-3, (200, 1))
+    normal, d, _ = evaluate("mesh", (), points, grids=[grid])
+    sagitta = 3.5e-3 * (1 - np.cos(0.5 * ball.edges_unique_length.max() / 3.5e-3 * 2 / np.sqrt(3)))
+    near = d > -grid.spacing
+    np.testing.assert_allclose(d[near], (np.linalg.norm(points, axis=1) - 3.5e-3)[near], atol=1.5 * sagitta)
+    np.testing.assert_allclose(d, np.linalg.norm(points, axis=1) - 3.5e-3, atol=1.5 * sagitta + 0.05 * grid.spacing)
+    assert (np.einsum("ij,ij->i", normal, direction) > 0.998).all()  # facets lean by up to 2.3 degrees
+
+
+def test_two_meshes_keep_apart():
+    """Grids lie one after another in memory: the second geom sees its own."""
+    small, large = (trimesh.creation.box(extents=[s] * 3) for s in (4e-3, 8e-3))
+    grids = [bake_distance_grid(m.vertices, m.faces, cells=16) for m in (small, large)]
+    p = np.array([[0.0, 0, 3.95e-3]])
+    assert evaluate("mesh", (), p, grids=grids[:1])[1] == pytest.approx(1.95e-3, abs=2e-5)
+    both = GeomSet(["mesh", "sphere", "mesh"], [(), (1.0,), ()], grids=grids)
+    assert both.struct.grid.numpy().tolist() == [0, 0, 1]
+
+    out, bound = wp.zeros(1, dtype=wp.vec4d), wp.zeros(1, dtype=wp.float64)
+    both.struct.grid = wp.array([1], dtype=int)
+    wp.launch(_distances, dim=1, inputs=[both.struct, wp.array(p, dtype=wp.vec3d)], outputs=[out, bound], device="cpu")
+    assert out.numpy()[0, 3] == pytest.approx(-0.05e-3, abs=1e-8)
+
+
+# --- bad input ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_open_mesh():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    with pytest.raises(ValueError, match="the mesh is open: its inside is not defined; close its holes"):
+        bake_distance_grid(ball.vertices, ball.faces[1:])
+    with pytest.raises(ValueError, match="a mesh geom without faces has no distance field: give it a triangle mesh"):
+        bake_distance_grid(ball.vertices, np.zeros((0, 3), int))
+
+
+@pytest.mark.parametrize("arguments, text", [
+    (dict(types=["hfield"], sizes=[(1,)]), "geom type 'hfield' cannot touch the skin: use one of plane, sphere, capsule"),
+    (dict(types=["mesh"], sizes=[()]), r"every mesh geom needs one DistanceGrid: make it with bake_distance_grid\(vert, face\)"),
+    (dict(types=["sphere"], sizes=[(0.0,)]), r"a sphere of size \[0.0, 0.0, 0.0\] is not a solid: sizes must be positive and finite"),
+    (dict(types=["box"], sizes=[(1.0, 1.0)]), "a box of size .* is not a solid"),
+    (dict(types=["sphere"], sizes=[(float("nan"),)]), "is not a solid"),
+    (dict(types=["sphere"], sizes=[(1.0,)], friction=[-0.5]), r"friction \[-0.5\] must be finite and not negative"),
+    (dict(types=["sphere"], sizes=[(1.0,)], friction=[np.nan]), r"friction \[nan\] must be finite"),
+    (dict(types=["box"], sizes=[(1.0, 1.0, 1.0)], rounding=[2.0]), "rounding of a box is 2.0: a fillet's radius lies"),
+    (dict(types=["sphere"], sizes=[(1.0,)], rounding=[np.nan]), "rounding of a sphere is nan"),
+])  # fmt: skip
+def test_bad_geoms(arguments, text):
+    with pytest.raises(ValueError, match=text):
+        GeomSet(**arguments)
+
+
+def test_bad_poses():
+    geoms = GeomSet(["sphere"], [(1.0,)], nworld=2)
+    with pytest.raises(ValueError, match="geom positions contain NaN or infinite numbers: the simulation has diverged or a pose was"):
+        geoms.set_pose([[np.nan, 0, 0]])
+    with pytest.raises(ValueError, match="geom rotations contain NaN"):
+        geoms.set_pose([[0, 0, 0]], [np.full((3, 3), np.inf)])
+    with pytest.raises(ValueError, match=r"geom positions have shape \(3,\): expected \(1, 3\) or \(2, 1, 3\)"):
+        geoms.set_pose([0, 0, 0])
+    with pytest.raises(ValueError, match="geom friction coefficients contain NaN"):
+        geoms.set_friction([np.nan])
