@@ -210,4 +210,4 @@ def _host(array):
 
 
 def _leading(array: wp.array) -> np.ndarray:
-    return np.ascontiguousarray(np.swapaxes(array.numpy(), 0, 1))
+    return np.swapaxes(array.numpy(), 0, 1).copy()  # never a view: the next step would change what the caller keeps
