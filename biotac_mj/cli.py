@@ -7,6 +7,7 @@ __all__ = ["main", "parser"]
 
 # Names that the help shows without loading what defines them (tests hold them together).
 INDENTERS = "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm cube_14mm ring_7mm".split()
+TIERS = ("full", "condensed")
 MATERIALS = ("default", "paper", "rubber")
 SKINS = ("coarse", "default", "fine")
 
@@ -49,6 +50,7 @@ def _verb(verbs, name, run, text):
 
 def _add_skin(verb):
     verb.add_argument("--skin", default="default", help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`")
+    verb.add_argument("--tier", default="full", choices=TIERS, help="full finite elements, or the condensed skin for real time on one core")
     verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)"
@@ -103,6 +105,7 @@ def _press(args):
         material=args.material,
         liquid=args.liquid,
         skin=args.skin,
+        tier=args.tier,
         timestep=1e-3 * args.timestep,
         speed=1e-3 * args.speed,
         hold=1e-3 * args.hold,
@@ -141,6 +144,7 @@ def _view(args):
     _calm_warp()
     view.view(
         skin=args.skin,
+        tier=args.tier,
         material=args.material,
         liquid=args.liquid,
         seed=args.seed,

@@ -37,6 +37,7 @@ class PressOptions:
       material: name of a preset of the skin.
       liquid: whether there is liquid under the skin; None takes the material's choice.
       skin: "coarse", "default", "fine" or a file.
+      tier: of the skin's solution, "full" or "condensed".
       timestep: [s]. speed: of the indenter [m/s]. hold: rest at the end of the press and of the slide [s].
       two_way: a servo with mass pushes the indenter and gives way, instead of a prescribed path.
       friction: Coulomb coefficient; None takes the material's.
@@ -53,6 +54,7 @@ class PressOptions:
     material: str = "default"
     liquid: bool | None = None
     skin: str = "default"
+    tier: str = "full"
     timestep: float = 4e-3
     speed: float = 10e-3
     hold: float = 0.02
@@ -195,6 +197,7 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
         body="finger",
         prefix=_PREFIX,
         skin=options.skin,
+        tier=options.tier,
         material=options.material,
         liquid=chosen.liquid if options.liquid is None else options.liquid,
         coupling="two-way" if options.two_way else "one-way",

@@ -15,7 +15,7 @@ from .sensor.channels import CHANNELS
 
 __all__ = ["CSV_COLUMNS", "PressRecord", "replacing", "versions", "write_readings", "write_skin"]
 
-CSV_COLUMNS = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *CHANNELS, "nonconverged")
+CSV_COLUMNS = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *CHANNELS, "nonconverged", "tier")
 
 
 @dataclasses.dataclass
@@ -93,13 +93,14 @@ def versions() -> dict:
 
 
 def write_readings(record: PressRecord, path) -> None:
-    """readings.csv: a header (CSV_COLUMNS; channels are counts), then one row per saved step."""
+    """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved step."""
+    tier = record.parameters.get("tier", "full")
     rows = np.column_stack([record.time, record.depth, record.force])
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)
         for row, counts, nonconverged in zip(rows, record.counts, record.nonconverged):
-            writer.writerow([*(f"{value:.9g}" for value in row), *(f"{value:.6g}" for value in counts), int(nonconverged)])
+            writer.writerow([*(f"{value:.9g}" for value in row), *(f"{value:.6g}" for value in counts), int(nonconverged), tier])
 
 
 def write_skin(record: PressRecord, path) -> None:
@@ -122,6 +123,7 @@ def write_skin(record: PressRecord, path) -> None:
             file[name].attrs["unit"] = unit
         file["counts"].attrs["names"] = CHANNELS
         file.attrs["skin"] = geometry.name
+        file.attrs["tier"] = record.parameters.get("tier", "full")
         file.attrs["frame"] = "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x"
         file.attrs["parameters"] = json.dumps(record.parameters)
         file.attrs["versions"] = json.dumps(versions())

@@ -55,11 +55,11 @@ def build_scene(skin="default", **attach_options):
     return spec, handle
 
 
-def view(skin="default", material="default", liquid=None, seed=0, device="cpu", render=None, seconds=0.3):
+def view(skin="default", material="default", liquid=None, seed=0, device="cpu", tier="full", render=None, seconds=0.3):
     """Opens the viewer and steps in real time as far as the machine goes; or renders.
 
     Args:
-      skin, material, liquid, seed, device: see `biotac_mj.attach`; liquid None takes the material's choice.
+      skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's choice.
       render: path of a picture to write after `seconds` [s] instead.
 
     Raises:
@@ -70,7 +70,7 @@ def view(skin="default", material="default", liquid=None, seed=0, device="cpu", 
     if render is None and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ValueError("no display to open a window on: use `biotac view --render FILE.png`, or set DISPLAY")
     liquid = preset(material).liquid if liquid is None else liquid
-    spec, _ = build_scene(skin, material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device)
+    spec, _ = build_scene(skin, material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device, tier=tier)
     model = spec.compile()
     data = mujoco.MjData(model)
     if render is not None:

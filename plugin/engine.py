@@ -30,6 +30,7 @@ ATTRIBUTES = (
     "rounding",
     "friction",
     "priority",
+    "tier",
     "seed",
     "device",
     "options",

@@ -64,7 +64,7 @@ def test_model_carries_the_skins_parts():
     np.testing.assert_allclose(model.skin_vert, geometry.vert[node], atol=1e-7)
     assert model.body(handle.body).parentid == model.body("hand").id
     dims = {c: model.sensor(handle.sensor(c)).dim[0] for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")}
-    assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=4)
+    assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=5)
     # the rigid core's mesh lies where the geometry says, whatever frame MuJoCo stores it in
     mujoco.mj_forward(model, data)
     geom = model.geom("tip_core")
@@ -215,7 +215,7 @@ def test_plain_mjcf_loads_without_the_plugin():
         "import importlib.util, pathlib, mujoco\n"
         "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else pathlib.Path(r'{}')\n"
         "m = mujoco.MjModel.from_xml_path(str(folder / 'biotac.xml'))\n"
-        "assert m.nplugin == 0 and m.nsensordata == 54 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) < 1e-9\n"
+        "assert m.nplugin == 0 and m.nsensordata == 55 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) < 1e-9\n"
         "mujoco.MjModel.from_xml_path(str(folder / 'scene_press.xml'))\n"
     )
     import importlib.resources

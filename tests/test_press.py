@@ -195,11 +195,11 @@ def test_readings_are_read_back(synthetic_press, tmp_path):
     with open(tmp_path / "readings.csv") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *[f"e{i}" for i in range(1, 20)],
-                             "pdc", "pac", "tdc", "tac", "nonconverged"]  # fmt: skip
+                             "pdc", "pac", "tdc", "tac", "nonconverged", "tier"]  # fmt: skip
     assert len(rows) == 12
     assert np.allclose([float(row["force_y_N"]) for row in rows], synthetic_press.force[:, 1], rtol=1e-8)
     assert np.array_equal([[float(row[name]) for name in CHANNELS] for row in rows], synthetic_press.counts)
-    assert rows[-1]["nonconverged"] == "1" and list(tmp_path.iterdir()) == [tmp_path / "readings.csv"]
+    assert rows[-1]["nonconverged"] == "1" and rows[-1]["tier"] == "full" and list(tmp_path.iterdir()) == [tmp_path / "readings.csv"]
 
 
 def test_skin_is_read_back(synthetic_press, tmp_path):

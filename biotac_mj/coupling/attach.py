@@ -42,7 +42,8 @@ class Handle:
 
     def read(self, data, channel) -> np.ndarray:
         """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m] on the BioTac in its frame;
-        status is (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual)."""
+        status is (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier:
+        0 full, 1 condensed)."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
 
@@ -64,6 +65,7 @@ def attach(
     seed=0,
     device="cpu",
     stepper="fem",
+    tier="full",
     readings="biotac",
     options=None,
     slots=None,
@@ -78,7 +80,7 @@ def attach(
       prefix: of every name it adds, so that a model may hold several.
       skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
-      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, readings, options: see `Config`.
+      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings, options: see `Config`.
 
     Raises:
       ValueError: unknown site, body, coupling, geom or skin; the prefix is taken; site and body both given.
@@ -87,7 +89,7 @@ def attach(
     _check_place(spec, site, body, prefix)
     text, geometry = skins.reference(skin)
     config = Config(
-        skin=text, stepper=stepper, readings=readings, material=material, liquid=bool(liquid), coupling=coupling, geoms=geoms,
+        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=bool(liquid), coupling=coupling, geoms=geoms,
         rounding=dict(rounding or {}), priority=int(priority), seed=int(seed), device=device, options=dict(options or {}),
         **({} if friction is None else {"friction": float(friction)}),
     )  # fmt: skip

@@ -3,9 +3,10 @@
 import dataclasses
 import json
 
-__all__ = ["COUPLINGS", "Config"]
+__all__ = ["COUPLINGS", "TIERS", "Config"]
 
 COUPLINGS = ("two-way", "one-way")
+TIERS = ("full", "condensed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,6 +16,8 @@ class Config:
     Attributes:
       skin: name or file of the `SkinGeometry`.
       stepper: what solves the skin: a name known to `biotac_mj.coupling.stepper`.
+      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/condensed.md); the number of its place in TIERS is in
+        the status sensor.
       readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
       material: name of the skin's material or a dict of its parameters; None is the default one.
       liquid: whether the space between skin and core is filled.
@@ -31,6 +34,7 @@ class Config:
 
     skin: str = "default"
     stepper: str = "fem"
+    tier: str = "full"
     readings: str = "biotac"
     material: str | dict | None = None
     liquid: bool = True
@@ -46,6 +50,10 @@ class Config:
     def __post_init__(self):
         if self.coupling not in COUPLINGS:
             raise ValueError(f"unknown coupling {self.coupling!r}: choose one of {', '.join(COUPLINGS)}")
+        if self.tier not in TIERS:
+            raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
+        if self.tier != "full" and self.stepper != "fem":
+            raise ValueError(f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: leave one of them out")
         if not self.friction >= 0:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
         if self.geoms is not None:

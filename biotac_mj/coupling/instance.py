@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from . import skins
-from .config import Config
+from .config import TIERS, Config
 from .metric import Metric
 from .stepper import make_readings, make_stepper
 from .touching import Touching
@@ -24,7 +24,7 @@ __all__ = ["Instance", "Setup", "reset_state", "state_size"]
 _HEAD = 4
 _MODEL = 6 + 36 + 3 + 9  # of a touching body: wrench, tangent, and the pose they belong to
 _FAILED, _CONVERGED, _ITERATIONS, _RESIDUAL = range(_HEAD)
-STATUS = ("converged", "failed_steps", "iterations", "residual")
+STATUS = ("converged", "failed_steps", "iterations", "residual", "tier")
 
 
 class _Skin:
@@ -132,6 +132,7 @@ class Instance:
             for name, i in sensors.items()
             if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
         }
+        self._tier = TIERS.index(setup.config.tier)
         self.two_way = setup.config.coupling == "two-way"
         if self.two_way:
             slots = sorted((int(n[6:]), i) for n, i in setup.named("eq").items() if n.startswith("couple") and n[6:].isdigit())
@@ -213,7 +214,7 @@ class Instance:
             out[self.sensor["contact_force"]] = -result.wrench.sum(axis=0)
         if "status" in self.sensor:
             failed = self.state[_FAILED] + (not result.converged)
-            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual)
+            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual, self._tier)
 
     def failed(self):
         """After an exception: the step's skin is unknown; the status sensor says -1."""
@@ -222,7 +223,7 @@ class Instance:
 
     def _flag(self):
         if "status" in self.sensor:
-            self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan)
+            self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan, self._tier)
 
     def advance(self):
         """Commits the solved step."""

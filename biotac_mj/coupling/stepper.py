@@ -114,6 +114,7 @@ class _NoReadings:
 
 # A name, or where to find the factory the first time the name is used.
 _steppers = {"fem": "biotac_mj.coupling.fem:FemStepper"}
+_tiers = {"condensed": "biotac_mj.coupling.condensed:CondensedStepper"}  # instead of "fem"
 _readings = {"biotac": "biotac_mj.coupling.readings:SensorReadings", "none": _NoReadings}
 
 
@@ -144,12 +145,14 @@ def check_names(config):
 
 
 def make_stepper(config, geometry, geoms) -> SkinStepper:
-    """The skin that `config.stepper` names.
+    """The skin that `config.stepper` names, of the tier that `config.tier` names.
 
     Raises:
       ValueError: the name is unknown.
     """
     check_names(config)
+    if config.tier in _tiers:
+        return _factory(_tiers, config.tier)(config, geometry, geoms)
     return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 

@@ -1,0 +1,97 @@
+"""The real-time tier as the coupling sees it: `skin.condensed` behind the protocol of a SkinStepper."""
+
+import functools
+
+import numpy as np
+
+from ..skin.condensed import CondensedSkin, Memory
+from .fem import FemStepper
+from .stepper import SkinResult
+
+__all__ = ["CondensedStepper"]
+
+_MAX_FORCES, _MAX_CONTACTS = 1024, 2048
+
+
+class CondensedStepper(FemStepper):
+    """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
+
+    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening, poses of the geoms, contact forces (how
+    many, then coordinate and force of each) and sticking contacts (how many, then sample, geom and anchor of each).
+    """
+
+    def __init__(self, config, geometry, geoms):
+        super().__init__(config, geometry, geoms)
+        g = len(geoms)
+        sizes = {
+            "head": 4,
+            "geom_pos": 3 * g,
+            "geom_mat": 9 * g,
+            "forces": 1 + 2 * _MAX_FORCES,
+            "contacts": 1 + 5 * _MAX_CONTACTS,
+        }
+        ends = np.cumsum(list(sizes.values()))
+        self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self.nstate = int(ends[-1])
+
+    @functools.cached_property
+    def _skin(self):
+        return CondensedSkin(self._model, self._geom_set)
+
+    def reset(self, state):
+        state[:] = 0
+        self._write(state, Memory.rest(len(self._geoms)))
+
+    def vert_xpos(self, state):
+        return self._geometry.vert + self._skin.displacement(self._read(state))
+
+    def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
+        """See `SkinStepper`.
+
+        Raises:
+          ValueError: NaN in a pose, a geom deep inside the core, or more contact than the state can hold.
+        """
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat)
+        new = np.zeros_like(state)
+        self._write(new, out.memory)
+        return SkinResult(
+            state=new,
+            wrench=out.wrench,
+            tangent=out.tangent,
+            vert_xpos=out.vert_xpos,
+            pressure=out.memory.pressure,
+            converged=out.converged,
+            iterations=out.iterations,
+            residual=out.error,
+        )
+
+    def _read(self, state) -> Memory:
+        started, pressure, bulge, softening = self._part(state, "head").tolist()
+        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
+        n, k = int(forces[0]), int(contacts[0])
+        return Memory(
+            started=bool(started),
+            coordinate=forces[1 : 1 + n].astype(int),
+            force=forces[1 + n : 1 + 2 * n].copy(),
+            pressure=pressure,
+            bulge=bulge,
+            softening=softening,
+            geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
+            geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
+            contacts=contacts[1 : 1 + 5 * k].reshape(k, 5),
+        )
+
+    def _write(self, state, memory):
+        n, k = len(memory.coordinate), len(memory.contacts)
+        if n > _MAX_FORCES or k > _MAX_CONTACTS:
+            raise ValueError(
+                f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and {_MAX_FORCES}: "
+                "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
+            )
+        self._part(state, "head")[:] = memory.started, memory.pressure, memory.bulge, memory.softening
+        self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
+        self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
+        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
+        forces[0], contacts[0] = n, k
+        forces[1 : 1 + n], forces[1 + n : 1 + 2 * n] = memory.coordinate, memory.force
+        contacts[1 : 1 + 5 * k] = memory.contacts.ravel()
