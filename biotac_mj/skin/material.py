@@ -20,6 +20,7 @@ __all__ = ["LAWS", "PRESETS", "Material", "material"]
 wp.set_module_options({"enable_backward": False})
 
 LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
+ELEMENTS = ("linear", "quadratic")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Material:
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
       liquid: whether the preset fills the space between skin and core with the liquid.
+      element: what the preset is solved with, "linear" or "quadratic", see `SkinOptions`.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -44,10 +46,13 @@ class Material:
     friction: float = 0.783414394
     density: float = 1000.0
     liquid: bool = True
+    element: str = "linear"
 
     def __post_init__(self):
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
+        if self.element not in ELEMENTS:
+            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}")
         for name in ("youngs_modulus", "poissons_ratio", "friction", "density"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
@@ -77,12 +82,13 @@ class Material:
         return self.youngs_modulus / (3 * (1 - 2 * self.poissons_ratio))
 
 
-# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("rubber"; nu 0.5 there: linear
-# tetrahedra lock, so 0.45 here, the value of the reference solutions).
+# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys": nu 0.5 there, 0.4999 here, on
+# elements that do not lock; "rubber": nu 0.45, the value of the reference solutions, on linear ones).
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False),
     "rubber": Material("neo_hookean", 2.80e5, 0.45, 0.186),
+    "ansys": Material("neo_hookean", 2.80e5, 0.4999, 0.186, element="quadratic"),
 }
 
 

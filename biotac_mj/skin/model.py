@@ -11,7 +11,8 @@ from ..geometry.skin_geometry import SkinGeometry
 from . import contact, elasticity, liquid
 from .factor import DenseFactor, SparseFactor
 from .geoms import GeomSet
-from .material import LAWS, Material, material
+from .material import ELEMENTS, LAWS, Material, material
+from .quadratic import QuadraticTetrahedra, quadratic
 from .shapes import bake_distance_grid
 from .types import real, vec3
 
@@ -23,6 +24,8 @@ class SkinOptions:
     """How the skin is solved.
 
     Attributes:
+      element: "linear" (four nodes), "quadratic" (ten nodes: does not lock; every edge gets a node behind the geometry's own, see
+        `quadratic.quadratic`); None takes the material's choice.
       dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
       liquid: fills the space between skin and core; None takes the material preset's choice.
       bulk_modulus: of the liquid [Pa]; water has 2.2e9.
@@ -55,10 +58,13 @@ class SkinOptions:
     tolerance: float = 1e-3
     max_newton: int = 30
     max_cg: int = 40
+    element: str | None = None
 
     def __post_init__(self):
         if self.dynamics not in ("quasistatic", "implicit"):
             raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
+        if self.element not in (None, *ELEMENTS):
+            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the material's choice")
         for name in ("bulk_modulus", "stick_ratio", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -96,13 +102,16 @@ class Surface:
 class SkinModel:
     """Constants of a skin on one device.
 
+    With quadratic elements `geometry` is the refined one: the nodes of the given geometry come first and keep their numbers, so
+    `vert_xpos[:, :given.nvert]` fits it; a node on each edge follows. `nelem` counts the given tetrahedra.
+
     Args:
       geometry: the skin.
       material: a preset's name or a Material.
       options: SkinOptions.
       device: "cpu" or a CUDA device of Warp.
-      fixed: (n,) nodes that do not move, instead of the geometry's.
-      core_faces: (n,) inner faces that can meet the core, instead of all that start clear of it.
+      fixed: (n,) nodes of the given geometry that do not move, instead of its own.
+      core_faces: (n,) inner faces of the given geometry that can meet the core, instead of all that start clear of it.
 
     Raises:
       ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed.
@@ -117,26 +126,34 @@ class SkinModel:
         fixed=None,
         core_faces=None,
     ):
-        self.geometry = geometry
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
         self.device = wp.get_device(device)
         self._cores = {}
         self.law = LAWS[self.material.law]
-        vert, elem = geometry.vert, geometry.elem
+        vert = geometry.vert
         if not np.isfinite(vert).all():
             raise ValueError(
                 f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh"
             )
+        self.element = self.options.element or self.material.element
+        elem = geometry.elem
+        if fixed is not None:
+            geometry = dataclasses.replace(geometry, fixed=fixed)
+        if self.element == "quadratic":
+            geometry, elem = quadratic(geometry)
+            core_faces = None if core_faces is None else (4 * np.asarray(core_faces)[:, None] + np.arange(4)).ravel()
+        self.geometry, vert = geometry, geometry.vert
         self.nvert, self.nelem = len(vert), len(elem)
-        self.fixed = np.asarray(geometry.fixed if fixed is None else fixed, int)
+        self.fixed = geometry.fixed.astype(int)
         if not len(self.fixed):
             raise ValueError(f"skin {geometry.name!r} has no fixed nodes: it would float away; fix those on core, nail and clamp")
         self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
         self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
 
-        self.elasticity = elasticity.LinearTetrahedra(vert, elem, self.law, self.device)
+        formulation = QuadraticTetrahedra if self.element == "quadratic" else elasticity.LinearTetrahedra
+        self.elasticity = formulation(vert, elem, self.law, self.device)
         mask = np.zeros(self.nvert)
         mask[self.free] = 1
         with wp.ScopedDevice(self.device):
