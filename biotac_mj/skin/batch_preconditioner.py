@@ -76,12 +76,12 @@ class BatchPreconditioner:
             for corner in range(3):
                 flag.index_add_(0, face[:, corner], wp.to_torch(state.touching))
         touched = (flag > 0) & (self.free_index[:-1, None] >= 0)
-        slot = torch.cumsum(touched, 0) - 1
+        slot = (torch.cumsum(touched.T.contiguous(), 1, dtype=torch.int32) - 1).T
         count = int(touched.sum(0).max())
         m = -(-count // _PAD) * _PAD
         slot = torch.where(touched, slot, m)  # slot m catches what is not touched
         nodes = torch.full((m + 1, nworld), self.nvert, device=self.device)
-        nodes.scatter_(0, slot, torch.arange(self.nvert, device=self.device)[:, None].expand(-1, nworld))
+        nodes.scatter_(0, slot.long(), torch.arange(self.nvert, device=self.device)[:, None].expand(-1, nworld))
         self.nodes = nodes[:m].T.contiguous()  # (nworld, m), nvert where unused
         self.size = 3 * m + (gradient is not None)
         if not self.size:
@@ -121,7 +121,7 @@ class BatchPreconditioner:
         if m:
             local = self.free_index[self.nodes].clamp_min(0)
             block = self._inverse[local[:, :, None], :, local[:, None, :], :]  # (nworld, m, m, 3, 3)
-            W[:, : 3 * m, : 3 * m] = block.transpose(2, 3).reshape(nworld, 3 * m, 3 * m)
+            W[:, : 3 * m, : 3 * m] = block.transpose(2, 3).reshape(nworld, 3 * m, 3 * m).float() * self.factor.scale
             W[:, : 3 * m, : 3 * m] *= self.used[:, :, None] * self.used[:, None, :]
         if self.gradient is not None:
             along = self.factor.solve(self.gradient)

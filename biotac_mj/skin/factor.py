@@ -69,35 +69,37 @@ class SparseFactor:
 
 
 class DenseFactor:
-    """The dense inverse in single precision on a CUDA device (torch)."""
+    """The dense inverse on a CUDA device (torch), rounded to half precision; sums are in single precision.
+
+    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs nothing as long as
+    everything is computed from the same rounded entries. Rounding the right-hand side would cost: contact makes results that are
+    small differences of large ones. So it travels as a sum of two halves, 22 bits in all.
+    """
 
     def __init__(self, stiffness, free, vert, device):
         import torch
 
-        self._device = wp.device_to_torch(device)
+        self._torch, self._device = torch, wp.device_to_torch(device)
         self.size = stiffness.shape[0]
         matrix = torch.tensor(stiffness.toarray(), device=self._device)
-        self.inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).float()
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix))
+        self.scale = float(inverse.abs().max())
+        self.inverse = (inverse / self.scale).half()
         self._free = torch.as_tensor(free, device=self._device)
-        self._index = np.full(len(vert), -1)
-        self._index[free] = np.arange(len(free))
 
     def solve(self, rhs):
-        out = rhs.new_zeros(rhs.shape)
+        """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""
         nworld = rhs.shape[1]
         b = rhs[self._free].movedim(1, 2).reshape(self.size, nworld)
         scale = b.abs().amax(0).clamp_min(1e-300)
-        x = (self.inverse @ (b / scale).float()).double() * scale
-        out[self._free] = x.reshape(-1, 3, nworld).movedim(2, 1)
+        b = (b / scale).float()
+        high = b.half()
+        halves = self._torch.cat([high, ((b - high) * 2048).half()], 1)
+        x = self._torch.mm(self.inverse, halves, out_dtype=self._torch.float32)
+        x = x[:, :nworld].double() + x[:, nworld:] / 2048
+        out = rhs.new_zeros(rhs.shape)
+        out[self._free] = (x * (scale * self.scale)).reshape(-1, 3, nworld).movedim(2, 1)
         return out
-
-    def rows(self, nodes):
-        return self.inverse[self.dof(nodes)]
-
-    def dof(self, nodes):
-        import torch
-
-        return torch.as_tensor((3 * self._index[nodes][:, None] + np.arange(3)).ravel(), device=self._device)
 
 
 def _bisection_order(points: np.ndarray) -> np.ndarray:
