@@ -12,7 +12,7 @@ from .types import vec3
 
 __all__ = ["step"]
 
-_BALANCED = 1e-9  # [N] of residual on every node: rounding, where nothing touches
+_BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = 0.01
 _PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
@@ -119,7 +119,9 @@ class _Step:
             residual = self.force * self.mask
             finite = np.isfinite(_host(residual.sum((0, 2))))
             states = self._contacts()
-            if not any(view(s.touching).any() for s in states) and abs(residual).max() < _BALANCED:
+            touched = np.logical_or.reduce([_host(view(s.touching).any(0)) for s in states])
+            at_rest = ~touched & (_host((residual * residual).sum((0, 2))) < _BALANCED**2)
+            if at_rest.all():
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
                 return asked
@@ -129,7 +131,7 @@ class _Step:
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
-            active = asked & finite & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
+            active = asked & finite & ~at_rest & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
             if not active.any() or iteration == options.max_newton:
                 break
             d.iterations += active
@@ -274,14 +276,28 @@ class _Step:
             dx += chosen[:, None] * p
         return dx
 
+    def _hold(self, failed):
+        """Puts worlds that did not converge back to where the step began, geoms too, so that forces and contacts are the last good ones.
+
+        Returns what has to be written back when the step is over: the poses as they were set.
+        """
+        if not len(failed):
+            return []
+        struct, poses = self.geoms.struct, []
+        for array, last in ((struct.pos, struct.pos_last), (struct.mat, struct.mat_last)):
+            poses.append((array, _copy(view(array))))
+            for w in failed:
+                view(array)[:, w] = view(last)[:, w]
+        for w in failed:
+            self.x[:, w] = self.start[:, w]
+        self._evaluate()
+        return poses
+
     def _finish(self, good):
         d = self.d
         d.converged = good
         d.nonconverged += ~good
-        if not good.all():
-            for w in np.flatnonzero(~good):
-                self.x[:, w] = self.start[:, w]
-            self._evaluate()
+        poses = self._hold(np.flatnonzero(~good))
         groups = self.geoms.ngroup
         wrench = wp.zeros((groups, d.nworld, 6), dtype=wp.float64, device=self.m.device)
         if groups:
@@ -295,6 +311,8 @@ class _Step:
         d.motion = self._motion()
         view(d.increment)[...] = self.x - self.start
         self.geoms.advance()
+        for array, now in poses:
+            view(array)[...] = now
         wp.copy(d.x_last, d.x)
         if self.inertia is not None:
             pos, mat = self.pose
