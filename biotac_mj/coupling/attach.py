@@ -56,7 +56,7 @@ def attach(
     prefix="biotac_",
     skin="default",
     material=None,
-    liquid=True,
+    liquid=None,
     coupling="two-way",
     geoms=None,
     rounding=None,
@@ -80,6 +80,7 @@ def attach(
       prefix: of every name it adds, so that a model may hold several.
       skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
+      liquid, friction: None takes the material's choice.
       material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings, options: see `Config`.
 
     Raises:
@@ -88,8 +89,10 @@ def attach(
     """
     _check_place(spec, site, body, prefix)
     text, geometry = skins.reference(skin)
+    if stepper == "fem":
+        liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
-        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=bool(liquid), coupling=coupling, geoms=geoms,
+        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=liquid is None or bool(liquid), coupling=coupling, geoms=geoms,
         rounding=dict(rounding or {}), priority=int(priority), seed=int(seed), device=device, options=dict(options or {}),
         **({} if friction is None else {"friction": float(friction)}),
     )  # fmt: skip
@@ -112,6 +115,14 @@ def attach(
     if config.coupling == "two-way":
         _add_slots(spec, core, prefix, slots)
     return Handle(prefix, core.name, config)
+
+
+def _material_choices(material, liquid, friction):
+    from ..skin.material import Material
+    from ..skin.material import material as preset
+
+    chosen = Material(**material) if isinstance(material, dict) else preset(material or "default")
+    return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction
 
 
 def _check_place(spec, site, body, prefix):
