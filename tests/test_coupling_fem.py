@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import biotac_mj
-from biotac_mj.geometry import asset_path, indenter
+from biotac_mj.geometry import indenter
 
 G = 9.81
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -31,7 +31,8 @@ def no_errors():
 def scene(bodies, timestep=0.002, gravity="0 0 -9.81", finger='<body name="finger"/>', **settings):
     """A BioTac, pad up, its highest point over the origin."""
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="implicitfast"/><worldbody>{finger}{bodies}</worldbody></mujoco>'
+        f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="implicitfast"/>'
+        f"<worldbody>{finger}{bodies}</worldbody></mujoco>"
     )
     handle = biotac_mj.attach(spec, body="finger", quat=PAD_UP, pos=APEX, **(dict(skin="coarse", readings="none") | settings))
     model = spec.compile()
@@ -102,3 +103,274 @@ def test_a_ball_reads_its_weight(mass, timestep):
 @pytest.mark.parametrize("mass", [0.001, 0.01, 0.1, 1.0])
 def test_a_ball_reads_its_weight_on_the_default_skin(mass, timestep, liquid):
     check_weight(mass, timestep, skin="default", liquid=liquid)
+
+
+@pytest.mark.parametrize("timestep", [0.001, 0.004])
+def test_a_ball_sticks_and_slips_at_mu(timestep):
+    """Pressed by 0.3 N and pushed along the finger, where the pad is flat to 2 degrees."""
+    mass, load, mu = 0.03, 0.3, 0.4
+    joints = UPRIGHT.format(3) + '<joint name="x" type="slide" axis="1 0 0" damping="1"/>'
+    model, data, handle = scene(ball(mass, joints), timestep, friction=mu)  # MuJoCo's rule: the larger friction counts
+    data.qfrc_applied[0] = mass * G - load
+    mujoco.mj_step(model, data, int(0.1 / timestep))
+    for share in np.linspace(0, 0.85, int(0.05 / timestep)):
+        data.qfrc_applied[1] = -share * mu * load
+        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, int(0.05 / timestep))
+    start = data.qpos[1]
+    mujoco.mj_step(model, data, int(0.05 / timestep))
+    assert abs(data.qpos[1] - start) < 2e-6  # sticks: creeps less than 40 um/s
+    force = handle.read(data, "contact_force")
+    assert force[0] == pytest.approx(-0.85 * mu * load, rel=0.01)
+    data.qfrc_applied[1] = -1.4 * mu * load
+    mujoco.mj_step(model, data, int(0.02 / timestep))
+    ratio = []
+    for _ in range(int(0.03 / timestep)):
+        mujoco.mj_step(model, data)
+        force = handle.read(data, "contact_force")
+        ratio.append(np.hypot(force[0], force[2]) / force[1])
+    assert data.qvel[1] < -0.01
+    assert np.mean(ratio) == pytest.approx(mu, rel=0.05)  # what the pad's slope leaves: tan(1 degree) / mu
+
+
+def momentum(model, data):
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_comVel(model, data)
+    linear, angular = np.zeros(3), np.zeros(3)
+    for b in range(1, model.nbody):
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
+        axes = data.ximat[b].reshape(3, 3)
+        linear += model.body_mass[b] * velocity[3:]
+        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (model.body_inertia[b] * (axes.T @ velocity[:3]))
+    return linear, angular
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.002])
+@pytest.mark.parametrize("masses", [(0.02, 0.005), (0.05, 0.05)])
+def test_momentum_of_a_free_finger_and_a_ball_is_conserved(masses, timestep):
+    """A spinning ball hits a free finger beside its centre and slides."""
+    finger = f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" {GHOST}/></body>'
+    model, data, handle = scene(ball(masses[1], pos=(0.002, 0.001, TOP + RADIUS + 2e-4)), timestep, "0 0 0", finger, friction=0.3)
+    # MuJoCo's own step of a free body errs where its centre of mass is off its joint or its inertia has unequal axes: not what is tested
+    core = model.body("biotac_core").id
+    model.body_ipos[core] = [-APEX[0], 0, 0]
+    model.body_inertia[core] = model.body_inertia[core].mean()
+    mujoco.mj_setConst(model, data)
+    data.qvel[6:] = [0.1, 0.05, -0.3, 3, 4, 2]
+    linear, angular = momentum(model, data)
+    touched = 0
+    for _ in range(int(0.03 / timestep)):
+        mujoco.mj_step(model, data)
+        touched += handle.read(data, "contact_force").any()
+    after = momentum(model, data)
+    assert touched >= 2 and np.linalg.norm(data.qvel[:3]) > 0.01  # there was something to conserve
+    assert np.linalg.norm(after[0] - linear) < 1e-3 * np.linalg.norm(linear)
+    assert np.linalg.norm(after[1] - angular) < 1e-3 * np.linalg.norm(angular)
+
+
+def pinch(timestep, friction, mass=0.02, grip=2.0):
+    """Two BioTacs face each other, pads 16 mm apart with a ball between; gravity along the fingers, towards their tips."""
+    fingers = "".join(
+        f'<body name="finger{i}" pos="0 0 {z}"><joint name="f{i}" type="slide" axis="0 0 {s}" damping="5"/>'
+        f'<geom size=".003" mass=".05" {GHOST}/></body>'
+        for i, (z, s) in enumerate(((-TOP - RADIUS, 1), (TOP + RADIUS, -1)))
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" integrator="implicitfast"/><worldbody>{fingers}'
+        f"{ball(mass, pos=(0, 0, 0), friction=0)}</worldbody>"
+        '<actuator><motor joint="f0"/><motor joint="f1"/></actuator></mujoco>'
+    )
+    handles = [
+        biotac_mj.attach(spec, body=f"finger{i}", quat=quat, pos=APEX, prefix=f"b{i}_", skin="coarse", readings="none", friction=friction)
+        for i, quat in enumerate((PAD_UP, PAD_DOWN))
+    ]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = grip
+    return model, data, handles
+
+
+def in_world(model, data, handle):
+    return data.xmat[model.body(handle.body).id].reshape(3, 3) @ handle.read(data, "contact_force")[:3]
+
+
+@pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])
+def test_a_pinch_holds_a_ball_against_gravity(timestep):
+    """1 N from each side; the weight is 0.28 of the friction there is."""
+    mass, grip = 0.02, 1.0
+    model, data, handles = pinch(timestep, 0.35, mass, grip)
+    mujoco.mj_step(model, data, int(0.15 / timestep))
+    start = data.body("ball").xpos.copy()
+    total = np.zeros(3)
+    for _ in range(int(0.1 / timestep)):
+        mujoco.mj_step(model, data)
+        total += sum(in_world(model, data, handle) for handle in handles) / int(0.1 / timestep)
+    moved = data.body("ball").xpos - start
+    assert abs(moved[0]) < 1e-4  # held: in free fall it would have gone 49 mm
+    np.testing.assert_allclose(total, [-mass * G, 0, 0], atol=0.01 * mass * G)
+    for handle in handles:
+        assert handle.read(data, "contact_force")[1] == pytest.approx(grip, rel=0.02)
+
+
+def test_without_friction_the_pinched_ball_falls():
+    model, data, _ = pinch(0.004, 0.0, grip=1.0)
+    mujoco.mj_step(model, data, 12)
+    assert data.body("ball").xpos[0] < -0.5 * 0.5 * G * 0.048**2  # at least half of free fall
+
+
+def two_biotacs(**settings):
+    """Two BioTacs side by side, a ball sliding on each; the balls are light and not in the same state."""
+    bodies = "".join(ball(0.002 * (i + 1), pos=(0.04 * i, 0, TOP + RADIUS - 2e-5), name=f"ball{i}") for i in range(2))
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>{bodies}</worldbody></mujoco>'
+    )
+    for i in range(2):
+        settings = dict(skin="coarse", friction=0.3, seed=i) | settings
+        biotac_mj.attach(spec, pos=[APEX[0] + 0.04 * i, 0, 0], quat=PAD_UP, prefix=f"b{i}_", **settings)
+    return spec.compile()
+
+
+def start(model, speed=0.05):
+    data = mujoco.MjData(model)
+    data.qvel[0], data.qvel[7] = speed, 0.7 * speed
+    return data
+
+
+@pytest.fixture(scope="module", params=["quasistatic", "implicit"])
+def both(request):
+    """The whole sensor, counts with noise and all, on both dynamics."""
+    return two_biotacs(readings="biotac", options={"skin": {"dynamics": request.param}})
+
+
+def test_replay_copies_and_reset_are_bit_equal(both):
+    data = start(both)
+    mujoco.mj_step(both, data, 3)
+    saved = state_of(both, data)
+    copied = mujoco.MjData(both)
+    mujoco.mj_copyData(copied, both, data)
+    mujoco.mj_step(both, data, 4)
+    assert all(data.sensor(f"b{i}_contact_force").data[1] > 0.005 for i in range(2)) and data.sensor("b0_electrodes").data.all()
+
+    def same(other):
+        assert np.array_equal(other.qpos, data.qpos) and np.array_equal(other.qvel, data.qvel)
+        assert np.array_equal(other.sensordata, data.sensordata) and np.array_equal(state_of(both, other), state_of(both, data))
+
+    restored = mujoco.MjData(both)
+    mujoco.mj_setState(both, restored, saved, STATE)
+    for other in (restored, copied):
+        mujoco.mj_step(both, other, 4)
+        same(other)
+    mujoco.mj_resetData(both, restored)
+    assert np.array_equal(restored.plugin_state, mujoco.MjData(both).plugin_state)
+    restored.qvel[:] = start(both).qvel
+    mujoco.mj_step(both, restored, 7)
+    same(restored)
+
+
+def test_rollout_with_two_threads_equals_the_loop(both):
+    starts = np.stack([state_of(both, start(both, 0.02 * i), FULL) for i in range(3)])
+    states, sensors = mujoco.rollout.rollout(both, [mujoco.MjData(both), mujoco.MjData(both)], starts, nstep=5)
+    for i in range(3):
+        data = mujoco.MjData(both)
+        mujoco.mj_setState(both, data, starts[i], FULL)
+        for k in range(5):
+            mujoco.mj_step(both, data)
+            assert np.array_equal(states[i, k], state_of(both, data, FULL))
+            assert np.array_equal(sensors[i, k], data.sensordata)
+
+
+def test_biotacs_of_equal_settings_do_not_read_each_other():
+    """They share the skin's constants and working memory, not what they read."""
+    model = two_biotacs(readings="biotac", seed=0)
+    untouched = mujoco.MjData(model)
+    untouched.qpos[[2, 9]] = 1.0
+    pressed = mujoco.MjData(model)
+    pressed.qpos[2] = 1.0
+    counts = []
+    for data in (untouched, pressed):
+        mujoco.mj_step(model, data, 6)
+        counts.append([data.sensor(f"b{i}_electrodes").data.copy() for i in range(2)])
+    assert np.array_equal(counts[0][0], counts[0][1])  # equal seeds, equal noise
+    assert np.array_equal(counts[0][0], counts[1][0])  # lies first, was not pressed
+    assert not np.array_equal(counts[0][1], counts[1][1])
+
+
+def test_one_way_reads_and_leaves_the_dynamics_alone():
+    bodies = ball(0.01) + f'<geom type="plane" size="1 1 .1" pos="0 0 {TOP - 3e-4}" friction="0.5"/>'
+    reading, data, handle = scene(bodies, coupling="one-way")
+    deaf, plain, _ = scene(bodies, coupling="one-way", geoms=[])
+    data.qvel[0] = plain.qvel[0] = 0.02
+    for _ in range(40):
+        mujoco.mj_step(reading, data)
+        mujoco.mj_step(deaf, plain)
+        assert np.array_equal(data.qpos, plain.qpos) and np.array_equal(data.qvel, plain.qvel) and np.array_equal(data.qacc, plain.qacc)
+    assert handle.read(data, "contact_force")[1] > 0.05  # it did read
+
+
+def pressing(shape, timestep=0.002, **settings):
+    """A geom on a mocap body; it moves with data.mocap_pos[0], which starts over the pad without touching it."""
+    return scene(f'<body name="probe" mocap="true" pos="0 0 .03">{shape}</body>', timestep, **settings)
+
+
+def test_a_geom_deep_in_the_core_is_named_and_survived():
+    model, data, handle = pressing(f'<geom name="probe" type="sphere" size="{RADIUS}"/>')
+    mujoco.mj_step(model, data)
+    good = data.plugin_state.copy()
+    data.mocap_pos[0, 2] = 0.0
+    with pytest.warns(RuntimeWarning, match="inside the rigid core"):
+        mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[0] == -1
+    assert np.array_equal(data.plugin_state, good)
+    with pytest.raises(ValueError, match=r"\(sphere\) is .* mm inside the rigid core: .* press less deep"):
+        biotac_mj.plugin.check()
+    data.mocap_pos[0, 2] = TOP + RADIUS - 3e-4
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[0] == 1
+    assert handle.read(data, "contact_force")[1] > 0.1
+
+
+def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted():
+    model, data, handle = pressing(f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}})
+    data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
+    mujoco.mj_step(model, data, 5)
+    failed = handle.read(data, "status")[1]
+    good, force = data.plugin_state.copy(), handle.read(data, "contact_force")
+    assert handle.read(data, "status")[0] == 1 and force[1] > 0
+    data.mocap_pos[0, 2] -= 2.2e-3  # on the core at once: three iterations cannot
+    mujoco.mj_step(model, data, 3)
+    status = handle.read(data, "status")
+    assert status[0] == 0 and status[1] == failed + 3 and status[3] > 5e-4
+    assert np.array_equal(handle.read(data, "contact_force"), force)
+    assert np.array_equal(data.plugin_state[4 + 54 :], good[4 + 54 :])  # all but the counters and the pose of the one touching body
+    data.mocap_pos[0, 2] += 2.2e-3
+    mujoco.mj_step(model, data, 3)
+    assert handle.read(data, "status")[:2].tolist() == [1, status[1]]
+    np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
+
+
+def test_a_mesh_with_a_hole_presses_around_the_hole():
+    """A ring of 50 g lies on the pad, read as a signed distance field: its weight, and where it touches."""
+    ring = indenter("ring_7mm")
+    vert, face = ring.mesh()
+    mass, damping, timestep = 0.05, 5.0, 0.004
+    spec = mujoco.MjSpec.from_string(f'<mujoco><option timestep="{timestep}" integrator="implicitfast"/></mujoco>')
+    spec.add_mesh(name="ring", uservert=vert.ravel().tolist(), userface=face.ravel().tolist())
+    body = spec.worldbody.add_body(name="ring", pos=[0, 0, TOP], quat=PAD_UP)
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -1, 0], damping=[damping, 0, 0])
+    body.add_geom(name="ring", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ring", mass=mass)
+    handle = biotac_mj.attach(spec, quat=PAD_UP, pos=APEX, skin="coarse", readings="none", friction=0.3)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 50)
+    force = []
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+        force.append(handle.read(data, "contact_force")[1])
+    np.testing.assert_allclose(force, mass * G, rtol=0.01)
+    place = solved_skin(data).contacts()[:, 2:] @ data.geom("ring").xmat.reshape(3, 3).T + data.geom("ring").xpos
+    axis = np.linalg.norm(vert[:, [0, 2]], axis=1)
+    radius = np.linalg.norm(place[:, :2], axis=1)
+    assert len(radius) > 3
+    assert axis.min() - 1e-4 < radius.min() and radius.max() < axis.max() + 1e-4
