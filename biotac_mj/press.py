@@ -244,22 +244,6 @@ def _read(handle, data):
     return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
 
 
-class _Nodes:
-    """The skin's nodes in an mjData; the plugin keeps them in its state."""
-
-    def __init__(self, handle, model):
-        from .coupling.instance import Setup
-        from .plugin.structs import ModelView
-
-        index = int(model.body_plugin[model.body(handle.body).id])
-        self.setup = Setup(ModelView(model._address), index)
-        self.part = slice(model.plugin_stateadr[index], model.plugin_stateadr[index] + model.plugin_statenum[index])
-
-    def __call__(self, data):
-        """(nvert, 3) [m] in the BioTac frame after the last step."""
-        return self.setup.skin.stepper.vert_xpos(self.setup.parts(data.plugin_state[self.part])[2]).copy()
-
-
 def press(options: PressOptions = PressOptions(), render=None, progress: bool = True):  # noqa: B008 - frozen
     """Presses.
 
@@ -287,7 +271,6 @@ def press(options: PressOptions = PressOptions(), render=None, progress: bool = 
     except (ValueError, mujoco.FatalError):
         plugin.check()  # says why, where MuJoCo only says that
         raise
-    nodes = _Nodes(handle, model)
     rows, picture = [], None
     last = len(path.depth) - 1
     begin = time.perf_counter()
@@ -301,7 +284,7 @@ def press(options: PressOptions = PressOptions(), render=None, progress: bool = 
             data.mocap_pos[0] = path.position(*travel)
             mujoco.mj_step(model, data)
         plugin.check()
-        rows.append((data.time, travel[0], path.position(*travel), nodes(data), *_read(handle, data)))
+        rows.append((data.time, travel[0], path.position(*travel), handle.vert_xpos(model, data), *_read(handle, data)))
     seconds = time.perf_counter() - begin
     if render is not None:
         picture = render(model, data)

@@ -298,3 +298,13 @@ def test_dm_control_loads_and_steps_it(tmp_path):
     assert np.array_equal(physics.data.sensordata, copied.data.sensordata)
     physics.reset()
     assert physics.data.plugin_state[0] == 0
+
+
+def test_nodes_of_the_skin_from_the_handle():
+    """`Handle.vert_xpos` gives the skin at rest, and of the right BioTac where there are two."""
+    spec = mujoco.MjSpec()
+    handles = [biotac_mj.attach(spec, prefix=prefix, skin=skin, pos=(0, 0, z)) for prefix, skin, z in (("a_", "coarse", 0), ("b_", "default", 1))]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for handle, skin in zip(handles, ("coarse", "default")):
+        np.testing.assert_array_equal(handle.vert_xpos(model, data), biotac_mj.load_skin(skin).vert)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.resources
+import weakref
 
 import mujoco
 import numpy as np
@@ -45,6 +46,26 @@ class Handle:
         status is (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier:
         0 full, 1 condensed)."""
         return np.array(data.sensor(self.sensor(channel)).data)
+
+    def vert_xpos(self, model, data) -> np.ndarray:
+        """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
+        index = int(model.body_plugin[model.body(self.body).id])
+        setup = _setup(model, index)
+        start = model.plugin_stateadr[index]
+        return setup.skin.stepper.vert_xpos(setup.parts(data.plugin_state[start : start + setup.nstate])[2]).copy()
+
+
+_setups = weakref.WeakKeyDictionary()  # of each living model
+
+
+def _setup(model, index):
+    from ..plugin.structs import ModelView
+    from .instance import Setup
+
+    setups = _setups.setdefault(model, {})
+    if index not in setups:
+        setups[index] = Setup(ModelView(model._address), index)
+    return setups[index]
 
 
 def attach(
@@ -92,7 +113,8 @@ def attach(
     if stepper == "fem":
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
-        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=liquid is None or bool(liquid), coupling=coupling, geoms=geoms,
+        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=liquid is None or bool(liquid),
+        coupling=coupling, geoms=geoms,
         rounding=dict(rounding or {}), priority=int(priority), seed=int(seed), device=device, options=dict(options or {}),
         **({} if friction is None else {"friction": float(friction)}),
     )  # fmt: skip
