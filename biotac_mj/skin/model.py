@@ -69,6 +69,10 @@ class SkinOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: pass a positive finite number")
+        for name in ("core_clearance", "max_core_depth", "mass_damping", "stiffness_damping"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} is {value}: pass a finite number >= 0")
         if self.contact_stiffness is not None and not (math.isfinite(self.contact_stiffness) and self.contact_stiffness > 0):
             raise ValueError(f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None")
         if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
