@@ -1,0 +1,207 @@
+"""The solver as a function: batches, order, repetition, failure, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from blocks import shell, skin
+
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+
+PATH = np.linspace(0, 1.2e-3, 5)
+
+
+def finger(shuffle=None, law="corotational", **options):
+    """A ball of rubber, liquid and core of 20 mm, held below."""
+    vert, elem, inner = shell(10e-3, 8.5e-3, subdivisions=2, layers=2)
+    if shuffle is not None:
+        elem = np.random.default_rng(shuffle).permutation(elem)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=7e-3)
+    geometry = skin(vert, elem, np.flatnonzero(vert[:, 2] < -6e-3), inner_face=inner, core=(ball.vertices, ball.faces), name="ball")
+    if shuffle is not None:
+        geometry = dataclasses.replace(geometry, outer_face=np.random.default_rng(shuffle).permutation(geometry.outer_face))
+    return SkinModel(geometry, Material(law), SkinOptions(**{"max_newton": 60, **options}))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return finger()
+
+
+def geoms(nworld=1):
+    return GeomSet(["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)], [0.7, 0.3], [0, 1], [0, 5e-4], nworld=nworld)
+
+
+def pose(s, world=0):
+    """Sphere from above, dragged sideways; box from the side, in worlds 1 and 2 elsewhere; world 2 lets go at the end."""
+    leave = 4e-3 if world == 2 and s > 0.8e-3 else 0.0
+    return [[0.3 * s, 1e-3 * world, 13.5e-3 - s + leave], [12e-3 - 0.5 * s + leave, 0, 1e-3 * world]]
+
+
+def press(model, worlds, path=PATH, material=None):
+    """Data and geoms after a press in the given worlds."""
+    data, touching = SkinData(model, len(worlds), material), geoms(len(worlds))
+    for s in path:
+        touching.set_pose([pose(s, w) for w in worlds])
+        step(model, data, touching)
+        assert data.converged.all()
+    return data, touching
+
+
+@pytest.mark.parametrize("tolerance, apart", [(1e-3, 1e-6), (1e-9, 1e-9)])
+def test_a_world_of_a_batch_is_the_world_alone(tolerance, apart):
+    """A batch sums in another order and its preconditioner rounds to single precision, so the paths to balance differ, by far less than
+    the tolerance, and what they lead to does not."""
+    model = finger(tolerance=tolerance, max_newton=200)
+    batch, touching = press(model, [0, 1, 2])
+    tangent = batch.tangent(touching)
+    for w in range(3):
+        alone, one = press(model, [w])
+        np.testing.assert_allclose(batch.vert_xpos[w], alone.vert_xpos[0], rtol=0, atol=apart * 1e-3)  # of the way pressed
+        np.testing.assert_allclose(batch.wrench[w], alone.wrench[0], rtol=0, atol=20 * apart * abs(batch.wrench).max())
+        np.testing.assert_allclose(batch.pressure[w], alone.pressure[0], rtol=0, atol=max(20 * apart, tolerance) * abs(batch.pressure).max())
+        np.testing.assert_allclose(tangent[w], alone.tangent(one)[0], rtol=0, atol=1e-5 * abs(tangent).max())  # rows are single precision
+    assert abs(batch.wrench[2]).max() < 1e-9 < abs(batch.wrench[0]).max()
+    assert abs(batch.wrench[0] - batch.wrench[1]).max() > 1e-2  # the worlds do differ
+
+
+def test_worlds_in_another_order(model):
+    one, _ = press(model, [0, 1])
+    other, _ = press(model, [1, 0])
+    np.testing.assert_allclose(one.vert_xpos, other.vert_xpos[::-1], rtol=0, atol=1e-9)  # a millionth of the way pressed
+
+
+def test_the_same_input_gives_the_same_bits():
+    results = []
+    for _ in range(2):
+        data, touching = press(finger(), [0])
+        results.append((data.vert_xpos, data.wrench, data.tangent(touching), data.pressure))
+    for a, b in zip(*results, strict=True):
+        assert (a == b).all()
+
+
+def test_order_of_tetrahedra_and_faces_does_not_matter():
+    tight = dict(tolerance=1e-9, max_newton=200)
+    one, _ = press(finger(**tight), [0])
+    other, _ = press(finger(shuffle=1, **tight), [0])
+    np.testing.assert_allclose(one.vert_xpos, other.vert_xpos, rtol=0, atol=1e-8 * 20e-3)
+    np.testing.assert_allclose(one.wrench, other.wrench, rtol=0, atol=1e-6 * abs(one.wrench).max())
+
+
+def test_each_world_has_its_material(model):
+    soft = [dataclasses.replace(model.material, youngs_modulus=s * model.material.youngs_modulus) for s in (1.0, 0.8)]
+    data, _ = press(model, [0, 0], material=soft)
+    alone = SkinModel(model.geometry, soft[1], dataclasses.replace(model.options, contact_stiffness=model.contact_stiffness))
+    expected, _ = press(alone, [0])
+    # other preconditioners take other ways: what the tolerance of 1e-3 leaves
+    np.testing.assert_allclose(data.wrench[1], expected.wrench[0], rtol=0, atol=5e-3 * abs(data.wrench).max())
+    assert np.linalg.norm(data.wrench[1, 0, :3]) < 0.9 * np.linalg.norm(data.wrench[0, 0, :3])
+
+
+def test_tolerance_bounds_the_error(model):
+    """The estimated error is in the energy norm; forces are off by no more than that many parts."""
+    exact, _ = press(finger(tolerance=1e-8, max_newton=200), [0])
+    rough, _ = press(model, [0])
+    assert (rough.error <= model.options.tolerance).all()
+    scale = np.linalg.norm(exact.wrench[0, :, :3], axis=1).max()
+    assert abs(rough.wrench - exact.wrench)[..., :3].max() < 5 * model.options.tolerance * scale
+
+
+def test_reset_starts_over(model):
+    first, touching = press(model, [0])
+    expected = first.vert_xpos
+    first.set_external(np.ones((1, model.nvert, 3)))
+    first.reset()
+    assert (first.vert_xpos[0] == model.geometry.vert).all()
+    assert not first.wrench.size and first.nonconverged[0] == 0 and first.external is None
+    touching = geoms()
+    for s in PATH:
+        touching.set_pose(pose(s))
+        step(model, first, touching)
+    assert (first.vert_xpos == expected).all()
+
+
+def test_load_goes_on_where_it_was_read(model):
+    """A single world's state: positions, increment, motion, sticking contacts."""
+    data, touching = press(model, [0], PATH[:-1])
+    again, other = SkinData(model), geoms()
+    again.load(data.vert_xpos[0], data.increment.numpy()[:, 0], data.motion[0], data.contacts())
+    other.set_pose(pose(PATH[-2]))
+    for d, g in ((data, touching), (again, other)):
+        g.set_pose(pose(PATH[-1]))
+        step(model, d, g)
+    assert (data.vert_xpos == again.vert_xpos).all()
+    assert (data.wrench == again.wrench).all()
+
+
+# --- failure --------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_step_that_does_not_converge_keeps_the_last_good_state():
+    model = finger(max_newton=1)
+    data, touching = SkinData(model, 2), geoms(2)
+    easy = finger()
+    for s in PATH[:3]:
+        touching.set_pose([pose(s), pose(-1e-3)])
+        step(easy, data, touching)
+        assert data.converged.all()
+    good = [np.copy(a) for a in (data.vert_xpos, data.wrench, data.contact_force, data.pressure)]
+    before = data.nonconverged.copy()
+    touching.set_pose([pose(1.4e-3), pose(-1e-3)])  # too deep for one iteration
+    step(model, data, touching)
+    assert data.converged.tolist() == [False, True]
+    assert (data.nonconverged - before).tolist() == [1, 0]
+    for kept, now in zip(good, (data.vert_xpos, data.wrench, data.contact_force, data.pressure)):
+        np.testing.assert_allclose(now, kept, rtol=0, atol=1e-9 * max(abs(kept).max(), 1e-3))
+
+
+def test_after_a_failed_step_smaller_ones_go_on():
+    """What failed leaves no trace: the press goes on to the answer that it would have had."""
+    easy, hasty = finger(tolerance=1e-5, max_newton=200), finger(max_newton=1)
+    data, touching = press(easy, [0], PATH[:2])
+    touching.set_pose(pose(1.4e-3))
+    step(hasty, data, touching)
+    assert not data.converged[0]
+    for s in PATH[2:]:
+        touching.set_pose(pose(s))
+        step(easy, data, touching)
+    expected, _ = press(easy, [0])
+    np.testing.assert_allclose(data.wrench, expected.wrench, rtol=0, atol=1e-3 * abs(expected.wrench).max())
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_geom_deep_inside_the_core(model):
+    data, touching = SkinData(model), geoms()
+    touching.set_pose([[0, 0, 8e-3], [1.0, 0, 0]])
+    text = r"geom 0 of world 0 \(sphere\) is 2.\d\d mm inside the rigid core: no skin fits between them; move it out, press less deep"
+    with pytest.raises(ValueError, match=text):
+        step(model, data, touching)
+
+
+def test_numbers_of_worlds(model):
+    with pytest.raises(ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"):
+        step(model, SkinData(model), geoms(2))
+    with pytest.raises(ValueError, match="pass one corotational material for each of the 2 worlds"):
+        SkinData(model, 2, [Material()])
+    with pytest.raises(ValueError, match="pass one corotational material for each of the 1 worlds"):
+        SkinData(model, 1, [Material("svk")])
+
+
+@pytest.mark.parametrize("options, text", [
+    (dict(dynamics="explicit"), "unknown dynamics 'explicit': choose 'quasistatic' or 'implicit'"),
+    (dict(bulk_modulus=-1.0), "bulk_modulus is -1.0: pass a positive finite number"),
+    (dict(tolerance=0.0), "tolerance is 0.0: pass a positive finite number"),
+    (dict(stick_ratio=float("nan")), "stick_ratio is nan: pass a positive finite number"),
+    (dict(contact_stiffness=0.0), "contact_stiffness is 0.0: pass a positive number of Pa/m, or None"),
+    (dict(max_newton=0), "samples, max_newton and max_cg must be at least 1"),
+    (dict(mass_damping=-1.0), "mass_damping is -1.0: pass a finite number >= 0"),
+    (dict(stiffness_damping=float("nan")), "stiffness_damping is nan: pass a finite number >= 0"),
+    (dict(core_clearance=float("nan")), "core_clearance is nan: pass a finite number >= 0"),
+    (dict(max_core_depth=-1e-3), "max_core_depth is -0.001: pass a finite number >= 0"),
+])  # fmt: skip
+def test_bad_options(options, text):
+    with pytest.raises(ValueError, match=text):
+        SkinOptions(**options)
