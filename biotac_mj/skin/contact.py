@@ -11,7 +11,16 @@ import warp as wp
 from .shapes import Grids, distance, distance_bound
 from .types import mat33, real, vec3
 
-__all__ = ["Geoms", "contact_force", "contact_product", "contact_wrench", "depth_in_core", "face_samples", "rest_gap"]
+__all__ = [
+    "Geoms",
+    "contact_force",
+    "contact_product",
+    "contact_wrench",
+    "core_contact_force",
+    "depth_in_core",
+    "face_samples",
+    "rest_gap",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,8 +74,10 @@ def rest_gap(
     gap_out[f * sample.shape[0] + s] = dn[3]
 
 
-@wp.kernel
-def contact_force(
+@wp.func
+def touch_face(
+    f: int,
+    w: int,
     # In:
     face: wp.array(dtype=wp.vec3i),
     area: wp.array(dtype=real),
@@ -86,7 +97,7 @@ def contact_force(
     anchor_out: wp.array2d(dtype=vec3),
     force_out: wp.array2d(dtype=vec3),
 ):
-    f, w = wp.tid()
+    """Evaluates a face; returns how far its nearest sample is from touching [m] (a lower bound)."""
     nsample = sample.shape[0]
     t = face[f]
     x0 = x[t[0], w]
@@ -95,12 +106,17 @@ def contact_force(
     center = (x0 + x1 + x2) / real(3.0)
     radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
     near = int(0)
+    clearance = real(1.0)
     # most faces are far from every geom: one distance each tells
     for g in range(geoms.count):
         R = geoms.mat[g, w]
         y = wp.transpose(R) * (center - geoms.pos[g, w])
-        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < radius:
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        clearance = wp.min(clearance, bound - radius)
+        if bound < radius:
             near = 1
+    if near == 1:
+        clearance = real(1.0)
     touching = int(0)
     f0 = vec3()
     f1 = vec3()
@@ -126,6 +142,7 @@ def contact_force(
                 R = geoms.mat[g, w]
                 y = wp.transpose(R) * (p - geoms.pos[g, w])
                 dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                clearance = wp.min(clearance, dn[3])
                 if dn[3] < gap:
                     gap = dn[3]
                     touched = g
@@ -184,6 +201,75 @@ def contact_force(
         block_out[6 * f + 3, w] = b11
         block_out[6 * f + 4, w] = b12
         block_out[6 * f + 5, w] = b22
+    return clearance
+
+
+@wp.kernel
+def contact_force(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    force_out: wp.array2d(dtype=vec3),
+):
+    f, w = wp.tid()
+    touch_face(
+        f, w, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
+        anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
+    )  # fmt: skip
+
+
+@wp.kernel
+def core_contact_force(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # In and out:
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    force_out: wp.array2d(dtype=vec3),
+):
+    """The same against geoms that never move: a face that has moved less than its clearance, since that was last seen, cannot touch."""
+    f, w = wp.tid()
+    t = face[f]
+    moved = real(0.0)
+    for c in range(3):
+        moved = wp.max(moved, wp.length_sq(x[t[c], w] - seen[3 * f + c, w]))
+    if wp.sqrt(moved) < clearance[f, w]:
+        return
+    clearance[f, w] = touch_face(
+        f, w, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
+        anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
+    )  # fmt: skip
+    for c in range(3):
+        seen[3 * f + c, w] = x[t[c], w]
 
 
 @wp.kernel

@@ -29,8 +29,11 @@ class ContactState:
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
         self.touching = wp.zeros((nface, nworld), dtype=int)
         self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
+        self.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
+        self.clearance = wp.zeros((nface, nworld), dtype=real)
 
     def reset(self):
+        self.clearance.zero_()
         self.anchor_geom.fill_(-1)
         for array in (self.trial_geom, self.touching, self.node_force, self.sample_force):
             array.zero_()

@@ -208,11 +208,13 @@ class _Step:
     def _contact(self, state, geoms):
         m, d = self.m, self.d
         surface, launch = state.surface, _launcher(m.device)
+        still = state is d.core
         launch(
-            contact.contact_force,
+            contact.core_contact_force if still else contact.contact_force,
             state.touching.shape,
             [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
-            + [state.anchor_geom, state.anchor],
+            + [state.anchor_geom, state.anchor]
+            + ([state.seen, state.clearance] if still else []),
             [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
         )
         launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
