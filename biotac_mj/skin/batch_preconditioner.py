@@ -63,8 +63,8 @@ class BatchPreconditioner:
         """For skins that nothing touches."""
         self.size, self.gradient = 0, None
 
-    def update(self, states, gradient, kappa):
-        """Takes the tangents of contact and liquid; arguments as in `Preconditioner.update`, on the device."""
+    def update(self, states, residual, gradient, kappa):
+        """See `Preconditioner.update`; on the device."""
         # the liquid's direction is scaled so that its stiffness is like that of contact: single precision then suffices
         self.kappa = _STIFF
         self.gradient = None if gradient is None else gradient * (kappa / _STIFF) ** 0.5
@@ -85,13 +85,14 @@ class BatchPreconditioner:
         self.nodes = nodes[:m].T.contiguous()  # (nworld, m), nvert where unused
         self.size = 3 * m + (gradient is not None)
         if not self.size:
-            return
+            return self.apply(residual)
         self.used = (self.nodes < self.nvert).repeat_interleave(3, 1)
         D = self._stiffness(states, slot)
         W = self._compliance(m)
         system = D @ W
         system.diagonal(dim1=1, dim2=2).add_(1)
         self.D, self.W, (self.lu, self.pivots) = D, W, torch.linalg.lu_factor(system)
+        return self.apply(residual)
 
     def _face(self, face):
         key = id(face)

@@ -23,17 +23,22 @@ class Preconditioner:
         self.scale = scale
         self._rows = {}
 
-    def update(self, states, gradient, kappa):
-        """Takes the tangents of contact and liquid.
+    def update(self, states, residual, gradient, kappa):
+        """Takes the tangents of contact and liquid; returns the approximate inverse of the new tangent times the residual.
 
         Args:
           states: ContactState of each surface that can touch, just evaluated.
+          residual: (nvert, nworld, 3), zero at fixed nodes [N].
           gradient: (nvert, nworld, 3) of the liquid's volume, zero at fixed nodes [m^2], or None.
           kappa: K / V0 [Pa/m^3].
         """
         self.gradient, self.kappa = gradient, kappa
-        self.along = self.factor.solve(gradient) if gradient is not None else None
+        if gradient is None:
+            y = self.factor.solve(residual)
+        else:  # two right-hand sides take little longer than one
+            y, self.along = np.split(self.factor.solve(np.concatenate([residual, gradient], 1)), 2, axis=1)
         self.worlds = [self._small(w, states) for w in range(len(self.scale))]
+        return self._correct(y)
 
     def clear(self):
         """For a skin that nothing touches."""
@@ -76,7 +81,9 @@ class Preconditioner:
 
     def apply(self, r):
         """Approximate inverse of the tangent times r: (nvert, nworld, 3), zero at fixed nodes."""
-        z = self.factor.solve(r)
+        return self._correct(self.factor.solve(r))
+
+    def _correct(self, z):
         for w, small in enumerate(self.worlds):
             z[:, w] /= self.scale[w]
             if small is None:

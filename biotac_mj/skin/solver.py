@@ -125,8 +125,7 @@ class _Step:
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
                 return asked
-            self.M.update(states, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
-            z = self.M.apply(residual)
+            z = self.M.update(states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             error = _host((residual * z).sum((0, 2)))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
             work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
