@@ -1,5 +1,6 @@
 """The finite-element skin as the coupling sees it: a function from a state and poses to a new state and wrenches."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
 from .stepper import SkinResult
 
-__all__ = ["FemStepper"]
+__all__ = ["FemStepper", "rest_geometry"]
 
 _MAX_CONTACTS = 4096
 
@@ -16,16 +17,13 @@ class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
     The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last
-    step, the sticking contacts (how many, then sample, geom and anchor of each) and, with implicit dynamics, nodal velocities
-    and the core's pose.
+    step, the sticking contacts (how many, then sample, geom and anchor of each), the liquid's pressure and, with implicit dynamics,
+    nodal velocities and the core's pose.
     """
 
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
-        # half of a lone press's tolerance: two-way, the error of single steps is heard as chatter
-        liquid = {} if config.liquid is None else {"liquid": config.liquid}
-        self._options = SkinOptions(**({"tolerance": 5e-4} | liquid | config.options.get("skin", {})))
-        self._material = Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default")
+        self._material, self._options = _choices(config)
         n, g = geometry.nvert, len(geoms)
         sizes = {
             "started": 1,
@@ -35,6 +33,7 @@ class FemStepper:
             "geom_mat": 9 * g,
             "motion": 3 * g,
             "contacts": 1 + 5 * _MAX_CONTACTS,
+            "pressure": 1,
         }
         if self._options.dynamics == "implicit":
             sizes |= {"velocity": 3 * n, "core_pos": 3, "core_mat": 9}
@@ -68,7 +67,11 @@ class FemStepper:
 
     def reset(self, state):
         state[:] = 0
-        self._part(state, "x")[:] = self._geometry.vert.ravel()
+        vert, pressure = self._geometry.vert, 0.0
+        if _filled(self._options):
+            vert, pressure = self._model.rest.vert, self._model.rest.pressure
+        self._part(state, "x")[:] = vert.ravel()
+        self._part(state, "pressure")[:] = pressure
         if "core_mat" in self._slices:
             self._part(state, "core_mat")[:] = np.eye(3).ravel()
 
@@ -107,6 +110,7 @@ class FemStepper:
             increment=self._part(state, "increment").reshape(-1, 3),
             motion=self._part(state, "motion").reshape(-1, 3),
             contacts=_contacts(self._part(state, "contacts")),
+            pressure=self._part(state, "pressure")[0],
         )
         geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
         geoms.advance()
@@ -129,6 +133,7 @@ class FemStepper:
         self._part(state, "geom_pos")[:] = np.ravel(geom_pos)
         self._part(state, "geom_mat")[:] = np.ravel(geom_mat)
         self._part(state, "motion")[:] = d.motion[0].ravel()
+        self._part(state, "pressure")[:] = d.liquid.last_pressure[0] if d.liquid else 0.0
         buffer = self._part(state, "contacts")
         buffer[0] = len(contacts)
         buffer[1 : 1 + contacts.size] = contacts.ravel()
@@ -136,6 +141,26 @@ class FemStepper:
             self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
             self._part(state, "core_pos")[:] = d.core_pos[0]
             self._part(state, "core_mat")[:] = d.core_mat[0].ravel()
+
+
+def rest_geometry(config, geometry):
+    """The geometry with the nodes where the skin rests on its filling: what the sensor sees when nothing touches."""
+    choice, options = _choices(config)
+    if not _filled(options):
+        return geometry
+    rest = _model(geometry, choice, options, config.device).rest
+    return dataclasses.replace(geometry, vert=rest.vert[: geometry.nvert])
+
+
+def _choices(config):
+    # half of a lone press's tolerance: two-way, the error of single steps is heard as chatter
+    liquid = {} if config.liquid is None else {"liquid": config.liquid}
+    options = SkinOptions(**({"tolerance": 5e-4} | liquid | config.options.get("skin", {})))
+    return Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default"), options
+
+
+def _filled(options):
+    return bool(options.fill_volume or options.rest_pressure)
 
 
 def _contacts(buffer):

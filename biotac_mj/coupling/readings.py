@@ -5,6 +5,7 @@ import functools
 from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction
 from ..sensor.readings import PhysicsReadings
+from .fem import rest_geometry
 
 __all__ = ["SensorReadings"]
 
@@ -18,14 +19,15 @@ class SensorReadings:
     """
 
     def __init__(self, config, geometry):
-        self._geometry, self._seed = geometry, config.seed
+        self._config, self._geometry, self._seed = config, geometry, config.seed
         self._options = dict(config.options.get("readings", {}))
         self.nstate = Acquisition.nstate
 
     @functools.cached_property
     def _physics(self):
-        film = _film(_Skin(self._geometry), self._options.get("sensor", "1"))
-        return PhysicsReadings(self._geometry, seed=self._seed, film=film, **self._options)
+        geometry = rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
+        film = _film(_Skin(geometry), self._options.get("sensor", "1"))
+        return PhysicsReadings(geometry, seed=self._seed, film=film, **self._options)
 
     @functools.cached_property
     def rest(self):

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from .liquid import Liquid
 from .model import SkinModel
 from .types import mat33, real, vec3
 
@@ -61,9 +62,10 @@ class SkinData:
       vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
       contact_force: (nworld, nvert, 3) nodal forces of the touching geoms on the skin [N].
       core_force: (nworld, nvert, 3) nodal forces of the core on the inner surface [N].
+      liquid_force: (nworld, nvert, 3) nodal forces of the liquid on the inner surface [N]; on the core it pushes the opposite way.
       reaction: (nworld, 3) force of core, nail and clamp on the fixed nodes [N].
       wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin [N, N m].
-      pressure: (nworld,) of the liquid above its rest value [Pa].
+      pressure: (nworld,) of the liquid above its rest value, which is `model.rest.pressure` [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
       nonconverged: (nworld,) number of steps that did not, since reset.
@@ -87,22 +89,22 @@ class SkinData:
             self.force = wp.zeros_like(self.x)
             self.direction = wp.zeros_like(self.x)
             self.product = wp.zeros_like(self.x)
-            self.gradient = wp.zeros_like(self.x)
+            self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
+            self.bending = wp.zeros_like(self.x)
             self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
             self.elastic = model.elasticity.allocate(nworld)
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
             self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
-            ninner = len(model.inner.face) if model.inner else 0
-            self.face_volume = wp.zeros((ninner, nworld), dtype=real)
-            self.inner_corner = wp.zeros((3 * ninner, nworld), dtype=vec3)
+            self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
+        self.liquid = Liquid(model, nworld) if model.inner is not None else None
         self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
         self.core_pos = np.zeros((nworld, 3))
         self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
         self.reset()
 
     def reset(self):
-        """Puts every world back to rest."""
-        rest = np.repeat(self.model.geometry.vert[:, None], self.nworld, 1)
+        """Puts every world back to rest: the skin on its filling, nothing touching."""
+        rest = np.repeat(self.model.rest.vert[:, None], self.nworld, 1)
         for array in (self.x, self.x_last):
             wp.copy(array, wp.array(rest, dtype=vec3, ndim=2, device=array.device))
         self.velocity.zero_()
@@ -114,8 +116,8 @@ class SkinData:
         if self.core:
             self.core.reset()
         self.wrench = np.zeros((self.nworld, 0, 6))
-        self.pressure = np.zeros(self.nworld)
-        self.volume = np.full(self.nworld, self.model.liquid_volume)
+        if self.liquid:
+            self.liquid.reset()
         self.converged = np.ones(self.nworld, bool)
         self.nonconverged = np.zeros(self.nworld, int)
         self.iterations = np.zeros(self.nworld, int)
@@ -139,6 +141,14 @@ class SkinData:
         self.external = view(wp.array(np.ascontiguousarray(np.swapaxes(force, 0, 1)), dtype=vec3, ndim=2, device=self.x.device))
 
     @property
+    def pressure(self):
+        return self.liquid.gauge_pressure - self.model.rest.pressure if self.model.has_liquid else np.zeros(self.nworld)
+
+    @property
+    def volume(self):
+        return self.liquid.volume if self.liquid else np.zeros(self.nworld)
+
+    @property
     def vert_xpos(self):
         return _leading(self.x)
 
@@ -151,20 +161,29 @@ class SkinData:
         return _leading(self.core.node_force) if self.core else np.zeros((self.nworld, self.model.nvert, 3))
 
     @property
+    def liquid_force(self):
+        if not self.model.has_liquid:
+            return np.zeros((self.nworld, self.model.nvert, 3))
+        return self.liquid.gauge_pressure[:, None, None] * _leading(self.gradient)
+
+    @property
     def reaction(self):
         return -self.force.numpy()[self.model.fixed].sum(0)
 
-    def load(self, x, increment, motion, contacts):
+    def load(self, x, increment, motion, contacts, pressure=0.0):
         """Sets the state of a single world; the inverse of reading it.
 
         Args:
           x, increment: (nvert, 3) positions and last increment [m].
           motion: (ngeom, 3) of the geoms in the last step [m].
           contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts` gives them.
+          pressure: of the liquid above the surroundings [Pa], `liquid.last_pressure`.
         """
         for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
             wp.copy(array, wp.array(value[:, None], dtype=vec3, ndim=2, device=array.device))
         self.motion = np.array(motion)[None]
+        if self.liquid:
+            self.liquid.last_pressure = np.array([float(pressure)])
         geom, anchor = self.outer.anchor_geom.numpy().copy(), self.outer.anchor.numpy().copy()
         geom[:] = -1
         sample = contacts[:, 0].astype(int)

@@ -1,16 +1,30 @@
-"""The liquid between core and skin: one pressure per sensor that resists a change of the enclosed volume.
+"""The liquid between core and skin: one pressure per sensor that resists a change of the volume between them.
 
-The inner surface of the skin is closed, so the divergence theorem gives its volume and the volume's gradient; the core inside
-is rigid and only subtracts a constant. p = -K (V - V0) / V0 with the bulk modulus K and the liquid's rest volume V0.
+The inner surface of the skin is closed, so the divergence theorem gives the cavity's volume and its gradient; the core inside is rigid
+and only subtracts a constant. Liquid is what is between the two: where the skin lies on the core there is none, so the overlap that
+penalty contact needs is no volume, and no pressure acts there. p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the
+liquid has without pressure; with infinite K the pressure is an unknown of its own (see `docs/liquid.md`).
+
+Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c, s = min(c / 2 p_ref, 1),
+p_ref the liquid's pressure when the step began. What pushes the skin off, c + (1 - s) p, then grows with the overlap everywhere. Switched
+at c = 0 instead, the skin would have two states of balance: pressed off the core by liquid under it, or stuck to it without. Bonded
+faces need no such care: their nodes are held, so it does not matter that pressure is counted on them as well.
 """
 
+import dataclasses
+import math
+
+import numpy as np
 import warp as wp
 
-from .types import real, vec3
+from .types import mat33, real, vec3
 
-__all__ = ["cavity_volume", "volume_gradient"]
+__all__ = ["Liquid", "Rest", "cavity_volume", "volume_gradient"]
 
 wp.set_module_options({"enable_backward": False})
+
+WATER = 2.2e9  # [Pa]
+_REFERENCE = 1e3  # [Pa], least pressure that sets over which overlap skin and core part
 
 
 @wp.kernel
@@ -42,3 +56,231 @@ def volume_gradient(
     corner_out[3 * f, w] = g
     corner_out[3 * f + 1, w] = g
     corner_out[3 * f + 2, w] = g
+
+
+@wp.func
+def contact_pressure(i: int, w: int, geom: wp.array2d(dtype=int), force: wp.array2d(dtype=vec3), area: real):
+    """Normal traction of the core on a sample that stands for an area [Pa]."""
+    c = real(0.0)
+    if geom[i, w] >= 0:
+        c = wp.length(force[i, w]) / area
+    return c
+
+
+@wp.kernel
+def wetting(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    sample: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
+    stiffness: real,
+    reference: wp.array(dtype=real),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    volume_out: wp.array2d(dtype=real),
+    wet_out: wp.array2d(dtype=vec3),
+):
+    """Share of the liquid's volume under each inner face, and of the face's area that is wet and pushes on each corner (1/3 where all is).
+
+    `slot` is a face's number on the surface that can meet the core, -1 where it cannot; `area` to `force` are of that surface.
+    """
+    f, w = wp.tid()
+    t = face[f]
+    x0 = x[t[0], w]
+    x1 = x[t[1], w]
+    x2 = x[t[2], w]
+    volume = -wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
+    third = real(1.0) / real(3.0)
+    wet = vec3(third, third, third)
+    c = slot[f]
+    if c >= 0:
+        if touching[c, w] == 1:
+            nsample = sample.shape[0]
+            share = real(1.0) / real(nsample)
+            full = real(2.0) * reference[w]
+            overlap = real(0.0)
+            for s in range(nsample):
+                pressure = contact_pressure(c * nsample + s, w, geom, force, area[c] * share)
+                if pressure < full:
+                    dry = pressure / full
+                    overlap += share * dry * pressure / (real(2.0) * stiffness)
+                else:
+                    dry = real(1.0)
+                    overlap += share * (pressure - reference[w]) / stiffness
+                wet -= share * dry * sample[s]
+            volume += overlap * wp.length(wp.cross(x1 - x0, x2 - x0)) / real(2.0)
+    volume_out[f, w] = volume
+    wet_out[f, w] = wet
+
+
+@wp.kernel
+def wet_gradient(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    wet: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+):
+    """dV/dx: the wet part of each face's area vector to its corners."""
+    f, w = wp.tid()
+    t = face[f]
+    g = -wp.cross(x[t[1], w] - x[t[0], w], x[t[2], w] - x[t[0], w]) / real(2.0)
+    for k in range(3):
+        corner_out[3 * f + k, w] = wet[f, w][k] * g
+
+
+@wp.kernel
+def gradient_derivative(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    wet: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    p: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+):
+    """Derivative of `wet_gradient` along p, the wet parts held; its sum over a closed surface is symmetric."""
+    f, w = wp.tid()
+    t = face[f]
+    e1 = x[t[1], w] - x[t[0], w]
+    e2 = x[t[2], w] - x[t[0], w]
+    d1 = p[t[1], w] - p[t[0], w]
+    d2 = p[t[2], w] - p[t[0], w]
+    g = -(wp.cross(d1, e2) + wp.cross(e1, d2)) / real(2.0)
+    for k in range(3):
+        corner_out[3 * f + k, w] = wet[f, w][k] * g
+
+
+@wp.kernel
+def soften_contact(
+    # In:
+    sample: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
+    stiffness: real,
+    reference: wp.array(dtype=real),
+    pressure: wp.array(dtype=real),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # In, out:
+    block: wp.array2d(dtype=mat33),
+):
+    """Takes from the core contact's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref) of k."""
+    f, w = wp.tid()
+    p = pressure[w]
+    if touching[f, w] == 1 and p > real(0.0):
+        nsample = sample.shape[0]
+        share = area[f] / real(nsample)
+        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness * share
+        for s in range(nsample):
+            i = f * nsample + s
+            c = contact_pressure(i, w, geom, force, share)
+            if c > real(0.0) and c < real(2.0) * reference[w]:
+                n = wp.normalize(force[i, w])
+                K = factor * wp.outer(n, n)
+                b = sample[s]
+                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
+                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
+                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
+                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
+                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
+                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+
+
+@dataclasses.dataclass(frozen=True)
+class Rest:
+    """What a skin is without touching geoms.
+
+    Attributes:
+      vert: (nvert, 3) nodes [m].
+      pressure: of the liquid, above the surroundings [Pa].
+      volume: of the liquid [m^3]; natural_volume: the same liquid without pressure [m^3].
+    """
+
+    vert: np.ndarray
+    pressure: float
+    volume: float
+    natural_volume: float
+
+
+class Liquid:
+    """The liquid of one SkinData: `evaluate` after the contact forces, then `force`; `product` is its share of the tangent.
+
+    Attributes:
+      natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V [Pa/m^3].
+      offset: (nworld,) pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is incompressible.
+      last_pressure: (nworld,) above the surroundings, of the last step [Pa].
+      gauge_pressure: (nworld,) above the surroundings [Pa], volume: (nworld,) [m^3] at the last evaluation.
+    """
+
+    def __init__(self, model, nworld):
+        self.m, self.nworld = model, nworld
+        nface = len(model.inner.face)
+        with wp.ScopedDevice(model.device):
+            self._share = wp.zeros((nface, nworld), dtype=real)
+            self._wet = wp.zeros((nface, nworld), dtype=vec3)
+            self._corner = wp.zeros((3 * nface, nworld), dtype=vec3)
+            self._none = wp.zeros((0, nworld), dtype=int), wp.zeros((0, nworld), dtype=vec3)
+            self._no_area = wp.zeros(0, dtype=real)
+        self.reset()
+
+    def reset(self):
+        rest, K = self.m.rest, self.m.options.bulk_modulus
+        self.natural_volume = rest.natural_volume
+        # an incompressible liquid: the pressure of the last step is what the next starts from, and this stiffness only finds the change
+        self.stiffness = (K if math.isfinite(K) else WATER) / rest.natural_volume
+        self.last_pressure = np.full(self.nworld, rest.pressure)
+        self.gauge_pressure = self.last_pressure.copy()
+        self.volume = np.full(self.nworld, rest.volume)
+
+    def begin(self):
+        """Starts a step."""
+        self.offset = self.last_pressure.copy() if self.stiffness == 0 or math.isinf(self.m.options.bulk_modulus) else 0.0
+        reference = np.maximum(np.abs(self.last_pressure), _REFERENCE)
+        self._reference = wp.array(reference, dtype=real, device=self.m.device)
+
+    def evaluate(self, x, core):
+        """Volume, wet faces and pressure of the skin at x [nvert, nworld]; `core` is the contact with the core there, or None."""
+        m = self.m
+        if core is None:
+            area, touching, geom, force = self._no_area, self._none[0], self._none[0], self._none[1]
+        else:
+            area, touching, geom, force = core.surface.area, core.touching, core.trial_geom, core.sample_force
+        contact = [m.sample, area, m.contact_stiffness, self._reference]
+        wp.launch(wetting, self._share.shape,
+                  [m.inner.face, m.core_slot, *contact, touching, geom, force, x],
+                  [self._share, self._wet], device=m.device)  # fmt: skip
+        self.volume = m.liquid_volume + _host(_view(self._share).sum(0)) - m.rest_volume
+        if not m.has_liquid:
+            return
+        self.gauge_pressure = self.offset - self.stiffness * (self.volume - self.natural_volume)
+        if core is not None:
+            pressure = wp.array(self.gauge_pressure, dtype=real, device=m.device)
+            wp.launch(soften_contact, touching.shape, [*contact, pressure, touching, geom, force], [core.block], device=m.device)
+
+    def gradient(self, x):
+        """dV/dx by corners of the inner faces, for `elasticity.gather`."""
+        wp.launch(wet_gradient, self._share.shape, [self.m.inner.face, self._wet, x], [self._corner], device=self.m.device)
+        return self._corner
+
+    def gradient_derivative(self, x, p):
+        """The same of the derivative of dV/dx along p."""
+        wp.launch(gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner], device=self.m.device)
+        return self._corner
+
+    def commit(self, good):
+        """Ends a step; worlds that are not good keep their last pressure."""
+        self.last_pressure = np.where(good, self.gauge_pressure, self.last_pressure)
+
+
+def _view(array):
+    return wp.to_torch(array) if array.device.is_cuda else array.numpy()
+
+
+def _host(array):
+    return array if isinstance(array, np.ndarray) else array.cpu().numpy()

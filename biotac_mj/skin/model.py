@@ -10,6 +10,7 @@ import warp as wp
 from ..geometry.skin_geometry import SkinGeometry
 from . import contact, elasticity, liquid
 from .factor import DenseFactor, SparseFactor
+from .fill import rest_state
 from .geoms import GeomSet
 from .material import ELEMENTS, LAWS, Material, material
 from .quadratic import QuadraticTetrahedra, quadratic
@@ -28,7 +29,9 @@ class SkinOptions:
         `quadratic.quadratic`); None takes the material's choice.
       dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
       liquid: fills the space between skin and core; None takes the material preset's choice.
-      bulk_modulus: of the liquid [Pa]; water has 2.2e9.
+      bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf keeps its volume.
+      fill_volume: liquid beyond what the unstressed skin holds [m^3]; less where negative. It inflates the skin at rest.
+      rest_pressure: instead, the liquid's pressure at rest above the surroundings [Pa].
       core_contact: whether the inner surface can touch the rigid core.
       core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core contact [m].
       max_core_depth: a geom that reaches deeper into the core than this is refused [m].
@@ -47,6 +50,8 @@ class SkinOptions:
     dynamics: str = "quasistatic"
     liquid: bool | None = None
     bulk_modulus: float = 2.2e9
+    fill_volume: float = 0.0
+    rest_pressure: float = 0.0
     core_contact: bool = True
     core_clearance: float = 2e-5
     max_core_depth: float = 5e-4
@@ -65,7 +70,11 @@ class SkinOptions:
             raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
         if self.element not in (None, *ELEMENTS):
             raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the material's choice")
-        for name in ("bulk_modulus", "stick_ratio", "tolerance"):
+        if not self.bulk_modulus > 0:
+            raise ValueError(f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf")
+        if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (self.fill_volume and self.rest_pressure):
+            raise ValueError(f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of them, a finite number")
+        for name in ("stick_ratio", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: pass a positive finite number")
@@ -172,6 +181,8 @@ class SkinModel:
             faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
             self.core_surface = Surface.create(vert, faces, self.device)
             self.core_vert = wp.array(geometry.core_vert, dtype=vec3, device=self.device)
+        if self.inner is not None:
+            self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
         stiffness = self.elasticity.rest_stiffness(self.material.mu, self.material.lame)
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
@@ -192,6 +203,15 @@ class SkinModel:
                   inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert], outputs=[gap], device=self.device)  # fmt: skip
         return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 
+    def _core_slots(self):
+        """Number of each inner face on the surface that can meet the core; -1: it cannot."""
+        face = self.geometry.inner_face
+        slot = np.full(len(face), -1, np.int32)
+        if self.has_core:
+            number = {tuple(f): i for i, f in enumerate(self.core_surface.face_np.tolist())}
+            slot[:] = [number.get(tuple(f), -1) for f in face.tolist()]
+        return wp.array(slot, dtype=int, device=self.device)
+
     def _volumes(self):
         if self.inner is None:
             return 0.0, 0.0
@@ -206,6 +226,11 @@ class SkinModel:
                 "check the meshes' frames and units"
             )
         return cavity, cavity - core
+
+    @functools.cached_property
+    def rest(self) -> liquid.Rest:
+        """The skin and its liquid without touching geoms: inflated where the options say so, solved when first asked for."""
+        return rest_state(self)
 
     @functools.cached_property
     def factor(self):

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from . import contact, elasticity, liquid
+from . import contact, elasticity
 from .data import SkinData, view
 from .geoms import GeomSet
 from .model import SkinModel
@@ -61,7 +61,9 @@ class _Step:
         self.force = view(data.force)
         self.mask = view(model.free_mask)[:, None, None]
         self.gradient = view(data.gradient)
-        self.kappa = model.options.bulk_modulus / model.liquid_volume if model.has_liquid else 0.0
+        self.kappa = data.liquid.stiffness if model.has_liquid else 0.0
+        if data.liquid:
+            data.liquid.begin()
         if not hasattr(data, "preconditioner"):
             data.preconditioner = _preconditioner(model)(model, data.stiffness_scale)
         self.M = data.preconditioner
@@ -128,7 +130,7 @@ class _Step:
             z = self.M.update(states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             error = _host((residual * z).sum((0, 2)))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
-            work = np.abs(_host((load * (self.x - view(self.m.vert))).sum((0, 2)))) + 1e-12
+            work = np.abs(_host((load * (self.x - view(d.rest_vert))).sum((0, 2)))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
             active = asked & finite & ~at_rest & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
             if not active.any() or iteration == options.max_newton:
@@ -142,7 +144,7 @@ class _Step:
         if not self.m.has_liquid:
             return True
         change = self.kappa * np.abs(_host((self.gradient * self.mask * z).sum((0, 2))))
-        return change <= _PRESSURE_TOLERANCE * np.abs(self.d.pressure) + _PRESSURE_NOISE
+        return change <= _PRESSURE_TOLERANCE * np.abs(self.d.liquid.gauge_pressure) + _PRESSURE_NOISE
 
     def _line_search(self, dx, residual, active):
         """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the full step overshoots.
@@ -191,14 +193,11 @@ class _Step:
         self._contact(d.outer, self.geoms)
         if m.has_core:
             self._contact(d.core, m.core(w))
-        if m.inner is not None:
-            launch(liquid.cavity_volume, d.face_volume.shape, [m.inner.face, d.x], [d.face_volume])
-            d.volume = m.liquid_volume + _host(view(d.face_volume).sum(0)) - m.rest_volume
+        if d.liquid:
+            d.liquid.evaluate(d.x, d.core)
         if m.has_liquid:
-            launch(liquid.volume_gradient, d.face_volume.shape, [m.inner.face, d.x], [d.inner_corner])
-            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.inner_corner, 1.0, 0], [d.gradient])
-            d.pressure = -self.kappa * (d.volume - m.liquid_volume)
-            self.force += _like(self.x, d.pressure)[:, None] * self.gradient
+            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.liquid.gradient(d.x), 1.0, 0], [d.gradient])
+            self.force += _like(self.x, d.liquid.gauge_pressure)[:, None] * self.gradient
         if self.inertia is not None:
             self.force -= self.inertia * (self.x - self.target) + m.options.mass_damping * self.dt * self.inertia * (self.x - self.start)
             if m.options.stiffness_damping:
@@ -241,6 +240,9 @@ class _Step:
             launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
         if m.has_liquid:
             q += self.kappa * (self.gradient * p).sum((0, 2))[:, None] * self.gradient
+            bend = d.liquid.gradient_derivative(d.x, d.direction)
+            launch(elasticity.gather, (m.nvert, d.nworld), [m.inner.start, m.inner.slot, bend, 1.0, 0], [d.bending])
+            q -= _like(self.x, d.liquid.gauge_pressure)[:, None] * view(d.bending)
         return q * self.mask
 
     def _conjugate_gradients(self, residual, z, active):
@@ -309,6 +311,8 @@ class _Step:
             )  # fmt: skip
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
         d.outer.commit()
+        if d.liquid:
+            d.liquid.commit(good)
         d.motion = self._motion()
         view(d.increment)[...] = self.x - self.start
         self.geoms.advance()

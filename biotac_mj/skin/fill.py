@@ -1,0 +1,59 @@
+"""The skin at rest on its filling: inflated step by step, once for each model."""
+
+import copy
+import dataclasses
+import math
+
+import numpy as np
+
+from .geoms import GeomSet
+from .liquid import Rest
+
+__all__ = ["rest_state"]
+
+
+def rest_state(model) -> Rest:
+    """The balance of skin and liquid without touching geoms.
+
+    Raises:
+      ValueError: the skin does not hold that much liquid or pressure.
+    """
+    options, volume = model.options, model.liquid_volume
+    vert = model.geometry.vert
+    if not (model.has_liquid and (options.fill_volume or options.rest_pressure)):
+        return Rest(vert, 0.0, volume, volume)
+    if volume + options.fill_volume <= 0:
+        raise ValueError(f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)")
+    from .data import SkinData
+    from .solver import step
+
+    model.factor  # noqa: B018 - made here, the copy shares it
+    bare = copy.copy(model)
+    # nothing touches, so the load of the convergence test is the smallest there is: this is a tight solution
+    bare.options = dataclasses.replace(options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=1e-6)
+    bare.rest = Rest(vert, 0.0, volume, volume)
+    data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
+    liquid = data.liquid
+    done, size = 0.0, 0.25
+    while done < 1:
+        size = min(size, 1 - done)
+        if options.rest_pressure:  # liquid at constant pressure
+            liquid.stiffness, liquid.last_pressure = 0.0, np.array([(done + size) * options.rest_pressure])
+        else:
+            liquid.natural_volume = volume + (done + size) * options.fill_volume
+        step(bare, data, nothing)
+        if data.converged[0]:
+            done += size
+        else:
+            size /= 2
+            if size < 1e-3:
+                which = "rest_pressure" if options.rest_pressure else "fill_volume"
+                raise ValueError(
+                    f"no balance of skin and liquid beyond {done:.0%} of {which} {getattr(options, which):g}: "
+                    "this rubber does not hold it; take less"
+                )
+    pressure, filled = float(liquid.gauge_pressure[0]), float(liquid.volume[0])
+    natural = liquid.natural_volume
+    if options.rest_pressure:
+        natural = filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
+    return Rest(data.vert_xpos[0].copy(), pressure, filled, natural)
