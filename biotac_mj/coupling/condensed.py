@@ -24,7 +24,7 @@ class CondensedStepper(FemStepper):
         super().__init__(config, geometry, geoms)
         g = len(geoms)
         sizes = {
-            "head": 4,
+            "head": 5,
             "geom_pos": 3 * g,
             "geom_mat": 9 * g,
             "forces": 1 + 2 * _MAX_FORCES,
@@ -66,7 +66,7 @@ class CondensedStepper(FemStepper):
         )
 
     def _read(self, state) -> Memory:
-        started, pressure, bulge, softening = self._part(state, "head").tolist()
+        started, pressure, bulge, growth, softening = self._part(state, "head").tolist()
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         n, k = int(forces[0]), int(contacts[0])
         return Memory(
@@ -75,6 +75,7 @@ class CondensedStepper(FemStepper):
             force=forces[1 + n : 1 + 2 * n].copy(),
             pressure=pressure,
             bulge=bulge,
+            growth=growth,
             softening=softening,
             geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
             geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
@@ -88,7 +89,7 @@ class CondensedStepper(FemStepper):
                 f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and {_MAX_FORCES}: "
                 "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
             )
-        self._part(state, "head")[:] = memory.started, memory.pressure, memory.bulge, memory.softening
+        self._part(state, "head")[:] = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening
         self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
         self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")

@@ -1,0 +1,328 @@
+"""One step of the condensed skin: candidates, Newton's method on the contact law, results."""
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy.linalg.lapack import dgesv
+
+__all__ = ["Memory", "Outcome", "Step"]
+
+_SOFTENING = (6.5e-3, 0.30)  # h [m], s_max: fitted to the full FEM
+_REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
+_TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
+_MAX_NEWTON = 30
+_SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
+
+
+@dataclasses.dataclass
+class Memory:
+    """What the skin remembers between steps.
+
+    Attributes:
+      started: whether a step was made.
+      coordinate: (n,) contact coordinates with a force, ascending.
+      force: (n,) [N].
+      pressure: [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it grew in the last step.
+      softening: s.
+      geom_pos, geom_mat: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step.
+      contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
+    """
+
+    started: bool
+    coordinate: np.ndarray
+    force: np.ndarray
+    pressure: float
+    bulge: float
+    growth: float
+    softening: float
+    geom_pos: np.ndarray
+    geom_mat: np.ndarray
+    contacts: np.ndarray
+
+    @classmethod
+    def rest(cls, ngeom):
+        none = np.zeros(0)
+        return cls(False, none.astype(int), none, 0.0, 0.0, 0.0, 1.0, np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3)), np.zeros((0, 5)))
+
+
+@dataclasses.dataclass
+class Outcome:
+    """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6, 6), nodes (nvert, 3)."""
+
+    memory: Memory
+    wrench: np.ndarray
+    tangent: np.ndarray
+    vert_xpos: np.ndarray
+    volume: float
+    converged: bool
+    iterations: int
+    error: float
+
+
+class Step:
+    """One step of a CondensedSkin: candidates, Newton's method, results."""
+
+    def __init__(self, skin, memory, u, geom_pos, geom_mat, moved):
+        self.skin, self.memory, self.u = skin, memory, u
+        self.pose = geom_pos, geom_mat
+        self.reach = _REACH + 2 * moved
+        self.share = min(1.0, 3 * moved / max(u.max(), -u.min(), 1e-9))
+        self.faces = np.zeros(0, int)
+        self.inner = np.zeros(0, int)
+        self.meeting = None
+        self.bulge, self.pressure = memory.bulge + memory.growth, memory.pressure
+        self.coordinate, self.force = memory.coordinate, memory.force
+        self.iterations, self.error, self.converged = 0, 0.0, True
+        self.softening = self._soften()
+        self._choose()
+
+    def _choose(self):
+        """Candidates: faces that are near a geom or the core; whether there are more than before."""
+        s = self.skin
+        near = s._faces_near(self.reach, *self.pose, np.sqrt(3) * max(self.u.max(), -self.u.min()))
+        count = len(self.faces) + len(self.inner)
+        if len(self.faces):
+            chosen = np.zeros(len(s._face), bool)
+            chosen[self.faces] = chosen[near] = True
+            near = np.flatnonzero(chosen)
+        self.faces = near
+        if s._core:
+            self.meeting = s._core.meet(self.u, self.share, self.meeting.face if self.meeting else self.inner)
+            self.inner = self.meeting.node
+        return len(self.faces) + len(self.inner) > count
+
+    def missed(self):
+        """Whether something touches that was no candidate; it is one now."""
+        self.reach = self.share = 0.0
+        return self._choose()
+
+    def _set(self):
+        """Hands the candidate faces and their anchors to the kernels."""
+        s, nsample = self.skin, len(self.skin.model.sample)
+        n = len(self.faces)
+        nodes = np.unique(s._face[self.faces])
+        self.outer = nodes[s._number[nodes] >= 0]
+        self.m = 3 * len(self.outer)
+        nface, ndof = s._capacity
+        if n > nface or self.m > ndof:
+            s._allocate(max(nface, 2 * n), max(ndof, 2 * self.m))
+        s._cface[:n], s._carea[:n] = s._face[self.faces], s._area[self.faces]
+        s._count[:] = n, self.m
+        s._slot[nodes] = -1
+        s._slot[self.outer] = np.arange(len(self.outer))
+        s._contact.set_dim((n, 1))
+        self.nsample = n * nsample
+        s._anchor_geom[: self.nsample] = -1
+        contacts = self.memory.contacts
+        if len(contacts):
+            sample = contacts[:, 0].astype(int)
+            place = np.searchsorted(self.faces, sample // nsample)
+            known = place < n
+            known[known] = self.faces[place[known]] == sample[known] // nsample
+            here = place[known] * nsample + sample[known] % nsample
+            s._anchor_geom[here, 0], s._anchor[here, 0] = contacts[known, 1], contacts[known, 2:]
+        self.c, self.rest_W = s._system(self.outer, self.inner)
+        self.a = s._give_at[self.c] if s.model.has_liquid else None
+
+    def _scaled(self):
+        """Softened compliance with the liquid, and the displacement that q alone makes: u = W f + shift; p = -share (a.f c + q)."""
+        s = self.skin
+        scale = self.softening / s.model.material.youngs_modulus
+        if self.a is None:
+            return scale * self.rest_W, 0.0
+        m = s.model
+        share = 1 / (m.liquid_volume / m.options.bulk_modulus + scale * s._liquid_give)
+        a = scale * self.a
+        self.share, self.along = share, a
+        return scale * self.rest_W - np.outer(share * a, a), -share * self.bulge * a
+
+    def _evaluate(self, u):
+        """Contact forces at displacements u (n,) of the contact coordinates and their stiffness blocks."""
+        s, m = self.skin, self.m
+        f = np.zeros(len(u))
+        if m:
+            s._x[self.outer, 0] = s._rest[self.outer] + u[:m].reshape(-1, 3)
+            s._contact.launch()
+            s._gather.launch()
+            f[:m] = s._nodal[:m]
+        if len(self.inner):
+            f[m:], self.closed = self.meeting.force(u[m:])
+        return f
+
+    def _soften(self):
+        """s of the nodes that touched and their displacements."""
+        s = self.skin
+        touched = self.coordinate[self.coordinate < 3 * len(s._outer)]
+        v = self.u[s._outer[touched // 3]]
+        depth = np.sqrt((v * v).sum(1).max(initial=0.0))
+        h, most = _SOFTENING
+        return 1 + depth * most / (depth + h * most)
+
+    def run(self):
+        """Newton's method, repeated until the cavity's exact volume agrees."""
+        s = self.skin
+        if not len(self.faces) and not len(self.force):
+            self.outer, self.nsample = self.faces, 0
+            self.pressure = self.bulge = 0.0
+            s._measure_volume()
+            return
+        self._set()
+        f = np.zeros(len(self.c))
+        place = np.searchsorted(self.coordinate, self.c)
+        known = place < len(self.coordinate)
+        known[known] = self.coordinate[place[known]] == self.c[known]
+        f[known] = self.force[place[known]]
+        for _ in range(4):
+            f = self._newton(f)
+            order = np.argsort(self.c)
+            order = order[f[order] != 0]
+            self.coordinate, self.force = self.c[order], f[order]
+            self.pressure = -self.share * float(self.along @ f + self.bulge) if self.a is not None else 0.0
+            self._place(s._recover(self.coordinate, self.force, self.pressure, self.softening))
+            s._measure_volume()
+            softening = self._soften()
+            settled = abs(softening - self.softening) < _SETTLED * softening
+            if not settled:
+                self.softening = softening
+            if self.a is None:
+                if settled:
+                    break
+                continue
+            bulge = float(s._share.sum()) - s.model.rest_volume - float(s._gradient @ self.u[s.model.free].ravel())
+            change, self.bulge = self.share * abs(bulge - self.bulge), bulge
+            if settled and change < _SETTLED * abs(self.pressure) + 1.0:
+                break
+
+    def _place(self, u):
+        s = self.skin
+        self.u = u
+        s._x[:, 0] = s._rest + u
+
+    def _newton(self, f):
+        self.W, shift = self._scaled()
+        W = self.W
+        u = W @ f + shift
+        g = self._evaluate(u)
+        self.converged = False
+        for _ in range(_MAX_NEWTON):
+            r = g - f
+            self.error = math.sqrt(max(r @ (W @ r), 0.0) / (abs(g @ u) + 1e-14))
+            if self.error < _TOLERANCE:
+                self.converged = True
+                return g
+            self.iterations += 1
+            df = r.copy()
+            D, on = self._springs()
+            if len(on):  # (1 + D W) df = r, of which only the rows of closed contacts are coupled
+                df[on] = 0
+                Won = W[on]
+                matrix = D @ Won[:, on]
+                matrix.ravel()[:: len(on) + 1] += 1
+                df[on] = dgesv(matrix, r[on] - D @ (Won @ df), overwrite_a=1)[2]
+            du = W @ df
+            f, u, g = self._search(f, u, df, du, float(r @ du))
+        return g
+
+    def _springs(self):
+        """Stiffness of the closed contacts, and the contact coordinates that it couples."""
+        s, m = self.skin, self.m
+        K = s._stiffness[: m * m].reshape(m, m)
+        sliding = np.flatnonzero(K.diagonal())
+        n = len(sliding)
+        if not len(self.inner) or not len(self.closed[1]):
+            return K[np.ix_(sliding, sliding)], sliding
+        B, k = self.closed
+        core = (B.T * k) @ B
+        pressed = np.flatnonzero(core.diagonal())
+        D = np.zeros((n + len(pressed), n + len(pressed)))
+        D[:n, :n] = K[np.ix_(sliding, sliding)]
+        D[n:, n:] = core[np.ix_(pressed, pressed)]
+        return D, np.concatenate([sliding, m + pressed])
+
+    def _search(self, f, u, df, du, slope):
+        """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi where the step overshoots)."""
+        low, high, at_low, at_high = 0.0, None, slope, None
+        alpha = 1.0
+        for _ in range(10):
+            new_f, new_u = f + alpha * df, u + alpha * du
+            g = self._evaluate(new_u)
+            now = float((g - new_f) @ du)
+            if abs(now) <= 0.5 * abs(slope):
+                break
+            if now > 0:
+                if high is None:
+                    break
+                low, at_low, at_high = alpha, now, at_high / 2
+            else:
+                high, at_high, at_low = alpha, now, at_low if high is None else at_low / 2
+            alpha = low + (high - low) * at_low / (at_low - at_high)
+            alpha = min(max(alpha, low + 0.05 * (high - low)), high - 0.05 * (high - low))
+        return new_f, new_u, g
+
+    # --- results -----------------------------------------------------------------------------------------------------------------
+
+    def outcome(self) -> Outcome:
+        s = self.skin
+        wrench, contacts = np.zeros((s.geoms.ngroup, 6)), np.zeros((0, 5))
+        tangent = np.zeros((s.geoms.ngroup, 6, 6))
+        nsample = len(s._sample)
+        geom = s._geom[: self.nsample, 0]
+        here = np.flatnonzero(geom >= 0)
+        if len(here):
+            face = self.faces[here // nsample]
+            contacts = np.column_stack([face * nsample + here % nsample, geom[here], s._trial[here, 0]])
+            point = np.einsum("kc,kci->ki", s._sample[here % nsample], s._x[s._face[face], 0])
+            force = s._force[here, 0]
+            load = np.concatenate([force, np.cross(point, force)], axis=1)
+            group = s.geoms.groups[geom[here]]
+            for k in np.unique(group):
+                wrench[k] = -load[group == k].sum(0)
+                tangent[k] = self._tangent(k)
+        pos, mat = self.pose
+        now = (
+            self.coordinate,
+            self.force,
+            self.pressure,
+            self.bulge,
+            self.bulge - self.memory.bulge,
+            self.softening,
+            np.array(pos),
+            np.array(mat),
+            contacts,
+        )
+        memory = Memory(True, *now)
+        volume = float(s._share.sum()) - s.model.rest_volume + s.model.liquid_volume if s.model.inner is not None else 0.0
+        return Outcome(memory, wrench, tangent, s._rest + self.u, volume, self.converged, self.iterations, self.error)
+
+    def _tangent(self, group):
+        """Stiffness against rigid motions of a group of geoms about the origin, G' (D_g - D_g W (I + D W)^-1 D_g) G, symmetric."""
+        s, m = self.skin, self.m
+        D, on = self._springs()
+        outer = on[on < m]
+        if not len(outer):  # only held nodes are touched
+            return np.zeros((6, 6))
+        n = len(outer)
+        mine = D[:n, :n]
+        if s.geoms.ngroup > 1:
+            nface = len(self.faces)
+            touching = s._touching[:nface, 0].copy()
+            geom = s._geom[: self.nsample, 0].reshape(nface, -1).max(1)
+            s._touching[:nface, 0] = touching * ((geom >= 0) & (s.geoms.groups[geom] == group))
+            s._gather.launch()
+            mine = s._stiffness[: m * m].reshape(m, m)[np.ix_(outer, outer)]
+            s._touching[:nface, 0] = touching
+            s._gather.launch()
+        x = s._x[self.outer, 0]
+        rigid = np.zeros((len(x), 3, 6))
+        rigid[:, :, :3] = np.eye(3)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            rigid[:, i, 3 + j], rigid[:, i, 3 + k] = x[:, k], -x[:, j]
+        rigid = rigid.reshape(m, 6)[outer]
+        pull = np.zeros((len(on), 6))
+        pull[:n] = mine @ rigid
+        W = self.W[np.ix_(on, on)]
+        give = W @ dgesv(np.eye(len(on)) + D @ W, pull)[2]
+        stiffness = rigid.T @ pull[:n] - pull.T @ give
+        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+        return (vectors * np.maximum(values, 0)) @ vectors.T
