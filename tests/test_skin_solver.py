@@ -60,7 +60,8 @@ def test_a_world_of_a_batch_is_the_world_alone(tolerance, apart):
         alone, one = press(model, [w])
         np.testing.assert_allclose(batch.vert_xpos[w], alone.vert_xpos[0], rtol=0, atol=apart * 1e-3)  # of the way pressed
         np.testing.assert_allclose(batch.wrench[w], alone.wrench[0], rtol=0, atol=20 * apart * abs(batch.wrench).max())
-        np.testing.assert_allclose(batch.pressure[w], alone.pressure[0], rtol=0, atol=max(20 * apart, tolerance) * abs(batch.pressure).max())
+        stiff = max(20 * apart, tolerance)  # water makes much of little volume
+        np.testing.assert_allclose(batch.pressure[w], alone.pressure[0], rtol=0, atol=stiff * abs(batch.pressure).max())
         np.testing.assert_allclose(tangent[w], alone.tangent(one)[0], rtol=0, atol=1e-5 * abs(tangent).max())  # rows are single precision
     assert abs(batch.wrench[2]).max() < 1e-9 < abs(batch.wrench[0]).max()
     assert abs(batch.wrench[0] - batch.wrench[1]).max() > 1e-2  # the worlds do differ
