@@ -6,6 +6,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 
 import biotac_mj
 from biotac_mj.geometry import indenter
@@ -59,7 +60,7 @@ def state_of(model, data, kind=STATE):
 
 
 # stiffness [N/m] of the coarse skin under each mass [kg], roughly: only to choose a damping with which the ball settles soon
-STIFFNESS = {0.001: 600, 0.01: 1000, 0.1: 2500, 1.0: 16000}
+STIFFNESS = {0.001: 600, 0.01: 1000, 0.1: 1500, 1.0: 12000}
 
 
 def check_weight(mass, timestep, **settings):
@@ -68,7 +69,7 @@ def check_weight(mass, timestep, **settings):
     damping = min(0.7 * critical, 0.2 * mass / timestep)
     rate = damping / (2 * mass) + min(0.5 * stiffness / mass * timestep, 0.5 / timestep)  # the damper's, and backward Euler's own
     model, data, handle = scene(ball(mass, UPRIGHT.format(damping)), timestep, **settings)
-    mujoco.mj_step(model, data, int(10 / rate / timestep) + 20)
+    mujoco.mj_step(model, data, int(12 / rate / timestep) + 20)
     weight, force, balance, clamp, speed = mass * G, [], [], [], []
     for _ in range(30):
         mujoco.mj_step(model, data)
@@ -341,7 +342,7 @@ def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted(
     data.mocap_pos[0, 2] -= 2.2e-3  # on the core at once: three iterations cannot
     mujoco.mj_step(model, data, 3)
     status = handle.read(data, "status")
-    assert status[0] == 0 and status[1] == failed + 3 and status[3] > 5e-4
+    assert status[0] == 0 and status[1] == failed + 3 and status[3] > 3e-4
     assert np.array_equal(handle.read(data, "contact_force"), force)
     assert np.array_equal(data.plugin_state[4 + 54 :], good[4 + 54 :])  # all but the counters and the pose of the one touching body
     data.mocap_pos[0, 2] += 2.2e-3
@@ -374,3 +375,45 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
     radius = np.linalg.norm(place[:, :2], axis=1)
     assert len(radius) > 3
     assert axis.min() - 1e-4 < radius.min() and radius.max() < axis.max() + 1e-4
+
+
+def sagging(model, acceleration):
+    """(nvert, 3) displacements of the linear skin, of scipy's own, under the inertia of a constant acceleration of the core."""
+    force = -model.material.density * model.elasticity.node_volume[model.free, None] * acceleration
+    out = np.zeros((model.nvert, 3))
+    out[model.free] = scipy.sparse.linalg.spsolve(model._stiffness, force.ravel()).reshape(-1, 3)
+    return out
+
+
+@pytest.mark.parametrize("coupling", ["two-way", "one-way"])
+def test_an_accelerating_finger_leaves_its_skin_behind(coupling):
+    """Implicit dynamics: 100 m/s^2, along and around, from a moving start; backward Euler damps the skin's own vibration."""
+    finger = f'<body name="finger"><joint type="slide" axis="0 0 1"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    settings = dict(coupling=coupling, liquid=False, geoms=[], options={"skin": {"dynamics": "implicit"}})
+    model, data, _ = scene("", 0.002, "0 0 0", finger, **settings)
+    data.qvel[0] = 1.5
+    mujoco.mj_step(model, data, 3)
+    skin = solved_skin(data)
+    rest = skin.model.geometry.vert
+    np.testing.assert_allclose(skin.vert_xpos[0], rest, atol=1e-9)  # uniform motion is no motion
+    acceleration = 100.0
+    data.qfrc_applied[0] = acceleration * model.body_subtreemass[1]
+    mujoco.mj_step(model, data, 60)
+    moved, expected = skin.vert_xpos[0] - rest, sagging(skin.model, [0, -acceleration, 0])  # up is the BioTac's -y
+    assert abs(expected).max() > 2e-5
+    assert abs(moved - expected).max() < 0.03 * abs(expected).max()
+
+
+@pytest.mark.slow
+def test_a_turning_finger_feels_the_centrifugal_force():
+    """50 rad/s about the finger's axis: the skin turns with it and is drawn outwards by omega^2 r, late by a step: by the angle omega h."""
+    finger = f'<body name="finger"><joint type="hinge" axis="1 0 0"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    options = {"skin": {"dynamics": "implicit", "mass_damping": 300.0}}
+    model, data, _ = scene("", 0.00025, "0 0 0", finger, liquid=False, geoms=[], options=options)
+    data.qvel[0] = omega = 50.0
+    mujoco.mj_step(model, data, 120)
+    skin = solved_skin(data)
+    rest = skin.model.geometry.vert
+    outwards = -(omega**2) * rest * [0, 1, 1]
+    moved, expected = skin.vert_xpos[0] - rest, sagging(skin.model, outwards[skin.model.free])
+    assert abs(moved - expected).max() < 0.1 * abs(expected).max()

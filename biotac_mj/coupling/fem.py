@@ -11,6 +11,7 @@ from .stepper import SkinResult
 __all__ = ["FemStepper", "rest_geometry"]
 
 _MAX_CONTACTS = 4096
+_STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
 class FemStepper:
@@ -18,7 +19,7 @@ class FemStepper:
 
     The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last
     step, the sticking contacts (how many, then sample, geom and anchor of each), the liquid's pressure and, with implicit dynamics,
-    nodal velocities and the core's pose.
+    nodal velocities.
     """
 
     def __init__(self, config, geometry, geoms):
@@ -35,8 +36,9 @@ class FemStepper:
             "contacts": 1 + 5 * _MAX_CONTACTS,
             "pressure": 1,
         }
-        if self._options.dynamics == "implicit":
-            sizes |= {"velocity": 3 * n, "core_pos": 3, "core_mat": 9}
+        self.inertial = self._options.dynamics == "implicit"
+        if self.inertial:
+            sizes |= {"velocity": 3 * n}
         ends = np.cumsum(list(sizes.values()))
         self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
         self.nstate = int(ends[-1])
@@ -72,13 +74,11 @@ class FemStepper:
             vert, pressure = self._model.rest.vert, self._model.rest.pressure
         self._part(state, "x")[:] = vert.ravel()
         self._part(state, "pressure")[:] = pressure
-        if "core_mat" in self._slices:
-            self._part(state, "core_mat")[:] = np.eye(3).ravel()
 
     def vert_xpos(self, state):
         return self._part(state, "x").reshape(-1, 3)
 
-    def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
+    def solve(self, state, geom_pos, geom_mat, dt, core_pos=_STILL[0], core_mat=_STILL[1]) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
@@ -87,9 +87,17 @@ class FemStepper:
         d, geoms = self._data, self._geom_set
         self._unpack(state)
         geoms.set_pose(geom_pos, geom_mat)
-        if not self._part(state, "started")[0]:
+        started = self._part(state, "started")[0]
+        if not started:
             geoms.advance()
-        step(self._model, d, geoms, dt, core_pos, core_mat)
+        if self.inertial:
+            x = self.vert_xpos(state)
+            rigid = (x @ (core_mat[1] - core_mat[0]).T + core_pos[1] - core_pos[0]) / dt
+            velocity = self._part(state, "velocity").reshape(-1, 3) if started else rigid  # begins at rest on a core that may move
+            d.load_motion(velocity, core_pos[0], core_mat[0])
+            step(self._model, d, geoms, dt, core_pos[1:], core_mat[1:])
+        else:
+            step(self._model, d, geoms, dt)
         new = np.zeros_like(state)
         self._pack(new, geom_pos, geom_mat)
         return SkinResult(
@@ -114,10 +122,6 @@ class FemStepper:
         )
         geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
         geoms.advance()
-        if "velocity" in self._slices:
-            d.load_motion(
-                self._part(state, "velocity").reshape(-1, 3), self._part(state, "core_pos"), self._part(state, "core_mat").reshape(3, 3)
-            )
 
     def _pack(self, state, geom_pos, geom_mat):
         d = self._data
@@ -137,10 +141,8 @@ class FemStepper:
         buffer = self._part(state, "contacts")
         buffer[0] = len(contacts)
         buffer[1 : 1 + contacts.size] = contacts.ravel()
-        if "velocity" in self._slices:
+        if self.inertial:
             self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
-            self._part(state, "core_pos")[:] = d.core_pos[0]
-            self._part(state, "core_mat")[:] = d.core_mat[0].ravel()
 
 
 def rest_geometry(config, geometry):
@@ -153,9 +155,9 @@ def rest_geometry(config, geometry):
 
 
 def _choices(config):
-    # half of a lone press's tolerance: two-way, the error of single steps is heard as chatter
+    # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
     liquid = {} if config.liquid is None else {"liquid": config.liquid}
-    options = SkinOptions(**({"tolerance": 5e-4} | liquid | config.options.get("skin", {})))
+    options = SkinOptions(**({"tolerance": 3e-4} | liquid | config.options.get("skin", {})))
     return Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default"), options
 
 

@@ -171,17 +171,25 @@ class Instance:
         models = self.setup.parts(self.state)[1]
         return models[:, :6], models[:, 6:42].reshape(-1, 6, 6), models[:, 42:45], models[:, 45:].reshape(-1, 3, 3)
 
-    def solve(self, pos, mat):
-        """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings."""
+    @property
+    def inertial(self):
+        """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
+        return getattr(self.setup.skin.stepper, "inertial", False)
+
+    def solve(self, pos, mat, core=()):
+        """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings.
+
+        An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the end of the step.
+        """
         self._pose = pos, mat
         dt = self.model.opt.timestep
-        key = (pos.tobytes(), mat.tobytes(), dt, self.state.tobytes())
+        key = (pos.tobytes(), mat.tobytes(), dt, self.state.tobytes(), *(c.tobytes() for c in core))
         result = self._solved.get(key)  # solving is a function of the key, so a second mj_forward costs nothing
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
-                result = skin.stepper.solve(before, *geom_pose, dt)
+                result = skin.stepper.solve(before, *geom_pose, dt, *core)
             if not result.converged:  # go on with what was last known to be good
                 wrench, _, pos, mat = self.last_model()
                 tangent = np.zeros((self.setup.ngroup, 6, 6))

@@ -77,7 +77,8 @@ class SkinStepper(Protocol):
 
     def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
         """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its arguments alone, which keeps
-        `state` as it is."""
+        `state` as it is. A stepper with a true attribute `inertial` gets core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac
+        frame in the world at the start and at the end of the step."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""

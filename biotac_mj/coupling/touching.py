@@ -66,15 +66,25 @@ class Touching:
         Raises:
           ValueError: a pose or a velocity is not finite.
         """
-        pos, mat = data.xpos[self._body], data.xmat[self._body].reshape(-1, 3, 3)
-        if horizon:
-            velocity = data.cvel[self._body]  # rotation, then translation of the point at the tree's centre of mass
-            spin = velocity[:, :3]
-            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, pos - data.subtree_com[self._root]))
-            mat = rotation(horizon * spin) @ mat
+        pos, mat = self._ahead(data, self._body, self._root, horizon)
         frame = mat[0]
         pos, mat = (pos[1:] - pos[0]) @ frame, frame.T @ mat[1:]
         self._check(pos, mat)
+        return pos, mat
+
+    def core_motion(self, data, horizon):
+        """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present velocity."""
+        now, then = (self._ahead(data, self._body[:1], self._root[:1], h) for h in (0.0, horizon))
+        return np.concatenate([now[0], then[0]]), np.concatenate([now[1], then[1]])
+
+    @staticmethod
+    def _ahead(data, body, root, horizon):
+        pos, mat = data.xpos[body], data.xmat[body].reshape(-1, 3, 3)
+        if horizon:
+            velocity = data.cvel[body]  # rotation, then translation of the point at the tree's centre of mass
+            spin = velocity[:, :3]
+            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, pos - data.subtree_com[root]))
+            mat = rotation(horizon * spin) @ mat
         return pos, mat
 
     def geom_pose(self, pos, mat):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from .instance import Instance
-from .touching import displace, displacement
+from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
 
@@ -34,7 +34,8 @@ class World:
         instance = self.instances[index]
         if not instance.two_way:
             instance.begin()
-            instance.solve(*instance.touching.predict(self.data, instance.horizon))
+            core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
+            instance.solve(*instance.touching.predict(self.data, instance.horizon), core)
         elif index == self.first:
             for other in self.coupled:
                 other.begin()
@@ -86,6 +87,10 @@ class _Coupled:
         self.jacobian = instance.metric.jacobians(data)
         instance.metric.begin(data)
         self.pose = instance.touching.predict(data, self.horizon)
+        self.core = ()
+        if instance.inertial:
+            self.core = instance.touching.core_motion(data, self.horizon)
+            self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.solved = self.written = False
         self.converged = True
@@ -96,10 +101,17 @@ class _Coupled:
         pose = displace(*self.pose, motion)
         if self.solved and (not self.converged or self._distance(pose) < TOLERANCE):
             return False
-        result = self.instance.solve(*pose)
+        result = self.instance.solve(*pose, self._core_motion(acceleration))
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
         self.solved, self.converged, self.written = True, result.converged, False
         return True
+
+    def _core_motion(self, acceleration):
+        if not self.core:
+            return ()
+        (start, end), (turned, turning) = self.core
+        move = self.horizon**2 * (self.core_jacobian @ acceleration)
+        return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
 
     def _distance(self, pose):
         motion = displacement(*pose, *self.pose0)
