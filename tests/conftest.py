@@ -1,3 +1,9 @@
+import os
+
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # before numpy reads them
+    os.environ.setdefault(_threads, "1")
+
+# ruff: noqa: E402
 import pathlib
 
 import numpy as np

@@ -2,6 +2,7 @@
 
 import numpy as np
 import warp as wp
+from threadpoolctl import ThreadpoolController
 
 from . import contact, elasticity
 from .data import SkinData, view
@@ -11,6 +12,9 @@ from .preconditioner import Preconditioner
 from .types import vec3
 
 __all__ = ["step"]
+
+# matrices of a few hundred rows: more threads of BLAS only wait for each other
+_threads = ThreadpoolController()
 
 _BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = 0.01
@@ -36,7 +40,8 @@ def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = No
     if geoms.nworld != data.nworld:
         raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
     _refuse_core(model, geoms)
-    _Step(model, data, geoms, dt, core_pos, core_mat).run()
+    with _threads.limit(limits=1, user_api="blas"):
+        _Step(model, data, geoms, dt, core_pos, core_mat).run()
 
 
 def _refuse_core(model, geoms):
