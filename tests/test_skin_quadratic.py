@@ -1,18 +1,26 @@
 """Quadratic tetrahedra: their derivatives, what they must do exactly, other codes' answers, and rubber that must not lock."""
 
+import pathlib
+import sys
+
 import numpy as np
 import pytest
 import skfem
 import warp as wp
-from blocks import box, skin
+from blocks import box, place, skin
 from skfem.helpers import ddot, div, sym_grad
 
-from biotac_mj.skin import Material, SkinData, SkinModel, SkinOptions
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.data import view
 from biotac_mj.skin.material import LAWS
 from biotac_mj.skin.quadratic import QuadraticTetrahedra, quadratic
 from biotac_mj.skin.types import vec3
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
+import locking  # noqa: E402
+
+NOTHING = GeomSet([], [])
 TIGHT = dict(max_newton=200, max_cg=200)
 CPU = wp.get_device("cpu")
 
@@ -87,3 +95,116 @@ def test_stiffness_equals_scikit_fem():
     ours = u.ravel() @ QuadraticTetrahedra(refined.vert, elem10, LAWS["linear"], CPU).rest_stiffness(mu, lame) @ u.ravel()
     theirs = u[order].ravel()
     assert ours == pytest.approx(theirs @ stiffness @ theirs, rel=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_patch(law):
+    """An affine displacement of the boundary of an irregular block goes on inside, exactly, also nearly incompressible."""
+    vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, jitter=0.3)
+    outside = np.flatnonzero(np.isin(vert, [0, 1e-2]).any(1))
+    model = SkinModel(skin(vert, elem, outside), Material(law, 1e6, 0.49), SkinOptions(element="quadratic", tolerance=1e-5, **TIGHT))
+    data = SkinData(model)
+    A = np.array([[0.05, 0.03, -0.02], [-0.04, -0.06, 0.01], [0.02, 0.05, 0.01]])
+    place(data, model.fixed, model.geometry.vert[model.fixed] @ (np.eye(3) + A).T)
+    step(model, data, NOTHING)
+    assert data.converged.all()
+    assert abs(data.vert_xpos[0] - model.geometry.vert @ (np.eye(3) + A).T).max() < 1e-9 * 1e-2
+
+
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
+def test_rigid_motion_makes_no_force(law):
+    model = block(law, nu=0.4999)
+    Q, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))
+    Q *= np.sign(np.linalg.det(Q))
+    data = SkinData(model)
+    moved = force(model, data, model.geometry.vert @ Q.T + 0.05)
+    stretched = force(model, data, 1.01 * model.geometry.vert)
+    assert abs(moved).max() < 1e-9 * abs(stretched).max()
+
+
+def test_stress_of_a_stretched_block():
+    """Isochoric stretch s of Neo-Hookean rubber: sigma = mu (s^2 - 1/s) along, less the same mean (Treloar)."""
+    model, s = block("neo_hookean", nu=0.499), 1.3
+    data = SkinData(model)
+    view(data.x)[:, 0] = model.geometry.vert * [s, s**-0.5, s**-0.5]
+    cauchy, mises = data.stress()
+    np.testing.assert_allclose(mises[0], model.material.mu * (s**2 - 1 / s), rtol=1e-9)
+    np.testing.assert_allclose(cauchy[0, :, 0, 0] - cauchy[0, :, 1, 1], model.material.mu * (s**2 - 1 / s), rtol=1e-9)
+
+
+def test_cook_does_not_lock():
+    """Cook's membrane, plane strain, nu 0.4999: within 2 % of Taylor-Hood elements where linear tetrahedra are lost."""
+    wanted = locking.cook_reference(0.4999, 24)
+    errors = np.array([locking.cook_tip(n, "quadratic", 0.4999) for n in (4, 8, 16)]) / wanted - 1
+    assert abs(errors[-1]) < 0.02 and (np.abs(errors[:-1]) > 2 * np.abs(errors[1:])).all(), errors
+    assert locking.cook_tip(16, "linear", 0.4999) / wanted - 1 < -0.5
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4999])
+def test_inflated_sphere(nu):
+    """Lame's thick sphere; with this mesh the loads of the faceted inside are off by as much."""
+    assert (abs(locking.sphere_growth(nu, "quadratic", 2, 2)) < 0.012).all()
+    if nu > 0.49:
+        assert (locking.sphere_growth(nu, "linear", 2, 2) < -0.5).all()
+
+
+def test_refined_geometry():
+    """The given nodes come first; the new ones fill the same volume and the same closed surfaces."""
+    coarse = load_skin("coarse")
+    model = SkinModel(coarse, "ansys", SkinOptions(core_contact=False, liquid=False))
+    fine = model.geometry
+    assert (fine.vert[: coarse.nvert] == coarse.vert).all() and set(coarse.fixed) < set(model.fixed)
+    assert len(np.unique(fine.elem)) == fine.nvert == model.nvert
+    for name in ("outer_face", "inner_face"):
+        given, new = (np.moveaxis(g.vert[getattr(g, name)], 1, 0) for g in (coarse, fine))
+        areas = [np.cross(t[1] - t[0], t[2] - t[0]) for t in (given, new)]
+        np.testing.assert_allclose(areas[1].reshape(-1, 4, 3).sum(1), areas[0], atol=1e-12 * abs(areas[0]).max())  # children in order
+    corner = fine.vert[fine.elem]
+    volume = np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+    assert (volume > 0).all()
+    np.testing.assert_allclose(volume.reshape(-1, 8).sum(1), model.elasticity.volume.numpy(), rtol=1e-9)
+    assert model.elasticity.node_volume.sum() == pytest.approx(volume.sum())
+
+
+def test_ansys_preset_presses():
+    """The ANSYS rubber with liquid: every step of a press converges, the liquid keeps its volume, the force rises."""
+    model = SkinModel(load_skin("coarse"), "ansys")
+    assert model.element == "quadratic" and model.has_liquid and PRESETS["paper"].element == "linear"
+    data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], [model.material.friction])
+    low = model.geometry.vert[:, 1].min()
+    pushed = []
+    for depth in (0.0, 0.1e-3, 0.2e-3, 0.3e-3):
+        geoms.set_pose(np.array([[-10e-3, low - 3.5e-3 + depth, 0]]), np.eye(3)[None])
+        step(model, data, geoms)
+        assert data.converged.all()
+        pushed.append(-data.wrench[0, 0, 1])
+    assert (np.diff(pushed) > 0).all() and pushed[-1] > 0.01
+    assert abs(data.volume[0] / model.liquid_volume - 1) < 1e-6
+
+
+@pytest.mark.parametrize("make, text", [
+    (lambda: SkinOptions(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic, or None for the material's choice"),
+    (lambda: Material(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic"),
+])  # fmt: skip
+def test_bad_element(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+def test_folded_element():
+    vert, elem = box([np.linspace(0, 1e-2, 2)] * 3)
+    refined, elem10 = quadratic(skin(vert, elem, [0]))
+    bent = refined.vert.copy()
+    bent[elem10[0, 4]] += 2 * (bent[elem10[0, 2]] - bent[elem10[0, 4]])  # an edge's node beyond the opposite corner
+    with pytest.raises(ValueError, match="quadratic tetrahedra are folded .*: straighten their edges"):
+        QuadraticTetrahedra(bent, elem10, 0, CPU)
+
+
+def test_factor_at_a_turned_shape():
+    """A skin that has only turned has the compliance of rest, turned with it."""
+    model = block("neo_hookean", nu=0.499)
+    Q = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    f = np.random.default_rng(0).standard_normal((model.nvert, 1, 3))
+    f[model.fixed] = 0
+    turned = model.factor_at(model.geometry.vert @ Q.T).solve(f @ Q.T)
+    np.testing.assert_allclose(turned, model.factor.solve(f) @ Q.T, rtol=0, atol=1e-8 * abs(turned).max())

@@ -157,7 +157,7 @@ class SkinModel:
             geometry, elem = quadratic(geometry)
             core_faces = None if core_faces is None else (4 * np.asarray(core_faces)[:, None] + np.arange(4)).ravel()
         self.geometry, vert = geometry, geometry.vert
-        self.nvert, self.nelem = len(vert), len(elem)
+        self.nvert, self.nelem, self._elem = len(vert), len(elem), elem
         self.fixed = geometry.fixed.astype(int)
         if not len(self.fixed):
             raise ValueError(f"skin {geometry.name!r} has no fixed nodes: it would float away; fix those on core, nail and clamp")
@@ -184,9 +184,7 @@ class SkinModel:
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
-        stiffness = self.elasticity.rest_stiffness(self.material.mu, self.material.lame)
-        dof = (3 * self.free[:, None] + np.arange(3)).ravel()
-        self._stiffness = stiffness[dof][:, dof]
+        self._stiffness = self._of_free(self.elasticity.rest_stiffness(self.material.mu, self.material.lame))
 
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
@@ -235,7 +233,30 @@ class SkinModel:
     @functools.cached_property
     def factor(self):
         """Inverse of the rest stiffness of the free nodes, as an operator."""
-        return (DenseFactor if self.device.is_cuda else SparseFactor)(self._stiffness, self.free, self.geometry.vert, self.device)
+        return self._invert(self._stiffness)
+
+    def factor_at(self, vert_xpos):
+        """The same for the skin in a deformed shape: its stiffness had it been made so, always positive definite.
+
+        Nearly incompressible rubber that has turned and strained resists volume change along other directions than at rest, which the
+        factor at rest does not know: preconditioned by it, conjugate gradients need hundreds of iterations at nu 0.4999 where this one
+        needs a few.
+
+        Args:
+          vert_xpos: (nvert, 3) [m].
+
+        Raises:
+          ValueError: a tetrahedron is inverted there.
+        """
+        formulation = type(self.elasticity)(vert_xpos, self._elem, self.law, self.device)
+        return self._invert(self._of_free(formulation.rest_stiffness(self.material.mu, self.material.lame)))
+
+    def _invert(self, stiffness):
+        return (DenseFactor if self.device.is_cuda else SparseFactor)(stiffness, self.free, self.geometry.vert, self.device)
+
+    def _of_free(self, stiffness):
+        dof = (3 * self.free[:, None] + np.arange(3)).ravel()
+        return stiffness[dof][:, dof]
 
 
 @functools.lru_cache(maxsize=8)

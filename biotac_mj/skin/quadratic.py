@@ -5,7 +5,7 @@ with the law's measure of dilatation theta (`material.dilatation`; J - 1 for neo
 element's mean dilatation alone (Nagtegaal, Parks and Rice 1974; Simo, Taylor and Pister 1985): volume is kept per element, not at
 every point, which leaves the element free to bend. A mean dilatation for all of lam (POINTWISE = 0) would be too soft under local
 loads, since a pressure that is constant over large elements is crude. What varies inside an element vanishes with its size, so
-POINTWISE changes the error of a mesh, not the limit. Compressible materials (lam <= POINTWISE mu) are integrated fully, as CalculiX's C3D10 is.
+POINTWISE changes the error of a mesh, not the limit. Where lam <= POINTWISE mu, integration is full, as in CalculiX's C3D10.
 """
 
 import dataclasses

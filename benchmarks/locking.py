@@ -1,0 +1,233 @@
+"""Locking of the skin's elements: linear and quadratic tetrahedra on the skins, Cook's membrane and an inflated thick sphere.
+
+    python benchmarks/locking.py --json out/locking.json [--skins coarse,default,fine] [--reference default] [--press coarse] [--depth 1.0]
+
+Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y) that moves the patch by
+0.1 mm on the load's average, small strain, for each resolution and element; the reference is the quadratic element on the skin that
+--reference names, printed first.
+Factor and solve seconds are CHOLMOD's on this machine: the price of a step is a few tens of solves. --press adds real presses of a sphere.
+Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of scikit-fem. Sphere: Lame's closed form.
+"""
+
+import argparse
+import os
+import pathlib
+import sys
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "tests"))  # blocks: small meshes
+
+import numpy as np
+import warp as wp
+from accuracy import write_json
+from blocks import boundary, box, faces_on, nodal_areas, shell, skin
+
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.contact import face_samples
+from biotac_mj.skin.elasticity import LinearTetrahedra
+from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.quadratic import QuadraticTetrahedra, quadratic
+
+__all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
+
+MATERIALS = {"paper": (1.55223093e6, 0.31645428), "rubber": (2.8e5, 0.45), "ansys": (2.8e5, 0.4999)}
+PATCH_CENTER, PATCH_SIZE, PATCH_MOTION = -10e-3, 1e-3, 1e-4  # [m]
+
+
+def discretise(geometry, element, material, project=None):
+    """The geometry with all its nodes, and its stiffness at rest (3 nvert, 3 nvert) [N/m]."""
+    if element == "linear":
+        return geometry, LinearTetrahedra(geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu")).rest_stiffness(
+            material.mu, material.lame
+        )
+    geometry, elem = quadratic(geometry, project)
+    formulation = QuadraticTetrahedra(geometry.vert, elem, LAWS[material.law], wp.get_device("cpu"))
+    return geometry, formulation.rest_stiffness(material.mu, material.lame)
+
+
+def solve(stiffness, load, free, prescribed=None):
+    """Displacements (3 nvert,) under nodal loads with the coordinates outside `free` held at `prescribed`; seconds of factor and solve."""
+    from cholespy import CholeskySolverD, MatrixType
+
+    u = np.zeros(len(load)) if prescribed is None else prescribed.copy()
+    u[free] = 0
+    b = (load - stiffness @ u)[free]
+    a = stiffness[free][:, free].tocoo()
+    times = [time.perf_counter()]
+    factor = CholeskySolverD(a.shape[0], a.row.astype(np.int32), a.col.astype(np.int32), a.data, MatrixType.COO)
+    times.append(time.perf_counter())
+    x = np.empty_like(b)
+    factor.solve(b, x)
+    times.append(time.perf_counter())
+    u[free] = x
+    return u, np.diff(times)
+
+
+def patch_force(geometry, element, material):
+    """Force of the patch load that moves it by 0.1 mm on the load's average [N]; free coordinates; seconds of factor and solve."""
+    geometry, stiffness = discretise(geometry, element, material)
+    tri = geometry.vert[geometry.outer_face]
+    area = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])[:, 1] / 2
+    sample = face_samples(4)
+    point = np.einsum("sk,fkd->fsd", sample, tri)
+    square = (point[..., 0] - PATCH_CENTER) ** 2 + point[..., 2] ** 2
+    traction = np.exp(-square / (2 * PATCH_SIZE**2)) * (point[..., 1] < 0) * np.maximum(-area, 0)[:, None]
+    load = np.zeros((geometry.nvert, 3))
+    np.add.at(load[:, 1], geometry.outer_face, traction @ sample)
+    load /= load.sum()
+    free = (3 * np.setdiff1d(np.arange(geometry.nvert), geometry.fixed)[:, None] + np.arange(3)).ravel()
+    u, seconds = solve(stiffness, load.ravel(), free)
+    return PATCH_MOTION / (load.ravel() @ u), len(free), *seconds
+
+
+def cook_tip(cells, element, nu):
+    """Cook's membrane as a plane strain slab of cells x cells x 1: how far the corner (48, 60) moves up under a load of 1, E 1."""
+    thickness = 48 / cells
+    vert, elem = box([np.linspace(0, 1, cells + 1)] * 2 + [[0, thickness]])
+    flat = vert[:, 0].copy()
+    vert[:, 0], vert[:, 1] = 48 * flat, 44 * flat + vert[:, 1] * (44 - 28 * flat)
+    geometry, stiffness = discretise(skin(vert, elem, [0], boundary(elem)), element, Material("linear", 1.0, nu))
+    load = np.zeros((geometry.nvert, 3))
+    load[:, 1] = nodal_areas(geometry.vert, faces_on(geometry.vert, geometry.outer_face, 0, 48)) / 16
+    moves = np.repeat(geometry.vert[:, :1] > 1e-9, 3, axis=1)
+    moves[:, 2] = False
+    u, _ = solve(stiffness, load.ravel(), np.flatnonzero(moves.ravel()))
+    corner = np.linalg.norm(geometry.vert[:, :2] - [48, 60], axis=1) < 1e-9
+    return u.reshape(-1, 3)[corner, 1].mean()
+
+
+def cook_reference(nu, cells=48):
+    """The same by Taylor-Hood triangles (quadratic displacement, continuous linear pressure) of scikit-fem, which do not lock."""
+    import skfem
+    from scipy.sparse import bmat
+    from skfem.helpers import ddot, div, sym_grad
+
+    mesh = skfem.MeshTri.init_tensor(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))
+    x, y = mesh.p
+    mesh = skfem.MeshTri(np.stack([48 * x, 44 * x + y * (44 - 28 * x)]), mesh.t)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
+    pressure = basis.with_element(skfem.ElementTriP1())
+    material = Material("linear", 1.0, nu)
+    a = skfem.BilinearForm(lambda u, v, w: 2 * material.mu * ddot(sym_grad(u), sym_grad(v))).assemble(basis)
+    b = skfem.BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, pressure)
+    c = skfem.BilinearForm(lambda p, q, w: -p * q / material.lame).assemble(pressure)
+    right = skfem.FacetBasis(mesh, basis.elem, facets=mesh.facets_satisfying(lambda x: abs(x[0] - 48) < 1e-9))
+    load = skfem.LinearForm(lambda v, w: v[1] / 16).assemble(right)
+    held = basis.get_dofs(lambda x: abs(x[0]) < 1e-9).all()
+    solution = skfem.solve(*skfem.condense(bmat([[a, b.T], [b, c]], "csr"), np.concatenate([load, np.zeros(pressure.N)]), D=held))
+    corner = np.flatnonzero(np.linalg.norm(basis.doflocs.T - [48, 60], axis=1) < 1e-9)
+    return solution[corner[1]]
+
+
+def sphere_growth(nu, element, subdivisions, layers, inner=6e-3, outer=10e-3, pressure=1e3, E=1e6):
+    """Relative errors of a thick sphere's growth under pressure at its inner and outer radius (Lame; Timoshenko and Goodier, 136)."""
+
+    def exact(r):
+        return pressure * inner**3 / (E * (outer**3 - inner**3)) * ((1 - 2 * nu) * r + (1 + nu) * outer**3 / (2 * r**2))
+
+    def onto(point, name):
+        return point * (outer if name == "outer" else inner) / np.linalg.norm(point, axis=1, keepdims=True)
+
+    vert, elem, face = shell(outer, inner, subdivisions, layers)
+    geometry, stiffness = discretise(skin(vert, elem, [0], inner_face=face), element, Material("linear", E, nu), onto)
+    vert, face = geometry.vert, geometry.inner_face
+    edge = vert[face[:, 1:]] - vert[face[:, :1]]
+    load = np.zeros_like(vert)
+    np.add.at(load, face.ravel(), np.repeat(-pressure * np.cross(edge[:, 0], edge[:, 1]) / 6, 3, axis=0))
+    radius = np.linalg.norm(vert, axis=1)
+    held = [np.linalg.norm(vert - outer * axis, axis=1).argmin() for axis in np.eye(3)]  # they go where they belong: no other force
+    prescribed = (vert / radius[:, None] * exact(radius)[:, None]).ravel()
+    free = (3 * np.setdiff1d(np.arange(len(vert)), held)[:, None] + np.arange(3)).ravel()
+    u, _ = solve(stiffness, load.ravel(), free, prescribed)
+    grown = (u.reshape(-1, 3) * vert).sum(1) / radius
+    return np.array([grown[abs(radius - r) < 1e-9].mean() / exact(r) - 1 for r in (inner, outer)])
+
+
+def press(name, element, preset, depth, steps=10, radius=3.5e-3):
+    """Presses a sphere of 3.5 mm radius along +y onto the pad at x = -10 mm: force [N], seconds, Newton iterations, steps that failed."""
+    model = SkinModel(load_skin(name), preset, SkinOptions(element=element))
+    model.factor  # noqa: B018  made here, so that `seconds` is of the steps
+    data, geoms = SkinData(model), GeomSet(["sphere"], [(radius,)], [model.material.friction])
+    point = np.einsum("sk,fkd->fsd", face_samples(8), model.geometry.vert[model.geometry.outer_face]).reshape(-1, 3)
+    square = (point[:, 0] - PATCH_CENTER) ** 2 + point[:, 2] ** 2
+    under = (point[:, 1] < 0) & (square < radius**2)
+    first = (point[under, 1] - np.sqrt(radius**2 - square[under])).min()
+    seconds, iterations, lost = time.perf_counter(), 0, 0
+    for k in range(steps + 1):
+        geoms.set_pose(np.array([[PATCH_CENTER, first + depth * k / steps, 0]]), np.eye(3)[None])
+        step(model, data, geoms)
+        iterations, lost = iterations + int(data.iterations[0]), lost + int(not data.converged[0])
+    return float(np.linalg.norm(data.wrench[0, 0, :3])), time.perf_counter() - seconds, iterations, lost
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", default="out/locking.json")
+    parser.add_argument("--skins", default="coarse,default,fine", help="linear elements on each; quadratic ones on all but fine")
+    parser.add_argument("--reference", default="default", help="skin whose quadratic elements are the reference")
+    parser.add_argument("--press", default="", help="skins for real presses, comma separated")
+    parser.add_argument("--depth", type=float, default=1.0, help="of the presses [mm]")
+    options = parser.parse_args(arguments)
+    out = {"skin": _skins(options.skins.split(","), options.reference), "cook": _cook(), "sphere": _spheres()}
+    out["press"] = _presses(list(filter(None, options.press.split(","))), options.depth)
+    write_json(options.json, out)
+    return 0
+
+
+def _skins(skins, reference):
+    rows = []
+    first = (reference, "quadratic")
+    others = [(name, element) for name in skins for element in ("linear", "quadratic")]
+    todo = [first] + [pair for pair in others if pair not in (first, ("fine", "quadratic"))]
+    print(f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}{'solve ms':>10}{'force N':>10}{'error':>9}")
+    for label, (E, nu) in MATERIALS.items():
+        wanted = None
+        for name, element in todo:
+            force, unknowns, factor, once = patch_force(load_skin(name), element, Material("neo_hookean", E, nu))
+            wanted = wanted or force
+            row = dict(material=label, nu=nu, skin=name, element=element, unknowns=unknowns, factor_s=factor, solve_s=once, force=force)
+            rows.append(row | {"error": force / wanted - 1})
+            cells = f"{unknowns:>9}{factor:>10.2f}{1e3 * once:>10.1f}{force:>10.5f}{force / wanted - 1:>9.1%}"
+            print(f"{label:<10}{name:<10}{element:<11}" + cells, flush=True)
+    return rows
+
+
+def _cook(nu=0.4999):
+    rows, wanted = [], cook_reference(nu)
+    print(f"\nCook's membrane, plane strain, nu {nu}, corner (48, 60): Taylor-Hood {wanted:.3f}")
+    for cells in (4, 8, 16):
+        tips = {element: cook_tip(cells, element, nu) for element in ("linear", "quadratic")}
+        rows.append(dict(cells=cells, reference=wanted, **tips))
+        print(f"{cells:>3} cells  " + "  ".join(f"{e} {tip:.3f} ({tip / wanted - 1:+.1%})" for e, tip in tips.items()), flush=True)
+    return rows
+
+
+def _spheres():
+    rows = []
+    print("\nThick sphere (radii 6 and 10 mm) under internal pressure, growth against Lame, at inner and outer radius")
+    for nu in (0.3, 0.4999):
+        for element, mesh in (("linear", (2, 2)), ("linear", (3, 4)), ("quadratic", (1, 1)), ("quadratic", (2, 2))):
+            errors = sphere_growth(nu, element, *mesh)
+            rows.append(dict(nu=nu, element=element, mesh=mesh, errors=errors.tolist()))
+            text = f"nu {nu:<7}{element:<10}{20 * 4 ** mesh[0]:>5} facets x {mesh[1]} layers: "
+            print(text + "  ".join(f"{e:+.2%}" for e in errors), flush=True)
+    return rows
+
+
+def _presses(skins, depth):
+    rows = []
+    for name in skins:
+        for preset in ("paper", "ansys"):
+            for element in ("linear", "quadratic"):
+                force, seconds, iterations, lost = press(name, element, preset, 1e-3 * depth)
+                row = dict(skin=name, preset=preset, element=element, depth=depth, force=force, seconds=seconds)
+                rows.append(row | {"iterations": iterations, "not_converged": lost})
+                cells = f"{force:.4f} N  {seconds:.1f} s  {iterations} iterations  {lost} steps failed"
+                print(f"press {depth} mm  {name:<9}{preset:<7}{element:<10} " + cells, flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    sys.exit(main())
