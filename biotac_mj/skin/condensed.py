@@ -10,6 +10,8 @@ A linear skin is too stiff at depth: real skin rolls around the indenter. The so
 displacement d of a touching node is that effect fitted to the full FEM (docs/condensed.md).
 """
 
+import math
+
 import numpy as np
 import warp as wp
 from scipy.linalg.blas import saxpy
@@ -135,6 +137,10 @@ class CondensedSkin:
         self._sample = contact.face_samples(model.options.samples)
         self._allocate(64, 300)
         self._core = CoreContact(model, self._x_wp, self._x) if model.has_core else None
+        if self._core and geoms.count:
+            depth = wp.zeros((geoms.count, 1), dtype=real, device="cpu")
+            self._depth = depth.numpy()
+            self._depths = self._record(contact.depth_in_core, (geoms.count, 1), [model.core_vert, geoms.struct], [depth])
         self._inner = self._core.node if self._core else np.zeros(0, int)
         self._away = self._core.direction if self._core else np.zeros((0, 3))
         self.compliance = SurfaceCompliance(model, self._outer, self._inner, self._away, cache)
@@ -218,12 +224,19 @@ class CondensedSkin:
     # --- a step ------------------------------------------------------------------------------------------------------------------
 
     def solve(self, memory: Memory, geom_pos, geom_mat) -> Outcome:
-        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments alone."""
+        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments alone.
+
+        Raises:
+          ValueError: NaN in a pose, or a geom deep inside the core.
+        """
+        if not (math.isfinite(np.sum(geom_pos)) and math.isfinite(np.sum(geom_mat))):
+            raise ValueError("geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was never set")
         struct = self.geoms.struct
         last = (memory.geom_pos, memory.geom_mat) if memory.started else (geom_pos, geom_mat)
         if self.geoms.count:
             struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = geom_pos, geom_mat
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
+            self._refuse_core()
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self._rest + u
         moved = np.abs(geom_pos - last[0]).max(initial=0.0)
@@ -235,6 +248,18 @@ class CondensedSkin:
         out = step.outcome()
         self._keep(out.memory, step.u)
         return out
+
+    def _refuse_core(self):
+        limit = self.model.options.max_core_depth
+        if self._core is None:
+            return
+        self._depths.launch()
+        if self._depth.max() > limit:
+            g = int(self._depth.argmax())
+            raise ValueError(
+                f"geom {g} ({self.geoms.types[g]}) is {self._depth.max() * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
+                "move it out, press less deep or take smaller steps"
+            )
 
     def _faces_near(self, reach, pos, mat, moved):
         """Faces with a sample nearer to a geom than the reach; `moved` bounds how far the nodes are from rest.

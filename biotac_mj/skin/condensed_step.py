@@ -11,7 +11,7 @@ __all__ = ["Memory", "Outcome", "Step"]
 _SOFTENING = (6.5e-3, 0.30)  # h [m], s_max: fitted to the full FEM
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
-_MAX_NEWTON = 30
+_MAX_NEWTON, _PASSES = 30, 4
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
 
@@ -173,8 +173,10 @@ class Step:
         known = place < len(self.coordinate)
         known[known] = self.coordinate[place[known]] == self.c[known]
         f[known] = self.force[place[known]]
-        for _ in range(4):
+        for number in range(_PASSES):
             f = self._newton(f)
+            if not f.any():  # nothing touches any more
+                self.bulge = 0.0
             order = np.argsort(self.c)
             order = order[f[order] != 0]
             self.coordinate, self.force = self.c[order], f[order]
@@ -183,16 +185,13 @@ class Step:
             s._measure_volume()
             softening = self._soften()
             settled = abs(softening - self.softening) < _SETTLED * softening
-            if not settled:
-                self.softening = softening
-            if self.a is None:
-                if settled:
-                    break
-                continue
-            bulge = float(s._share.sum()) - s.model.rest_volume - float(s._gradient @ self.u[s.model.free].ravel())
-            change, self.bulge = self.share * abs(bulge - self.bulge), bulge
-            if settled and change < _SETTLED * abs(self.pressure) + 1.0:
+            if self.a is not None:
+                bulge = float(s._share.sum()) - s.model.rest_volume - float(s._gradient @ self.u[s.model.free].ravel())
+                settled &= self.share * abs(bulge - self.bulge) < _SETTLED * abs(self.pressure) + 1.0
+                self.bulge = bulge
+            if settled or number == _PASSES - 1:
                 break
+            self.softening = softening
 
     def _place(self, u):
         s = self.skin
@@ -285,7 +284,7 @@ class Step:
             self.force,
             self.pressure,
             self.bulge,
-            self.bulge - self.memory.bulge,
+            self.bulge - self.memory.bulge if len(self.force) else 0.0,
             self.softening,
             np.array(pos),
             np.array(mat),

@@ -23,21 +23,40 @@ _PROBE = 2e-4  # half a step of the differences that give the directions, half a
 @wp.kernel
 def _core_distance(
     # In:
-    number: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
     sample: wp.array(dtype=vec3),
     core: Geoms,
+    rest: wp.array2d(dtype=vec3),
+    rest_gap: wp.array(dtype=real),
     x: wp.array2d(dtype=vec3),
+    share: wp.array(dtype=real),
+    kept: wp.array(dtype=int),
     # Out:
+    near_out: wp.array(dtype=int),
     distance_out: wp.array2d(dtype=real),
 ):
-    """Distance of the samples of some faces to the core."""
-    i, s = wp.tid()
-    t = face[number[i]]
-    b = sample[s]
-    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0]
-    half = real(0.5) * core.grids.spacing[core.grid[0]]
-    distance_out[i, s] = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p) + half
+    """Distances of the samples to the core, of faces that are kept or nearer to it than a share of their displacement."""
+    f = wp.tid()
+    t = face[f]
+    x0 = x[t[0], 0]
+    x1 = x[t[1], 0]
+    x2 = x[t[2], 0]
+    a = wp.length_sq(x0 - rest[t[0], 0])
+    b = wp.length_sq(x1 - rest[t[1], 0])
+    c = wp.length_sq(x2 - rest[t[2], 0])
+    moved = wp.sqrt(wp.max(a, wp.max(b, c)))
+    reach = share[0] * moved
+    near = kept[f]
+    if near == 1 or rest_gap[f] - moved < reach:
+        half = real(0.5) * core.grids.spacing[core.grid[0]]
+        for s in range(sample.shape[0]):
+            w = sample[s]
+            p = w[0] * x0 + w[1] * x1 + w[2] * x2
+            d = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p) + half
+            distance_out[f, s] = d
+            if d < reach:
+                near = 1
+    near_out[f] = near
 
 
 @dataclasses.dataclass
@@ -70,7 +89,7 @@ class CoreContact:
 
     Args:
       model: SkinModel with a core.
-      x_wp, x: (nvert, 1) positions of the nodes that distances are measured at, as Warp array and as its view; at rest now.
+      x_wp, x: (nvert, 1) present positions of the nodes, as Warp array and as its view; at rest now.
 
     Attributes:
       node: (nnode,) free nodes. direction: (nnode, 3) away from the core.
@@ -88,55 +107,44 @@ class CoreContact:
         self._number = np.full(model.nvert, -1)
         self._number[self.node] = np.arange(len(self.node))
         nface, nsample = len(self._face), len(self._sample)
-        number, out = wp.zeros(nface, dtype=int, device="cpu"), wp.zeros((nface, nsample), dtype=real, device="cpu")
-        self._asked, self._out = number.numpy(), out.numpy()
-        self._launch = wp.launch(
-            _core_distance, dim=(nface, nsample), device="cpu", record_cmd=True,
-            inputs=[number, model.core_surface.face, model.sample, model.core(1).struct, x_wp], outputs=[out],
+        rest_gap, share, kept = (wp.zeros(n, dtype=t, device="cpu") for n, t in ((nface, real), (1, real), (nface, int)))
+        near, gap = wp.zeros(nface, dtype=int, device="cpu"), wp.zeros((nface, nsample), dtype=real, device="cpu")
+        self._rest_gap, self._share, self._kept, self._near, self._gap = (a.numpy() for a in (rest_gap, share, kept, near, gap))
+        self._look = wp.launch(
+            _core_distance, dim=nface, device="cpu", record_cmd=True,
+            inputs=[model.core_surface.face, model.sample, model.core(1).struct, model.vert, rest_gap, x_wp, share, kept],
+            outputs=[near, gap],
         )  # fmt: skip
-        everything = np.arange(nface)
-        self._offset = np.zeros((nface, nsample))
+        self._kept[:] = 1
         gradient = np.zeros((nface, 3))
         for axis in range(3):
             for sign in (1, -1):
                 x[:, 0, axis] += sign * _PROBE
-                gradient[:, axis] += sign * self._distance(everything).mean(1)
+                self._look.launch()
+                gradient[:, axis] += sign * self._gap.mean(1)
                 x[:, 0] = self._rest
         nodal = np.zeros((model.nvert, 3))
         np.add.at(nodal, self._face, np.repeat(gradient[:, None], 3, 1))
         self.direction = nodal[self.node] / np.linalg.norm(nodal[self.node], axis=1, keepdims=True)
+        self._look.launch()
+        self._rest_gap[:] = self._gap.min(1)
         # the grid rounds edges of the core by micrometres: what starts outside stays outside
-        self._offset = np.minimum(self._distance(everything), 0)
-        self._rest_gap = self._distance(everything).min(1)
-        self._order = np.argsort(self._rest_gap, kind="stable")
-        self._ordered_gap = self._rest_gap[self._order]
-
-    def _distance(self, face):
-        self._asked[: len(face)] = face
-        self._launch.set_dim((len(face), len(self._sample)))
-        self._launch.launch()
-        return self._out[: len(face)] - self._offset[face]
+        self._offset = np.minimum(self._gap, 0)
 
     def meet(self, u, share, kept) -> Meeting:
         """Faces with a sample nearer to the core than a share of their displacement, and the faces `kept`.
 
         Args:
-          u: (nvert, 3) displacements at the present positions [m].
+          u: (nvert, 3) displacements at the present positions, for which the faces are looked at [m].
           share: how much of its displacement a face may make in this step.
           kept: (n,) numbers of faces.
         """
-        # the others cannot be near: no node has moved so far
-        most = np.sqrt(3) * max(u.max(), -u.min())
-        first = self._order[: np.searchsorted(self._ordered_gap, (1 + share) * most)]
-        a, b, c = (np.einsum("ij,ij->i", u[n], u[n]) for n in self._face[first].T)
-        length = np.zeros(len(self._face))
-        length[first] = np.sqrt(np.maximum(np.maximum(a, b), c))
-        reach = share * length
-        reach[kept] = np.inf
-        face = np.flatnonzero(self._rest_gap - length < reach)
-        gap = self._distance(face)
-        near = gap.min(1, initial=np.inf) < reach[face]
-        face, gap = face[near], gap[near]
+        self._share[0] = share
+        self._kept[:] = 0
+        self._kept[kept] = 1
+        self._look.launch()
+        face = np.flatnonzero(self._near)
+        gap = self._gap[face] - self._offset[face]
         corner = self._number[self._face[face]]
         used = np.zeros(len(self.node) + 1, bool)
         used[corner] = True  # fixed corners, -1, mark the last

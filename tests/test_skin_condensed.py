@@ -1,0 +1,324 @@
+"""The condensed tier against the full FEM, linear elasticity, Coulomb's law, statics and its own replay."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj.approach import nearest_point, surface_point
+from biotac_mj.coupling.condensed import CondensedStepper
+from biotac_mj.coupling.config import Config
+from biotac_mj.coupling.stepper import Geom
+from biotac_mj.geometry import load_skin
+from biotac_mj.sensor.channels import counts_from_impedance
+from biotac_mj.sensor.core_surface import CoreSurface
+from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_step, step
+from biotac_mj.skin.condensed import CondensedSkin, Memory
+from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
+
+RADIUS = 3.5e-3
+EYE = np.eye(3)[None]
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch, tmp_path):
+    """Never the user's cache folder."""
+    monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return SkinModel(load_skin("coarse"))
+
+
+def sphere(friction=0.783):
+    return GeomSet(["sphere"], [(RADIUS,)], [friction])
+
+
+def touch(geometry, x=-12e-3):
+    """Centre of the sphere (3,) where it first touches, and the inward normal."""
+    point, normal = surface_point(geometry, x, 0.0)
+    center = point + (RADIUS + 1e-3) * normal
+    for _ in range(100):
+        center = center - (np.linalg.norm(nearest_point(geometry, center)[0] - center) - RADIUS) * normal
+    return center, -normal
+
+
+def walk(skin, positions, memory=None):
+    memory = memory or Memory.rest(1)
+    out = []
+    for pos in positions:
+        out.append(skin.solve(memory, pos[None], EYE))
+        assert out[-1].converged
+        memory = out[-1].memory
+    return out
+
+
+def _steps(skin, positions):
+    memory = Memory.rest(1)
+    for pos in positions:
+        out = skin.solve(memory, pos[None], EYE)
+        memory = out.memory
+        yield out
+
+
+def press_both(model, depths):
+    """Force, nodes and pressure of full and condensed skin at depths [m]."""
+    start, direction = touch(model.geometry)
+    skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
+    condensed = walk(skin, start + np.outer(depths, direction))
+    full = []
+    for depth in depths:
+        geoms.set_pose((start + depth * direction)[None])
+        step(model, data, geoms)
+        assert data.converged.all()
+        full.append((data.wrench[0, 0].copy(), data.vert_xpos[0].copy(), float(data.pressure[0])))
+    return full, condensed
+
+
+@pytest.fixture(scope="module")
+def both(coarse):
+    depths = np.arange(1, 13) * 2e-4
+    return coarse, depths, *press_both(coarse, depths)
+
+
+# --- against the full FEM
+
+
+def test_force_is_that_of_the_full_fem_on_the_coarse_skin(both):
+    _, depths, full, condensed = both
+    error = [np.linalg.norm(c.wrench[0, :3] - f[0][:3]) / np.linalg.norm(f[0][:3]) for f, c in zip(full, condensed)]
+    assert max(error[:5]) < 0.06 and max(error) < 0.15
+    # the error of the coarse skin alone could hide a softening that is not there at all
+    assert condensed[4].memory.softening > 1.05
+
+
+def test_force_is_that_of_the_full_fem_on_the_default_skin():
+    full, condensed = press_both(SkinModel(load_skin("default")), np.array([2.5e-4, 5e-4, 7.5e-4, 1e-3]))
+    for (wrench, xpos, pressure), c in zip(full, condensed):
+        assert np.linalg.norm(c.wrench[0, :3] - wrench[:3]) < 0.06 * np.linalg.norm(wrench[:3])
+        assert np.abs(c.vert_xpos - xpos).max() < 0.08 * np.abs(xpos - c.vert_xpos[0]).max() + 1e-4
+        assert abs(c.memory.pressure - pressure) < 0.2 * pressure
+
+
+def test_film_and_counts_are_those_of_the_full_fem(both):
+    model, depths, full, condensed = both
+    geometry = model.geometry
+    conduction, core = FilmConduction(geometry), CoreSurface(geometry.core_vert, geometry.core_face)
+    rest = core.closest(geometry.vert)[0]
+    node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
+    at_rest = counts_from_impedance(conduction.impedance(geometry.vert))
+    for (_, xpos, _), c in list(zip(full, condensed))[:5]:
+        film = [core.closest(x[node])[0] for x in (xpos, c.vert_xpos)]
+        under = (rest[node] - film[0]).argmax()
+        assert abs(film[1][under] - film[0][under]) < 0.08 * (rest[node[under]] - film[0][under])
+        change = [counts_from_impedance(conduction.impedance(x)) - at_rest for x in (xpos, c.vert_xpos)]
+        assert np.abs(change[1] - change[0]).max() < 0.12 * np.abs(change[0]).max()
+
+
+def test_without_softening_and_liquid_it_is_the_linear_skin(monkeypatch):
+    monkeypatch.setattr(condensed_step, "_SOFTENING", (1.0, 1e-12))
+    model = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="linear"), SkinOptions(liquid=False))
+    full, condensed = press_both(model, np.arange(1, 10) * 2e-4)
+    for (wrench, xpos, _), c in zip(full, condensed):
+        # the same equations until the core is met (1.4 mm): rows in half precision and tolerances of 1e-3 remain
+        if not (c.memory.coordinate >= 3 * len(np.setdiff1d(np.unique(model.geometry.outer_face), model.fixed))).any():
+            assert np.abs(c.wrench[0] - wrench).max() < 5e-3 * np.abs(wrench).max()
+            assert np.abs(c.vert_xpos - xpos).max() < 3e-6
+        else:
+            assert np.abs(c.wrench[0, :3] - wrench[:3]).max() < 0.05 * np.abs(wrench[:3]).max()
+
+
+def test_liquid_keeps_its_volume(both):
+    model, _, _, condensed = both
+    volumes = np.array([c.volume for c in condensed])
+    assert np.abs(volumes / model.liquid_volume - 1).max() < 5e-4
+    pressures = np.array([c.memory.pressure for c in condensed])
+    assert (np.diff(pressures[:6]) > 0).all() and pressures[0] > 100
+
+
+# --- mechanics
+
+
+def test_rest_is_zero(coarse):
+    skin = CondensedSkin(coarse, sphere(), cache=False)
+    start, direction = touch(coarse.geometry)
+    out = walk(skin, [start - 1e-5 * direction, start + 3e-4 * direction, start - 1e-4 * direction, start - 2e-2 * direction])
+    for away in (out[0], out[2], out[3]):
+        assert (away.vert_xpos == coarse.geometry.vert).all() and (away.wrench == 0).all() and (away.tangent == 0).all()
+        assert away.memory.pressure == 0 and not len(away.memory.contacts)
+    assert np.linalg.norm(out[1].wrench) > 0.1
+
+
+def test_friction_stays_in_its_cone(coarse):
+    mu = 0.4
+    skin = CondensedSkin(coarse, sphere(mu), cache=False)
+    start, direction = touch(coarse.geometry)
+    along = np.array([1.0, 0, 0]) - direction[0] * direction
+    down = start + np.outer(np.linspace(2e-4, 8e-4, 4), direction)
+    slide = down[-1] + np.outer(np.arange(1, 13) * 1e-4, along / np.linalg.norm(along))
+
+    def loads(out):
+        """Normal and tangential force of every touching sample [N]."""
+        force = skin._force[np.flatnonzero(skin._geom[: 9 * skin._count[0], 0] >= 0), 0]
+        number, point = out.memory.contacts[:, 0].astype(int), skin._sample
+        face = coarse.geometry.outer_face[number // len(point)]
+        place = np.einsum("kc,kci->ki", point[number % len(point)], skin._x[face, 0])
+        outward = place - out.memory.geom_pos[0]
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        assert np.allclose(-force.sum(0), out.wrench[0, :3])
+        normal = np.einsum("ij,ij->i", force, outward)
+        return normal, np.linalg.norm(force - normal[:, None] * outward, axis=1)
+
+    for number, out in enumerate(_steps(skin, [*down, *slide])):
+        normal, tangential = loads(out)
+        assert (normal > 0).all() and (tangential <= 1.02 * mu * normal + 1e-5).all()
+        if number == len(down) - 1:
+            assert tangential.sum() < 0.7 * mu * normal.sum()
+    assert tangential.sum() > 0.97 * mu * normal.sum()  # all slides
+    backwards = out.wrench[0, :3] - (out.wrench[0, :3] @ direction) * direction
+    assert backwards @ along < 0 or np.linalg.norm(backwards) > 0.5 * mu * normal.sum()
+
+
+def test_tangent_is_the_force_s_derivative(coarse):
+    skin = CondensedSkin(coarse, sphere(), cache=False)
+    start, direction = touch(coarse.geometry)
+    base = walk(skin, start + np.outer(np.linspace(2e-4, 6e-4, 3), direction))[-1]
+    held = skin.solve(base.memory, base.memory.geom_pos, EYE)
+    eps = 2e-5
+    for axis in np.eye(3):
+        moved = skin.solve(held.memory, held.memory.geom_pos + eps * axis, EYE)
+        slope = -(moved.wrench[0] - held.wrench[0]) / eps
+        assert np.abs(slope - held.tangent[0][:, :3] @ axis)[:3].max() < 0.15 * np.abs(held.tangent[0][:3, :3]).max()
+    assert np.allclose(held.tangent[0], held.tangent[0].T) and np.linalg.eigvalsh(held.tangent[0]).min() > -1e-9
+
+
+def test_two_bodies_share_the_skin(coarse):
+    start, direction = touch(coarse.geometry)
+    geoms = GeomSet(["sphere", "sphere"], [(RADIUS,), (2e-3,)], [0.5, 0.5], [0, 1])
+    skin = CondensedSkin(coarse, geoms, cache=False)
+    side, normal = surface_point(coarse.geometry, -8e-3, 1.2)
+    poses = np.stack([start + 4e-4 * direction, side + 1.7e-3 * normal])
+    out = skin.solve(Memory.rest(2), poses, np.tile(np.eye(3), (2, 1, 1)))
+    assert out.converged and (np.linalg.norm(out.wrench[:, :3], axis=1) > 0.05).all()
+    data = SkinData(coarse)
+    geoms.set_pose(poses, np.tile(np.eye(3), (2, 1, 1)))
+    step(coarse, data, geoms)
+    for k in range(2):
+        full = data.wrench[0, k, :3]
+        assert np.linalg.norm(out.wrench[k, :3] - full) < 0.1 * np.linalg.norm(full)
+    assert all(np.trace(out.tangent[k, :3, :3]) > 100 for k in range(2))
+
+
+# --- a function of its arguments
+
+
+def stepper_at(skin="coarse"):
+    ball = Geom("ball", "sphere", np.array([RADIUS, 0, 0]), 0.783, 0)
+    return CondensedStepper(Config(skin=skin, tier="condensed"), load_skin(skin), [ball])
+
+
+def test_replay_is_bit_equal(coarse):
+    start, direction = touch(coarse.geometry)
+    path = start + np.outer([-1e-4, 2e-4, 5e-4, 1.6e-3, 2.0e-3, 1.2e-3, -1e-4, 4e-4], direction)
+
+    def run(stepper):
+        state = np.empty(stepper.nstate)
+        stepper.reset(state)
+        states = [state]
+        for pos in path:
+            before = states[-1].copy()
+            result = stepper.solve(states[-1], pos[None], EYE, 2e-3)
+            assert (states[-1] == before).all()
+            assert (stepper.vert_xpos(result.state) == result.vert_xpos).all()
+            states.append(result.state)
+        return np.array(states)
+
+    stepper = stepper_at()
+    first = run(stepper)
+    assert (run(stepper) == first).all()
+    fresh = stepper_at()  # other caches, other memory
+    assert (fresh.solve(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
+
+
+def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):
+    geometry = coarse.geometry
+    outer = np.setdiff1d(np.unique(geometry.outer_face), coarse.fixed)[::40]
+    inner = np.setdiff1d(np.unique(geometry.inner_face), coarse.fixed)[::40]
+    direction = np.tile([0.6, 0.0, 0.8], (len(inner), 1))
+    fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
+    chosen = [4, 3 * len(outer) + 2]
+    for coordinate, force in zip(chosen, ((outer[1], [0, 1, 0]), (inner[2], [0.6, 0, 0.8]))):
+        unit = np.zeros((coarse.nvert, 3))
+        unit[force[0]] = force[1]
+        exact = fresh.vector(unit)
+        (row,) = fresh.row([coordinate])
+        assert np.abs(row - exact).max() < 6e-4 * np.abs(exact).max()
+        stiff = coarse._stiffness @ (exact / coarse.material.youngs_modulus)
+        assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
+    for _ in range(2):  # written, then read
+        kept = SurfaceCompliance(coarse, outer, inner, direction)
+        assert all((a == b).all() for a, b in zip(kept.row(chosen), fresh.row(chosen)))
+    (file,) = cache_folder().glob("compliance-*.npy")
+    assert file.parent == tmp_path
+    np.save(file, np.zeros((3, 3), np.float16))
+    with pytest.raises(ValueError, match="does not hold the compliance of this skin: delete it"):
+        SurfaceCompliance(coarse, outer, inner, direction)
+
+
+# --- in MuJoCo
+
+
+def test_a_ball_rests_with_its_weight():
+    geometry = load_skin("coarse")
+    top, _ = surface_point(geometry, -10e-3, 0.0)
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    radius, mass = 5e-3, 0.05
+    ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + radius + 1e-4])
+    ball.mass, ball.inertia, ball.explicitinertial = mass, [1e-6] * 3, True
+    joint = ball.add_joint(name="drop", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    joint.damping[0] = 1.0
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0])
+    quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
+    handle = biotac_mj.attach(spec, quat=quat, skin="coarse", geoms=["ball"], tier="condensed", readings="none")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    while data.time < 0.5:
+        mujoco.mj_step(model, data)
+    biotac_mj.plugin.check()
+    force = handle.read(data, "contact_force")
+    rotation = data.body(handle.body).xmat.reshape(3, 3)
+    assert abs((rotation @ force[:3])[2] + mass * 9.81) < 0.01 * mass * 9.81
+    assert abs(data.qvel[0]) < 1e-4 and abs(data.qfrc_constraint[0]) + abs(data.qfrc_passive[0]) > 0
+    status = handle.read(data, "status")
+    assert status[0] == 1 and status[1] == 0 and status[4] == 1 and handle.config.tier == "condensed"
+
+
+# --- errors
+
+
+def test_what_it_cannot_do_is_refused():
+    with pytest.raises(ValueError, match="unknown tier 'fast': choose one of full, condensed"):
+        Config(tier="fast")
+    with pytest.raises(ValueError, match="stepper is 'springs': leave one of them out"):
+        Config(tier="condensed", stepper="springs")
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(dynamics="implicit"))
+    with pytest.raises(ValueError, match="no inertia: choose dynamics='quasistatic' or the full tier"):
+        CondensedSkin(model, sphere(), cache=False)
+
+
+def test_nan_is_refused(coarse):
+    skin = CondensedSkin(coarse, sphere(), cache=False)
+    with pytest.raises(ValueError, match="contain NaN or infinite numbers"):
+        skin.solve(Memory.rest(1), np.full((1, 3), np.nan), EYE)
+
+
+def test_a_geom_inside_the_core_is_refused(coarse):
+    skin = CondensedSkin(coarse, sphere(), cache=False)
+    start, direction = touch(coarse.geometry)
+    with pytest.raises(ValueError, match="inside the rigid core: no skin fits between them"):
+        skin.solve(Memory.rest(1), (start + 6e-3 * direction)[None], EYE)
