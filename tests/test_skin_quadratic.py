@@ -3,6 +3,7 @@
 import pathlib
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import skfem
@@ -10,6 +11,7 @@ import warp as wp
 from blocks import box, place, skin
 from skfem.helpers import ddot, div, sym_grad
 
+import biotac_mj
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.data import view
@@ -208,3 +210,22 @@ def test_factor_at_a_turned_shape():
     f[model.fixed] = 0
     turned = model.factor_at(model.geometry.vert @ Q.T).solve(f @ Q.T)
     np.testing.assert_allclose(turned, model.factor.solve(f) @ Q.T, rtol=0, atol=1e-8 * abs(turned).max())
+
+
+def test_coupled_skin_keeps_its_nodes():
+    """In a simulation the sensor and the view see the geometry's own nodes; the state holds them all and replays exactly."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002"/><worldbody><body name="finger"/>'
+        '<body name="ball" mocap="true" pos="-0.01 -0.0117 0"><geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(spec, body="finger", skin="coarse", material="ansys", readings="none")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rest = load_skin("coarse").vert
+    mujoco.mj_step(model, data)
+    data.mocap_pos[0, 1] += 2e-4
+    mujoco.mj_step(model, data)
+    biotac_mj.plugin.check()
+    xpos = handle.vert_xpos(model, data)
+    assert xpos.shape == rest.shape
+    assert 5e-5 < abs(xpos - rest).max() < 5e-4

@@ -6,6 +6,7 @@ import functools
 import numpy as np
 
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
+from ..skin.quadratic import quadratic
 from .stepper import SkinResult
 
 __all__ = ["FemStepper", "rest_geometry"]
@@ -25,7 +26,10 @@ class FemStepper:
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
         self._material, self._options = _choices(config)
-        n, g = geometry.nvert, len(geoms)
+        self._nodes = geometry.vert  # quadratic elements have more, behind those of the geometry, that only the state knows
+        if (self._options.element or self._material.element) == "quadratic":
+            self._nodes = quadratic(geometry)[0].vert
+        n, g = len(self._nodes), len(geoms)
         sizes = {
             "started": 1,
             "x": 3 * n,
@@ -69,14 +73,14 @@ class FemStepper:
 
     def reset(self, state):
         state[:] = 0
-        vert, pressure = self._geometry.vert, 0.0
+        vert, pressure = self._nodes, 0.0
         if _filled(self._options):
             vert, pressure = self._model.rest.vert, self._model.rest.pressure
         self._part(state, "x")[:] = vert.ravel()
         self._part(state, "pressure")[:] = pressure
 
     def vert_xpos(self, state):
-        return self._part(state, "x").reshape(-1, 3)
+        return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
     def solve(self, state, geom_pos, geom_mat, dt, core_pos=_STILL[0], core_mat=_STILL[1]) -> SkinResult:
         """See `SkinStepper`.
@@ -91,7 +95,7 @@ class FemStepper:
         if not started:
             geoms.advance()
         if self.inertial:
-            x = self.vert_xpos(state)
+            x = self._part(state, "x").reshape(-1, 3)
             rigid = (x @ (core_mat[1] - core_mat[0]).T + core_pos[1] - core_pos[0]) / dt
             velocity = self._part(state, "velocity").reshape(-1, 3) if started else rigid  # begins at rest on a core that may move
             d.load_motion(velocity, core_pos[0], core_mat[0])
