@@ -10,6 +10,7 @@ is the processor time of the same press: where it is well below the wall time, o
 
 force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press solved to a
 tolerance of 1e-6 in the same double precision: what stopping early costs, not what the mesh costs.
+For the condensed tier F_tight is the full tier's press of the row above (docs/condensed.md says more).
 """
 
 import os
@@ -33,6 +34,7 @@ from accuracy import write_json
 from biotac_mj.approach import nearest_point, surface_point
 from biotac_mj.geometry import SKINS, SkinGeometry, load_skin
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.condensed import CondensedSkin, Memory
 
 __all__ = ["main", "press", "standard_path", "time_skin"]
 
@@ -135,6 +137,58 @@ def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int
     }
 
 
+def time_condensed(ours: dict) -> dict:
+    """The condensed tier on the press of one of our rows; its row, with errors against the forces of that row."""
+    geometry = load_skin(ours["skin"])
+    path, _ = standard_path(geometry, ours["increments"])
+    model = SkinModel(geometry, PRESETS["paper"], SkinOptions(liquid=ours["liquid"]))
+    mat = np.eye(3)[None]
+
+    def walk(skin):
+        memory, force, seconds, lost = Memory.rest(1), [], [], 0
+        for center in path[1:]:
+            begin = _clocks()
+            out = skin.solve(memory, center[None], mat)
+            seconds.append(_clocks() - begin)
+            memory, lost = out.memory, lost + (not out.converged)
+            force.append(out.wrench[0, :3])
+        return np.array(force), np.array(seconds), lost
+
+    def make():
+        return CondensedSkin(model, GeomSet(["sphere"], [(RADIUS,)], [model.material.friction]))
+
+    make().solve(Memory.rest(1), path[1:2], mat)  # compiles, and computes the compliance where it is not yet on disk
+    begin = time.perf_counter()
+    skin = make()
+    setup = time.perf_counter() - begin
+    force, seconds, lost = walk(skin)
+    wanted = np.array(ours["force"])
+    size = np.linalg.norm(wanted, axis=1)
+    wrong = np.linalg.norm(force - wanted, axis=1)
+    to_1mm = slice(0, min(ours["increments"], round(PEER_TRAVEL / INCREMENT)))
+    return {
+        "device": "cpu",
+        "solver": "biotac_mj",
+        "skin": ours["skin"],
+        "tier": "condensed",
+        "liquid": ours["liquid"],
+        "worlds": 1,
+        "ms_per_press": 1e3 * seconds[:, 0].sum(),
+        "cpu_ms_per_press": 1e3 * seconds[:, 1].sum(),
+        "ms_per_step": 1e3 * seconds[:, 0].mean(),
+        "ms_slowest_step": 1e3 * seconds[:, 0].max(),
+        "ms_per_press_again": 1e3 * walk(skin)[1][:, 0].sum(),
+        "setup_s": setup,
+        "force_error_rel": float(wrong.mean() / size.max()),
+        "force_error_to_1mm": float((wrong / size)[to_1mm].max()),
+        "not_converged": lost,
+        "increments": ours["increments"],
+        "peak_force_N": float(np.linalg.norm(force, axis=1).max()),
+        "force": force.tolist(),
+        "wall_and_cpu_ms_of_steps": (1e3 * seconds).tolist(),
+    }
+
+
 def time_peer(ours: dict) -> dict:
     """MuJoCo's flex on the mesh and path of one of our rows, to where the core would be met; its row."""
     geometry = load_skin(ours["skin"])
@@ -212,8 +266,12 @@ def main(arguments=None) -> int:
             for worlds in map(int, options.worlds.split(",")):
                 rows.append({**time_skin(skin, liquid, options.device, worlds, options.increments), "machine": machine})
                 _print_row(rows[-1])
+    if options.device == "cpu":
+        for ours in [row for row in rows if row["worlds"] == 1]:
+            rows.append({**time_condensed(ours), "machine": machine})
+            _print_row(rows[-1])
     if not options.no_peer and options.device == "cpu":
-        for ours in [row for row in rows if not row["liquid"] and row["worlds"] == 1]:
+        for ours in [row for row in rows if not row["liquid"] and row["worlds"] == 1 and row["tier"] == "full"]:
             peer = {**time_peer(ours), "machine": machine}
             mine = np.mean(ours["wall_and_cpu_ms_of_steps"][: peer["steps"]], axis=0)  # over the same travel
             peer["ratio_ms_per_step"] = peer["ms_per_step"] / mine[0]

@@ -132,8 +132,13 @@ def test_a_cylinder_without_length_is_refused(accuracy):
 def test_speed_writes_rows(repo, tmp_path):
     done = _run(repo, "speed.py", "--device", "cpu", "--json", tmp_path / "speed.json", "--increments", 5, "--no-peer", "--skins", "coarse")
     assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "speed.json").read_text())["rows"]
-    assert [row["liquid"] for row in rows] == [False, True]
+    everything = json.loads((tmp_path / "speed.json").read_text())["rows"]
+    rows, condensed = ([row for row in everything if row["tier"] == tier] for tier in ("full", "condensed"))
+    assert [row["liquid"] for row in rows] == [row["liquid"] for row in condensed] == [False, True]
+    for row, ours in zip(condensed, rows):
+        assert row["not_converged"] == 0 and row["ms_per_press"] == pytest.approx(5 * row["ms_per_step"])
+        wrong = np.linalg.norm(np.array(row["force"]) - ours["force"], axis=1)
+        assert 0 < row["force_error_rel"] == pytest.approx(wrong.mean() / ours["peak_force_N"]) and row["force_error_to_1mm"] < 0.15
     for row in rows:
         assert (row["device"], row["solver"], row["skin"], row["tier"], row["worlds"]) == ("cpu", "biotac_mj", "coarse", "full", 1)
         assert row["ms_per_press"] == pytest.approx(5 * row["ms_per_step"])

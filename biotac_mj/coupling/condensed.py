@@ -16,8 +16,8 @@ _MAX_FORCES, _MAX_CONTACTS = 1024, 2048
 class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
 
-    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening, poses of the geoms, contact forces (how
-    many, then coordinate and force of each) and sticking contacts (how many, then sample, geom and anchor of each).
+    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening, poses and motion of the geoms, contact
+    forces (how many, then coordinates, forces and their last changes) and sticking contacts (how many, then sample, geom and anchor).
     """
 
     def __init__(self, config, geometry, geoms):
@@ -27,7 +27,8 @@ class CondensedStepper(FemStepper):
             "head": 5,
             "geom_pos": 3 * g,
             "geom_mat": 9 * g,
-            "forces": 1 + 2 * _MAX_FORCES,
+            "motion": 3 * g,
+            "forces": 1 + 3 * _MAX_FORCES,
             "contacts": 1 + 5 * _MAX_CONTACTS,
         }
         ends = np.cumsum(list(sizes.values()))
@@ -73,12 +74,14 @@ class CondensedStepper(FemStepper):
             started=bool(started),
             coordinate=forces[1 : 1 + n].astype(int),
             force=forces[1 + n : 1 + 2 * n].copy(),
+            change=forces[1 + 2 * n : 1 + 3 * n],
             pressure=pressure,
             bulge=bulge,
             growth=growth,
             softening=softening,
             geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
             geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
+            motion=self._part(state, "motion").reshape(-1, 3),
             contacts=contacts[1 : 1 + 5 * k].reshape(k, 5),
         )
 
@@ -92,7 +95,8 @@ class CondensedStepper(FemStepper):
         self._part(state, "head")[:] = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening
         self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
         self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
+        self._part(state, "motion")[:] = memory.motion.ravel()
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         forces[0], contacts[0] = n, k
-        forces[1 : 1 + n], forces[1 + n : 1 + 2 * n] = memory.coordinate, memory.force
+        forces[1 : 1 + 3 * n] = np.concatenate([memory.coordinate, memory.force, memory.change])
         contacts[1 : 1 + 5 * k] = memory.contacts.ravel()

@@ -239,8 +239,7 @@ class CondensedSkin:
             self._refuse_core()
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self._rest + u
-        moved = np.abs(geom_pos - last[0]).max(initial=0.0)
-        step = Step(self, memory, u, geom_pos, geom_mat, moved)
+        step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
         for _ in range(4):
             step.run()
             if not step.missed():

@@ -22,28 +22,31 @@ class Memory:
     Attributes:
       started: whether a step was made.
       coordinate: (n,) contact coordinates with a force, ascending.
-      force: (n,) [N].
+      force, change: (n,) forces and by how much they changed in the last step [N].
       pressure: [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it grew in the last step.
       softening: s.
-      geom_pos, geom_mat: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step.
+      geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how far they moved in it [m].
       contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
     """
 
     started: bool
     coordinate: np.ndarray
     force: np.ndarray
+    change: np.ndarray
     pressure: float
     bulge: float
     growth: float
     softening: float
     geom_pos: np.ndarray
     geom_mat: np.ndarray
+    motion: np.ndarray
     contacts: np.ndarray
 
     @classmethod
     def rest(cls, ngeom):
         none = np.zeros(0)
-        return cls(False, none.astype(int), none, 0.0, 0.0, 0.0, 1.0, np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3)), np.zeros((0, 5)))
+        pos, mat = np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3))
+        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, pos, mat, pos, np.zeros((0, 5)))
 
 
 @dataclasses.dataclass
@@ -63,15 +66,19 @@ class Outcome:
 class Step:
     """One step of a CondensedSkin: candidates, Newton's method, results."""
 
-    def __init__(self, skin, memory, u, geom_pos, geom_mat, moved):
+    def __init__(self, skin, memory, u, geom_pos, geom_mat, motion):
         self.skin, self.memory, self.u = skin, memory, u
         self.pose = geom_pos, geom_mat
+        moved = np.abs(motion).max(initial=0.0)
         self.reach = _REACH + 2 * moved
         self.share = min(1.0, 3 * moved / max(u.max(), -u.min(), 1e-9))
         self.faces = np.zeros(0, int)
         self.inner = np.zeros(0, int)
         self.meeting = None
-        self.bulge, self.pressure = memory.bulge + memory.growth, memory.pressure
+        # how much of the geoms' last motion this one repeats: so much of the last changes is expected again
+        last = memory.motion.ravel()
+        self.motion, self.repeat = motion, min(max(float(motion.ravel() @ last) / max(float(last @ last), 1e-20), 0.0), 2.0)
+        self.bulge, self.pressure = memory.bulge + self.repeat * memory.growth, memory.pressure
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
         self.softening = self._soften()
@@ -168,11 +175,9 @@ class Step:
             s._measure_volume()
             return
         self._set()
-        f = np.zeros(len(self.c))
-        place = np.searchsorted(self.coordinate, self.c)
-        known = place < len(self.coordinate)
-        known[known] = self.coordinate[place[known]] == self.c[known]
-        f[known] = self.force[place[known]]
+        f = self._at_candidates(self.force)
+        if self.force is self.memory.force:
+            f += self.repeat * self._at_candidates(self.memory.change)
         for number in range(_PASSES):
             f = self._newton(f)
             if not f.any():  # nothing touches any more
@@ -192,6 +197,15 @@ class Step:
             if settled or number == _PASSES - 1:
                 break
             self.softening = softening
+
+    def _at_candidates(self, force):
+        """Values (n,) of self.coordinate at the candidates; zero elsewhere."""
+        out = np.zeros(len(self.c))
+        if len(self.coordinate):
+            place = np.minimum(np.searchsorted(self.coordinate, self.c), len(self.coordinate) - 1)
+            known = self.coordinate[place] == self.c
+            out[known] = force[place[known]]
+        return out
 
     def _place(self, u):
         s = self.skin
@@ -282,17 +296,27 @@ class Step:
         now = (
             self.coordinate,
             self.force,
+            self._change(),
             self.pressure,
             self.bulge,
             self.bulge - self.memory.bulge if len(self.force) else 0.0,
             self.softening,
             np.array(pos),
             np.array(mat),
+            self.motion,
             contacts,
         )
         memory = Memory(True, *now)
         volume = float(s._share.sum()) - s.model.rest_volume + s.model.liquid_volume if s.model.inner is not None else 0.0
         return Outcome(memory, wrench, tangent, s._rest + self.u, volume, self.converged, self.iterations, self.error)
+
+    def _change(self):
+        """Of the forces since the step began."""
+        memory = self.memory
+        if not len(self.force) or not len(memory.force):
+            return 0 * self.force
+        place = np.minimum(np.searchsorted(memory.coordinate, self.coordinate), len(memory.coordinate) - 1)
+        return self.force - np.where(memory.coordinate[place] == self.coordinate, memory.force[place], 0)
 
     def _tangent(self, group):
         """Stiffness against rigid motions of a group of geoms about the origin, G' (D_g - D_g W (I + D W)^-1 D_g) G, symmetric."""
