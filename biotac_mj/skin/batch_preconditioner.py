@@ -56,7 +56,7 @@ class BatchPreconditioner:
         index = torch.full((model.nvert + 1,), -1, device=self.device)
         index[torch.as_tensor(model.free, device=self.device)] = torch.arange(len(model.free), device=self.device)
         self.free_index = index
-        self._inverse = self.factor.inverse.view(len(model.free), 3, len(model.free), 3)
+        self._inverse = self.factor.inverse.view(self.factor.padded // 3, 3, self.factor.padded // 3, 3)
         self._faces = {}
 
     def clear(self):
