@@ -211,8 +211,7 @@ class CondensedSkin:
         np.add.at(self._gradient, m.inner.face.numpy().ravel(), corner.numpy()[:, 0])
         self._gradient[m.fixed] = 0
         self._give = self.compliance.vector(self._gradient)
-        self._gradient = self._gradient[m.free].ravel()
-        self._liquid_give = float(self._gradient @ self._give)
+        self._liquid_give = float(self._gradient[m.free].ravel() @ self._give)
         give = np.zeros((m.nvert, 3))
         give[m.free] = self._give.reshape(-1, 3)
         self._give_at = np.concatenate([give[self._outer].ravel(), np.einsum("ij,ij->i", give[self._inner], self._away)])
@@ -236,7 +235,11 @@ class CondensedSkin:
         if self.geoms.count:
             struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = geom_pos, geom_mat
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
-            self._refuse_core()
+        if not len(memory.force):  # at rest: what no sample touches changes nothing
+            self._x[:, 0] = self._rest
+            if not len(self._faces_near(0.0, geom_pos, geom_mat, 0.0)):
+                return self._at_rest(geom_pos, geom_mat, geom_pos - last[0])
+        self._refuse_core()
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self._rest + u
         step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
@@ -248,9 +251,15 @@ class CondensedSkin:
         self._keep(out.memory, step.u)
         return out
 
+    def _at_rest(self, pos, mat, motion):
+        memory = Memory.rest(self.geoms.count)
+        memory.started, memory.geom_pos, memory.geom_mat, memory.motion = True, np.array(pos), np.array(mat), motion
+        n = self.geoms.ngroup
+        return Outcome(memory, np.zeros((n, 6)), np.zeros((n, 6, 6)), self._rest.copy(), self.model.liquid_volume, True, 0, 0.0)
+
     def _refuse_core(self):
         limit = self.model.options.max_core_depth
-        if self._core is None:
+        if self._core is None or not self.geoms.count:
             return
         self._depths.launch()
         if self._depth.max() > limit:
@@ -324,7 +333,7 @@ class CondensedSkin:
             c = np.concatenate([(3 * self._number[outer][:, None] + np.arange(3)).ravel(), 3 * len(self._outer) + inner])
             node = self.compliance.position(np.concatenate([outer, self._inner[inner]]))
             at = (3 * node[:, None] + np.arange(3)).ravel()
-            part = np.array([row[at] for row in self.compliance.row(c.tolist())]).reshape(len(c), len(at))
+            part = self.compliance.part(c, at)
             m = 3 * len(outer)
             W = np.empty((len(c), len(c)))
             W[:, :m] = part[:, :m]

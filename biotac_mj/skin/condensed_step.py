@@ -95,7 +95,7 @@ class Step:
             near = np.flatnonzero(chosen)
         self.faces = near
         if s._core:
-            self.meeting = s._core.meet(self.u, self.share, self.meeting.face if self.meeting else self.inner)
+            self.meeting = s._core.meet(self.u, self.share, self.meeting)
             self.inner = self.meeting.node
         return len(self.faces) + len(self.inner) > count
 
@@ -191,7 +191,7 @@ class Step:
             softening = self._soften()
             settled = abs(softening - self.softening) < _SETTLED * softening
             if self.a is not None:
-                bulge = float(s._share.sum()) - s.model.rest_volume - float(s._gradient @ self.u[s.model.free].ravel())
+                bulge = float(s._share.sum()) - s.model.rest_volume - float(np.vdot(s._gradient, self.u))
                 settled &= self.share * abs(bulge - self.bulge) < _SETTLED * abs(self.pressure) + 1.0
                 self.bulge = bulge
             if settled or number == _PASSES - 1:

@@ -131,19 +131,22 @@ class CoreContact:
         # the grid rounds edges of the core by micrometres: what starts outside stays outside
         self._offset = np.minimum(self._gap, 0)
 
-    def meet(self, u, share, kept) -> Meeting:
-        """Faces with a sample nearer to the core than a share of their displacement, and the faces `kept`.
+    def meet(self, u, share, last: Meeting | None) -> Meeting:
+        """Faces with a sample nearer to the core than a share of their displacement, and those of the last meeting.
 
         Args:
           u: (nvert, 3) displacements at the present positions, for which the faces are looked at [m].
           share: how much of its displacement a face may make in this step.
-          kept: (n,) numbers of faces.
+          last: candidates so far; returned as they are where there are no more.
         """
         self._share[0] = share
         self._kept[:] = 0
-        self._kept[kept] = 1
+        if last is not None:
+            self._kept[last.face] = 1
         self._look.launch()
         face = np.flatnonzero(self._near)
+        if last is not None and len(face) == len(last.face):
+            return last
         gap = self._gap[face] - self._offset[face]
         corner = self._number[self._face[face]]
         used = np.zeros(len(self.node) + 1, bool)
