@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.contact import face_samples
+from biotac_mj.skin.contact import face_samples, rest_gap
 
 RADIUS, X = 3.5e-3, -12e-3
 DEPTHS = np.linspace(0, 1e-3, 11)[1:]
@@ -112,3 +113,24 @@ def test_deep_inside_the_core(skin):
     with pytest.raises(ValueError, match=r"geom 0 of world 0 \(sphere\) is \d\.\d\d mm inside the rigid core: no skin fits between them"):
         step(model, data, geoms)
     assert (data.vert_xpos[0] == skin.vert).all()  # nothing happened
+
+
+def test_twenty_newtons_between_cube_and_core(skin):
+    """Beyond about 1.5 mm the core carries the load: every step converges and the skin stays between them."""
+    model = SkinModel(skin, options=SkinOptions(liquid=True))
+    data, geoms = SkinData(model), GeomSet(["box"], [(7e-3, 7e-3, 7e-3)], friction=[0.5], rounding=[1e-3])
+    force = 0.0
+    for depth in np.arange(0, 3e-3, 5e-5):
+        geoms.set_pose([[-0.010, skin.vert[:, 1].min() + depth - 7e-3, 0.0]])
+        step(model, data, geoms)
+        assert data.converged.all()
+        force = np.linalg.norm(data.wrench[0, 0, :3])
+        if force > 20:
+            break
+    assert force > 20
+    # under p samples are p/k inside, k = 180 E per mm: 5 MPa on average under the cube, twice that at the facet's edge is 36 um
+    grid = model.core(1).struct
+    inside = wp.zeros(len(model.core_surface.face) * len(model.sample), dtype=wp.float64)
+    wp.launch(rest_gap, dim=(len(model.core_surface.face), len(model.sample)),
+              inputs=[model.core_surface.face, model.sample, grid, data.x], outputs=[inside])  # fmt: skip
+    assert -5e-5 < inside.numpy().min() < 0
