@@ -4,7 +4,7 @@
 
 Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y) that moves the patch by
 0.1 mm on the load's average, small strain, for each resolution and element; the reference is the quadratic element on the skin that
---reference names, printed first.
+--reference names, printed first. "nodal" is linear tetrahedra with averaged nodal pressure, at small strain only.
 Factor and solve seconds are CHOLMOD's on this machine: the price of a step is a few tens of solves. --press adds real presses of a sphere.
 Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of scikit-fem. Sphere: Lame's closed form.
 """
@@ -19,6 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "tests"))  # blocks: small meshes
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 from accuracy import write_json
 from blocks import boundary, box, faces_on, nodal_areas, shell, skin
@@ -26,7 +27,7 @@ from blocks import boundary, box, faces_on, nodal_areas, shell, skin
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.contact import face_samples
-from biotac_mj.skin.elasticity import LinearTetrahedra
+from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
 from biotac_mj.skin.material import LAWS
 from biotac_mj.skin.quadratic import QuadraticTetrahedra, quadratic
 
@@ -39,12 +40,26 @@ PATCH_CENTER, PATCH_SIZE, PATCH_MOTION = -10e-3, 1e-3, 1e-4  # [m]
 def discretise(geometry, element, material, project=None):
     """The geometry with all its nodes, and its stiffness at rest (3 nvert, 3 nvert) [N/m]."""
     if element == "linear":
-        return geometry, LinearTetrahedra(geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu")).rest_stiffness(
-            material.mu, material.lame
-        )
+        formulation = LinearTetrahedra(geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu"))
+        return geometry, formulation.rest_stiffness(material.mu, material.lame)
+    if element == "nodal":
+        return geometry, nodal_pressure(geometry, material)
     geometry, elem = quadratic(geometry, project)
     formulation = QuadraticTetrahedra(geometry.vert, elem, LAWS[material.law], wp.get_device("cpu"))
     return geometry, formulation.rest_stiffness(material.mu, material.lame)
+
+
+def nodal_pressure(geometry, material):
+    """Stiffness at rest of linear tetrahedra whose dilatation is averaged at the nodes (Bonet and Burton 1998)."""
+    elem, (inverse, volume) = geometry.elem, rest_shape(geometry.vert, geometry.elem)
+    gradient = np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
+    size, cells = 3 * geometry.nvert, np.arange(len(elem))
+    dof = (3 * elem[:, :, None] + np.arange(3)).ravel()
+    growth = sp.csr_matrix(((volume[:, None, None] * gradient).ravel(), (np.repeat(cells, 12), dof)), (len(elem), size))  # of each volume
+    share = sp.csr_matrix((np.full(elem.size, 0.25), (elem.ravel(), np.repeat(cells, 4))), (geometry.nvert, len(elem)))
+    at_nodes = share @ growth
+    pressures = material.bulk * at_nodes.T @ sp.diags(1 / (share @ volume)) @ at_nodes
+    return (rest_stiffness(geometry.nvert, elem, inverse, volume, material.mu, -2 / 3 * material.mu) + pressures).tocsc()
 
 
 def solve(stiffness, load, free, prescribed=None):
@@ -165,7 +180,7 @@ def press(name, element, preset, depth, steps=10, radius=3.5e-3):
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", default="out/locking.json")
-    parser.add_argument("--skins", default="coarse,default,fine", help="linear elements on each; quadratic ones on all but fine")
+    parser.add_argument("--skins", default="coarse,default,fine", help="linear elements on each; the others on all but fine")
     parser.add_argument("--reference", default="default", help="skin whose quadratic elements are the reference")
     parser.add_argument("--press", default="", help="skins for real presses, comma separated")
     parser.add_argument("--depth", type=float, default=1.0, help="of the presses [mm]")
@@ -179,8 +194,8 @@ def main(arguments=None) -> int:
 def _skins(skins, reference):
     rows = []
     first = (reference, "quadratic")
-    others = [(name, element) for name in skins for element in ("linear", "quadratic")]
-    todo = [first] + [pair for pair in others if pair not in (first, ("fine", "quadratic"))]
+    others = [(name, element) for name in skins for element in ("linear", "nodal", "quadratic")]
+    todo = [first] + [pair for pair in others if pair not in (first, ("fine", "nodal"), ("fine", "quadratic"))]
     print(f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}{'solve ms':>10}{'force N':>10}{'error':>9}")
     for label, (E, nu) in MATERIALS.items():
         wanted = None

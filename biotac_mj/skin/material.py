@@ -83,7 +83,8 @@ class Material:
 
 
 # Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on elements that do not lock:
-# nu 0.5 there, 0.499 here, which presses with the force of 0.4999 to 0.3 %; "rubber": nu 0.45, as the reference solutions, on linear ones).
+# nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is squeezed on the core; "rubber": nu 0.45 on linear ones,
+# as the reference solutions).
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False),
