@@ -11,6 +11,9 @@ from .liquid import Rest
 
 __all__ = ["rest_state"]
 
+# Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no residual for later steps.
+_UNDERWAY, _ARRIVED = 1e-2, 1e-5
+
 
 def rest_state(model) -> Rest:
     """The balance of skin and liquid without touching geoms.
@@ -29,23 +32,25 @@ def rest_state(model) -> Rest:
 
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
-    # nothing touches, so the load of the convergence test is the smallest there is: this is a tight solution
-    bare.options = dataclasses.replace(options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=1e-6)
+    bare.options = dataclasses.replace(options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY)
     bare.rest = Rest(vert, 0.0, volume, volume)
     data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
     liquid = data.liquid
     done, size = 0.0, 0.25
     while done < 1:
         size = min(size, 1 - done)
+        if done + size == 1:
+            bare.options = dataclasses.replace(bare.options, tolerance=_ARRIVED)
         if options.rest_pressure:  # liquid at constant pressure
             liquid.stiffness, liquid.last_pressure = 0.0, np.array([(done + size) * options.rest_pressure])
         else:
-            liquid.natural_volume = volume + (done + size) * options.fill_volume
+            liquid.fill(volume + (done + size) * options.fill_volume)
         step(bare, data, nothing)
         if data.converged[0]:
             done += size
         else:
             size /= 2
+            bare.options = dataclasses.replace(bare.options, tolerance=_UNDERWAY)
             if size < 1e-3:
                 which = "rest_pressure" if options.rest_pressure else "fill_volume"
                 raise ValueError(

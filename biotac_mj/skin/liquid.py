@@ -230,13 +230,17 @@ class Liquid:
         self.reset()
 
     def reset(self):
-        rest, K = self.m.rest, self.m.options.bulk_modulus
-        self.natural_volume = rest.natural_volume
-        # an incompressible liquid: the pressure of the last step is what the next starts from, and this stiffness only finds the change
-        self.stiffness = (K if math.isfinite(K) else WATER) / rest.natural_volume
+        rest = self.m.rest
+        self.fill(rest.natural_volume)
         self.last_pressure = np.full(self.nworld, rest.pressure)
         self.gauge_pressure = self.last_pressure.copy()
         self.volume = np.full(self.nworld, rest.volume)
+
+    def fill(self, natural_volume):
+        """Takes as much liquid as has this volume without pressure [m^3]."""
+        # an incompressible liquid: the pressure of the last step is what the next starts from, and this stiffness only finds the change
+        K = self.m.options.bulk_modulus
+        self.natural_volume, self.stiffness = natural_volume, (K if math.isfinite(K) else WATER) / natural_volume
 
     def begin(self):
         """Starts a step."""
