@@ -1,7 +1,9 @@
 """The condensed tier against the full FEM, linear elasticity, Coulomb's law, statics and its own replay."""
 
+import csv
 import dataclasses
 
+import h5py
 import mujoco
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
+from biotac_mj.press_record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
@@ -296,6 +299,16 @@ def test_a_ball_rests_with_its_weight():
     assert abs(data.qvel[0]) < 1e-4 and abs(data.qfrc_constraint[0]) + abs(data.qfrc_passive[0]) > 0
     status = handle.read(data, "status")
     assert status[0] == 1 and status[1] == 0 and status[4] == 1 and handle.config.tier == "condensed"
+
+
+def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):
+    record = dataclasses.replace(synthetic_press, parameters={**synthetic_press.parameters, "tier": "condensed"})
+    write_readings(record, tmp_path / "readings.csv")
+    write_skin(record, tmp_path / "skin.h5")
+    with open(tmp_path / "readings.csv") as file:
+        assert {row["tier"] for row in csv.DictReader(file)} == {"condensed"}
+    with h5py.File(tmp_path / "skin.h5") as file:
+        assert file.attrs["tier"] == "condensed"
 
 
 # --- errors
