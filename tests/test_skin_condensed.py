@@ -311,6 +311,14 @@ def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):
         assert file.attrs["tier"] == "condensed"
 
 
+def test_the_command_line_knows_the_tiers():
+    from biotac_mj import cli
+    from biotac_mj.coupling.config import TIERS
+
+    assert cli.TIERS == TIERS
+    assert cli.parser().parse_args(["press", "--tier", "condensed"]).tier == "condensed"
+
+
 # --- errors
 
 
@@ -321,6 +329,9 @@ def test_what_it_cannot_do_is_refused():
         Config(tier="condensed", stepper="springs")
     model = SkinModel(load_skin("coarse"), options=SkinOptions(dynamics="implicit"))
     with pytest.raises(ValueError, match="no inertia: choose dynamics='quasistatic' or the full tier"):
+        CondensedSkin(model, sphere(), cache=False)
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=1e3))
+    with pytest.raises(ValueError, match="leave fill_volume and rest_pressure out, or use the full tier"):
         CondensedSkin(model, sphere(), cache=False)
 
 

@@ -44,7 +44,8 @@ class CondensedStepper(FemStepper):
         self._write(state, Memory.rest(len(self._geoms)))
 
     def vert_xpos(self, state):
-        return self._geometry.vert + self._skin.displacement(self._read(state))
+        n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
+        return self._geometry.vert + self._skin.displacement(self._read(state))[:n]
 
     def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
         """See `SkinStepper`.
@@ -59,7 +60,7 @@ class CondensedStepper(FemStepper):
             state=new,
             wrench=out.wrench,
             tangent=out.tangent,
-            vert_xpos=out.vert_xpos,
+            vert_xpos=out.vert_xpos[: self._geometry.nvert],
             pressure=out.memory.pressure,
             converged=out.converged,
             iterations=out.iterations,

@@ -115,7 +115,7 @@ class CondensedSkin:
       cache: whether to keep the compliance on disk (see `surface_compliance`).
 
     Raises:
-      ValueError: a model on another device or with implicit dynamics.
+      ValueError: a model on another device, with implicit dynamics, or filled beyond its unstressed volume.
     """
 
     def __init__(self, model, geoms: GeomSet, cache: bool = True):
@@ -123,6 +123,10 @@ class CondensedSkin:
             raise ValueError("the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA")
         if model.options.dynamics != "quasistatic":
             raise ValueError("the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier")
+        if model.has_liquid and (model.options.fill_volume or model.options.rest_pressure):
+            raise ValueError(
+                "the condensed tier is linear about the unstressed skin: leave fill_volume and rest_pressure out, or use the full tier"
+            )
         self.model, self.geoms = model, geoms
         g = model.geometry
         free = np.zeros(model.nvert, bool)
