@@ -1,0 +1,140 @@
+"""PAC through `mj_step` with implicit dynamics: tapping, rubbing over ridges, and what steps do to a vibration."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj import approach
+from biotac_mj.geometry import load_skin
+from biotac_mj.sensor import channels
+from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+
+RATE = SLOT_RATE / 2  # [Hz] of PAC
+REST = channels.impedance_from_counts(np.full(19, 3000.0))
+PITCH, RIDGE = 1e-3, 0.3e-3  # [m] of the texture, and its capsules' radius
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    yield
+    biotac_mj.plugin.check()
+
+
+@pytest.fixture(scope="module")
+def pad():
+    """Point on the pad, outward normal and the direction along the finger."""
+    point, normal = approach.surface_point(load_skin("coarse"), -12e-3, 0.0)
+    along = np.cross(normal, [0, 0, 1.0])
+    return point, normal, along / np.linalg.norm(along)
+
+
+def scene(geoms, timestep, start):
+    """A BioTac and a body that is moved from `start`, with geoms (type, size, pos)."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = timestep, np.zeros(3)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.worldbody.add_body(name="finger")
+    tool = spec.worldbody.add_body(name="tool", pos=start, mocap=True)
+    for kind, size, pos in geoms:
+        tool.add_geom(type=kind, size=size, pos=pos, contype=0, conaffinity=0, friction=[0.2, 0, 0])
+    for i, geom in enumerate(tool.geoms):
+        geom.name = f"g{i}"
+    handle = biotac_mj.attach(spec, body="finger", skin="coarse", coupling="one-way", geoms=[g.name for g in tool.geoms],
+                              friction=0.2, options={"skin": {"dynamics": "implicit"}})  # fmt: skip
+    model = spec.compile()
+    return model, mujoco.MjData(model), handle
+
+
+def record(model, data, handle, path):
+    """PAC counts, every one of 2.2 kHz, while the tool goes along `path` (nstep, 3)."""
+    pac, last = [], 0
+    for i, position in enumerate(path):
+        data.mocap_pos[0] = position
+        mujoco.mj_step(model, data)
+        assert handle.read(data, "status")[0] == 1
+        slot = int(np.floor((i + 1) * model.opt.timestep * SLOT_RATE + 1e-6))
+        frame = handle.read(data, "pac")
+        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last + 1, slot + 1) if k % 2 == 0]
+        last = slot
+    return np.array(pac)
+
+
+def test_tapping(pad):
+    """A ball meets the pad at 13 mm/s, goes 0.1 mm deep and leaves, at 20 Hz."""
+    point, normal, _ = pad
+    dt, frequency = 5e-4, 20.0
+    time = dt * np.arange(1, 201)
+    depth = -1e-4 + 2e-4 * np.sin(2 * np.pi * frequency * (time - 0.02)) * (time > 0.02)
+    path = point + (3.5e-3 - depth)[:, None] * normal
+    pac = record(*scene([(mujoco.mjtGeom.mjGEOM_SPHERE, [3.5e-3, 0, 0], [0, 0, 0])], dt, path[0]), path)
+    pressure = channels.pac_from_counts(pac)
+    quiet = pressure[: int(0.022 * RATE)]
+    assert 0.5 * 0.37 < quiet.std() < 1.5 * 0.37  # before first touch only the noise: about one count
+    instant = np.arange(1, len(pac) + 1) / RATE
+    touch = 0.02 + 1 / 12 / frequency
+    rising = (instant > touch) & (instant < touch + 1 / 3 / frequency)
+    assert pressure[rising].max() > 50 * quiet.std()
+    falling = (instant > touch + 1 / 3 / frequency) & (instant < touch + 1 / frequency)
+    assert pressure[falling].min() < -20 * quiet.std()  # below rest while the ball leaves: no steady part passes
+
+
+def rub(pad, speed, periods, rate):
+    """Amplitudes [counts] of PAC at multiples 1 / periods, 2 / periods... of speed / pitch, once the rubbing is steady."""
+    point, normal, along = pad
+    count, dt = 25, PITCH / speed / rate
+    ridges = [(mujoco.mjtGeom.mjGEOM_CAPSULE, [RIDGE, 5e-3, 0], (i - count // 2) * PITCH * along) for i in range(count)]
+    press, lead = 20, 3 * rate  # steps
+    n = np.arange(1, press + lead + rate * periods + 1)
+    depth = 0.4e-3 * np.minimum(n / press, 1)
+    slid = speed * dt * np.clip(n - press, 0, None)
+    slid -= slid[-1] / 2
+    path = point + (RIDGE - depth)[:, None] * normal + slid[:, None] * along
+    pac = record(*scene(ridges, dt, path[0]), path)
+    pac = pac[-int(round(periods * PITCH / speed * RATE)) :].astype(float)
+    index = np.arange(len(pac))
+    pac -= np.polyval(np.polyfit(index, pac, 1), index)
+    return np.abs(np.fft.rfft(pac)) * 2 / len(pac)
+
+
+# 200 Hz at 0.42 ms, 100 Hz at 0.5 ms
+@pytest.mark.parametrize("speed, rate", [(0.2, 12), pytest.param(0.1, 20, marks=pytest.mark.slow)])
+def test_rubbing_over_ridges(pad, speed, rate):
+    """PAC shows the lines speed / pitch and its multiples, and next to nothing between them.
+
+    White noise of one count has 2 / sqrt(n) of it in every line, so a line of five counts is 20 times the noise.
+    """
+    periods = 4
+    lines = rub(pad, speed, periods, rate)
+    top = min(4 * periods, int(periods * PITCH / speed * 1000))
+    number = np.arange(1, top + 1)
+    on = number % periods == 0
+    between = ~on & (number > periods)  # below lies what is left of the way in
+    amplitude = lines[1 : top + 1]
+    assert amplitude[periods - 1] > 5
+    assert amplitude[on].max() > 20
+    assert np.median(amplitude[on]) > 5 * np.median(amplitude[between])
+    assert (amplitude[on] ** 2).sum() > 30 * (amplitude[between] ** 2).sum()
+
+
+@pytest.mark.parametrize("dt", [2e-4, 5e-4])
+@pytest.mark.parametrize("frequency", [50.0, 200.0, 400.0])
+def test_vibration_through_steps(frequency, dt):
+    """Pressure known at step ends, linear between: a tone passes as sinc^2(f dt) of what the continuous band-pass lets through."""
+    acquisition = Acquisition(noise=False)
+    state = np.zeros(acquisition.nstate)
+    acquisition.reset(state, REST)
+    amplitude, count = 400.0, int(round(0.2 / dt))
+    pac, last = [], 0
+    for i in range(count):
+        acquisition.advance(state, i * dt, dt, None, amplitude * np.sin(2 * np.pi * frequency * (i + 1) * dt))
+        slot = int(np.floor((i + 1) * dt * SLOT_RATE + 1e-6))
+        frame = acquisition.readings(state)["pac"]
+        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last + 1, slot + 1) if k % 2 == 0]
+        last = slot
+    pac = np.array(pac)[-int(0.1 * RATE) :] - channels.counts_from_pac(0.0)
+    phase = np.exp(-2j * np.pi * frequency * np.arange(len(pac)) / RATE)
+    measured = 2 * abs((pac * phase).mean()) * 0.37
+    s, low, high = 2j * np.pi * frequency, 2 * np.pi * 1040, 2 * np.pi * 10
+    band = abs(s * low / ((s + low) * (s + high)))
+    assert measured == pytest.approx(amplitude * band * np.sinc(frequency * dt) ** 2, rel=0.02)
