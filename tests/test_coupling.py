@@ -1,12 +1,16 @@
 """The two-way coupling against statics, Coulomb's law and conservation of momentum, with a skin of springs."""
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
 import spring_skin
+from scipy.optimize import brentq
 
 import biotac_mj
 from biotac_mj.coupling import attach
+from biotac_mj.coupling.integrator import FixedPoint
 from biotac_mj.coupling.touching import displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
@@ -87,6 +91,105 @@ def test_a_light_finger_on_its_limit_carries_a_ball():
     assert abs(data.qvel).max() < 1e-6
     assert data.qfrc_passive[1] == pytest.approx(0.1 * G, rel=1e-6)
     assert data.qfrc_constraint[1] == pytest.approx(0.0, abs=1e-6)  # at rest the rows that carry the stiffness push nothing
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.004])
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
+@pytest.mark.parametrize("damping", [0.0, 0.05, 1.55])
+def test_a_damped_ball_moves_as_backward_euler_says(damping, integrator, timestep):
+    """1 g on a damped slide, up to h c / m = 6: the skin acts where the integrator takes the ball, not where the solver's qacc points."""
+    mass, stiffness, start = 0.001, 5.0, 0.0181
+    model, data, handle = scene(
+        ball(mass, f'<joint type="slide" axis="0 0 1" damping="{damping}"/>', f"0 0 {start}"), timestep, "0 0 -9.81", integrator,
+        stiffness=stiffness,
+    )  # fmt: skip
+    line = np.linspace(-0.004, 0.004, 9)
+    x, y = (grid.ravel() for grid in np.meshgrid(line, line))
+
+    def push(height):
+        distance = np.sqrt(x**2 + y**2 + height**2)
+        return (stiffness * np.maximum(0.01 - distance, 0.0) * height / distance).sum()
+
+    weight, most = mass * G, 0.0
+    for _ in range(min(int(0.4 / timestep), 200)):
+        height, speed = data.qpos[0] + start - 0.008, data.qvel[0]  # over the springs' plane
+        mujoco.mj_step(model, data)
+
+        def wrong(after, height=height, speed=speed):
+            return mass * (after - speed) / timestep + weight + damping * after - push(height + timestep * after)
+
+        height += timestep * brentq(wrong, -5, 5, xtol=1e-15, rtol=1e-14)
+        assert data.qpos[0] + start - 0.008 == pytest.approx(height, abs=1e-6)
+        assert handle.read(data, "contact_force")[1] == pytest.approx(push(height), abs=2e-6 * 81 * stiffness)  # solved within 2 um
+        most = max(most, push(height))
+    assert most > 0.5 * weight  # it has met the springs
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
+@pytest.mark.parametrize("disabled", [0, mujoco.mjtDisableBit.mjDSBL_EULERDAMP, mujoco.mjtDisableBit.mjDSBL_DAMPER])
+def test_the_skin_is_solved_where_the_integrator_takes_its_bodies(integrator, disabled):
+    """(M - h D)^-1 M a is the change of the velocities in mj_step: dampers of higher order, a tendon's, servos, also at their limit."""
+    finger = (
+        '<body name="finger"><joint name="a" type="hinge" axis="0 1 0" pos="-.04 0 0" damping=".01 .002 .001"/>'
+        '<geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass=".02"/></body>'
+    )
+    arm = (
+        '<body name="arm" pos="0 .1 0"><joint name="b" type="hinge" axis="0 1 0" damping="1e-3"/>'
+        '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/><body pos=".1 0 0"><joint name="c" type="hinge" axis="0 1 0"/>'
+        '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/></body></body>'
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="0.004" integrator="{integrator}"/><worldbody>{finger}{arm}'
+        + ball(0.03, '<joint type="free" damping=".2"/>', "0 0 .03")
+        + "</worldbody>"
+        '<tendon><fixed name="t" damping=".02"><joint joint="b" coef="1"/><joint joint="c" coef="-1"/></fixed></tendon>'
+        '<actuator><velocity joint="b" kv=".05"/><position joint="c" kp="1" kv=".03" forcerange="-.01 .01"/>'
+        '<position joint="a" kp="1" kv=".02"/></actuator></mujoco>'
+    )
+    settings = dict(stepper="springs", readings="none", friction=0.3)
+    attach(spec, body="finger", quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(), **settings)
+    model = spec.compile()
+    model.opt.disableflags |= int(disabled)
+    data = mujoco.MjData(model)
+    data.qvel[:], data.ctrl[:] = np.random.default_rng(0).normal(size=model.nv), (0.3, 0.5, -0.2)
+    mujoco.mj_forward(model, data)
+    world = sys.modules["biotac_mj.plugin.engine"]._worlds[data._address]
+    explicit, before = data.qacc.copy(), data.qvel.copy()
+    used = world.integrator.advance(explicit) if world.integrator.begin(world.data) else explicit
+    mujoco.mj_step(model, data)
+    real = (data.qvel - before) / model.opt.timestep
+    np.testing.assert_allclose(used, real, rtol=1e-9, atol=1e-9 * abs(real).max())
+    if integrator != "Euler" or not disabled:
+        assert abs(explicit - real).max() > 0.1 * abs(real).max()  # there was something to get right
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
+def test_only_dampers_take_momentum(integrator):
+    """A damped finger hit by a free ball: what both lose is what the joint's dampers take, at the end of each step."""
+    damping, timestep = 5.0, 0.004
+    joints = "".join(f'<joint type="slide" axis="{axis}" damping="{damping}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    finger = f'<body name="finger">{joints}<geom type="box" size=".008 .008 .008" mass=".02" {GHOST}/></body>'
+    model, data, handle = scene(ball(0.03, pos=".002 .001 .0182"), timestep, "0 0 0", integrator, finger, stiffness=2e3)
+    data.qvel[3:6] = [0.1, 0.05, -0.3]
+    finger_mass, touched = model.body_subtreemass[1], 0
+    for _ in range(20):
+        before = finger_mass * data.qvel[:3] + 0.03 * data.qvel[3:6]
+        mujoco.mj_step(model, data)
+        after = finger_mass * data.qvel[:3] + 0.03 * data.qvel[3:6]
+        np.testing.assert_allclose(after - before, -timestep * damping * data.qvel[:3], atol=1e-14)
+        touched += handle.read(data, "contact_force").any()
+    assert touched >= 2
+
+
+def test_a_fixed_point_with_a_kink_is_found_in_few_rounds():
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=(5, 5))
+    slope, offset = 0.9 * a / np.linalg.norm(a, 2), rng.normal(size=5)
+    for g in (lambda x: slope @ x + offset, lambda x: np.minimum(slope @ x + offset, 0.3)):
+        x, search = np.zeros(5), FixedPoint()
+        for _ in range(12):
+            x = search.next(x, g(x) - x)
+        np.testing.assert_allclose(g(x), x, atol=1e-8)
 
 
 def _momentum(model, data):

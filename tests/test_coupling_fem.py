@@ -98,6 +98,31 @@ def test_a_ball_reads_its_weight(mass, timestep):
     check_weight(mass, timestep)
 
 
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST", "IMPLICIT"])
+def test_a_damped_ball_settles_along_the_static_curve(integrator):
+    """1 g, h c / m = 6.2: what it reads at each depth is what the skin reads where a geom is held at that depth, and nothing rings."""
+    mass, timestep = 0.001, 0.004
+    weight = mass * G
+    model, data, handle = scene(ball(mass, UPRIGHT.format(1.55)), timestep)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    depth, force = [], []
+    for _ in range(40):
+        mujoco.mj_step(model, data)
+        depth.append(-data.qpos[0])
+        force.append(handle.read(data, "contact_force")[1])
+    depth, force = np.array(depth), np.array(force)
+    model, data, handle = pressing(f'<geom type="sphere" size="{RADIUS}" friction="0.1"/>', timestep)
+    static = []
+    for d in depth[:8]:
+        data.mocap_pos[0] = [0, 0, TOP + RADIUS - d]
+        mujoco.mj_step(model, data, 2)
+        static.append(handle.read(data, "contact_force")[1])
+    np.testing.assert_allclose(force[:8], static, atol=0.02 * weight)
+    assert force[0] < 0.3 * weight  # it begins shallow
+    assert np.diff(depth).min() > -5e-8 and np.ptp(depth[8:]) < 1e-7
+    np.testing.assert_allclose(force[8:], weight, rtol=0.005)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("liquid", [True, False])
 @pytest.mark.parametrize("timestep", [0.0005, 0.001, 0.002, 0.004])

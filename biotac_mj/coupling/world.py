@@ -1,23 +1,28 @@
 """All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
 
-A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, MuJoCo's accelerations a under it.
-Newton's method on x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which says where
-the bodies go, and solves the skins there, which gives new linear models. The models of the last step start it. A resting or smoothly
-moving contact takes one solve of the skin per step; an impact, or a light object that meets the skin within the step, two or three.
+A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, the accelerations a with which
+MuJoCo's integrator moves the bodies under it (`integrator`). Newton's method on x': every round asks MuJoCo for the accelerations with the
+skins' linear models in force (`metric`), which says where the bodies go, and solves the skins there, which gives new linear models. The
+models of the last step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a light object
+that meets the skin within the step, two or three.
 """
 
 import mujoco
 import numpy as np
 
 from .instance import Instance
+from .integrator import FixedPoint, Integrator
 from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
 
 MAX_ROUNDS = 4
 TOLERANCE = 2e-6  # [m] change of the predicted pose, rotations over a lever of _LEVER, below which the skin is not solved again
+MAX_CORRECTIONS = 12
+CORRECTED = 1e-6  # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _LEVER = 0.01  # [m] about the size of a fingertip
+_SCALE = np.array([1.0, 1.0, 1.0, *[1 / _LEVER] * 3])  # compares torques with forces
 
 
 class World:
@@ -28,6 +33,8 @@ class World:
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         self.first = self.coupled[0].index if self.coupled else -1
+        self._damped = None  # whether the integrator's accelerations differ from the constraint solver's in this step
+        self.integrator = Integrator(model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)})
 
     def passive(self, index):
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is asked."""
@@ -60,15 +67,52 @@ class World:
 
     def _newton(self, skins, outside):
         moving = skins[0].horizon > 0 and self.model.nv > 0
+        self._damped = None
         for _ in range(MAX_ROUNDS):
-            self._forces(skins, outside)
-            acceleration = self.data.acceleration() if moving else np.zeros(self.model.nv)
+            acceleration = self._accelerations(skins, outside) if moving else np.zeros(self.model.nv)
             solved = [skin.follow(acceleration) for skin in skins]
             if not any(solved):
                 return
             if not moving:
                 break
+        if moving and self._damped:
+            self._accelerations(skins, outside)
+        else:
+            self._forces(skins, outside)
+
+    def _accelerations(self, skins, outside):
+        """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the forces that do this in place.
+
+        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J (a - a') corrects it.
+        """
         self._forces(skins, outside)
+        found = self.data.acceleration()
+        if self._damped is None:  # known only after the actuation stage
+            self._damped = self.integrator.begin(self.data)
+        if not self._damped:
+            return found
+        if not any(s.tangent.any() for s in skins):
+            return self.integrator.advance(found)
+        jacobian, tangent, wrench0, correction = (
+            np.concatenate([getattr(s, name) for s in skins]) for name in ("jacobian", "tangent", "wrench0", "correction")
+        )
+        stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
+        search = slope = None
+        for last in range(MAX_CORRECTIONS, -1, -1):
+            moved = self.integrator.advance(found)
+            excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
+            wrong = excess - correction
+            poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
+            if not (poor and last):  # also where the simulation has blown up: nothing is greater than nan
+                return moved
+            if search is None:
+                search, slope = FixedPoint(), self.integrator.slope(jacobian, stiffness)
+            step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
+            correction = search.next((_SCALE * correction).ravel(), (_SCALE * step).ravel()).reshape(-1, 6) / _SCALE
+            for skin, part in zip(skins, np.split(correction, ends)):
+                skin.correction = part
+            self._forces(skins, outside)
+            found = self.data.acceleration()
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
@@ -92,6 +136,7 @@ class _Coupled:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
+        self.correction = np.zeros((len(self.wrench0), 6))
         self.solved = self.written = False
         self.converged = True
 
@@ -104,6 +149,8 @@ class _Coupled:
         result = self.instance.solve(*pose, self._core_motion(acceleration))
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
         self.solved, self.converged, self.written = True, result.converged, False
+        if not self.tangent.any():
+            self.correction = np.zeros_like(self.wrench0)
         return True
 
     def _core_motion(self, acceleration):
@@ -124,7 +171,7 @@ class _Coupled:
             self.written = True
         if self.wrench0.any() or self.tangent.any():
             motion = displacement(*self.pose, *self.pose0)
-            wrench = self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
+            wrench = self.correction + self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
             self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
 
     def let_go(self):
