@@ -8,8 +8,9 @@ __all__ = ["main", "parser"]
 # Names that the help shows without loading what defines them (tests hold them together).
 INDENTERS = "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm cube_14mm ring_7mm".split()
 TIERS = ("full", "condensed")
-MATERIALS = ("default", "paper", "rubber")
+MATERIALS = ("default", "paper", "rubber", "ansys")
 SKINS = ("coarse", "default", "fine")
+CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "solid")
 
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -39,6 +40,8 @@ def parser() -> argparse.ArgumentParser:
     _add_press(verbs)
     _add_view(verbs)
     _add_import_mesh(verbs)
+    _add_calibrate(verbs)
+    _add_compare(verbs)
     return top
 
 
@@ -183,6 +186,58 @@ def _import_mesh(args):
     print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
     geometry.save(out)
     print(f"  stored in {out}: use it with --skin {out}")
+
+
+def _add_calibrate(verbs):
+    verb = _verb(verbs, "calibrate", _calibrate, "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.")
+    verb.add_argument("data", nargs="?", metavar="DATA", help="CSV of the indentation (docs/calibration.md), or skin.h5 of a press")
+    verb.add_argument("--synthetic", action="store_true", help="instead of DATA: our own skin of --truth pressed and slid, with --noise")
+    verb.add_argument("--truth", default="rubber", help="material of the synthetic skin; a preset, its liquid with it")
+    verb.add_argument("--truth-skin", default="default", help="mesh of the synthetic skin")
+    verb.add_argument("--noise", type=float, default=0.01, metavar="N", help="of each synthetic force component, standard deviation")
+    verb.add_argument("--seed", type=int, default=0, help="of that noise")
+    verb.add_argument("--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {_INDENTER_HELP}")
+    verb.add_argument("--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="the indenter's tip points there (default: +y)")
+    verb.add_argument("--configuration", default="shell_with_core", choices=CONFIGURATIONS, help="what is fitted")
+    verb.add_argument("--skin", default="coarse", help=f"its mesh: {', '.join(SKINS)}, or a file; solids come as coarse")
+    verb.add_argument("--material", default="paper", help=f"law and starting values: {', '.join(MATERIALS)}, or a calibration's JSON")
+    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid under the skin; matters for E and nu")
+    verb.add_argument("--fit", nargs="+", default=["E", "nu", "mu"], metavar="NAME[:LOW:HIGH]", help="parameters, with bounds if you like")
+    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+    verb.add_argument("--out", default="out/calibrate", metavar="DIR", help="folder of calibration.json and calibration.png")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _calibrate(args):
+    from .calibration import verbs
+
+    _calm_warp()
+    verbs.calibrate_verb(args)
+
+
+def _add_compare(verbs):
+    verb = _verb(verbs, "compare", _compare, "Compare the paper's four configurations with a reference over many indentations.")
+    verb.add_argument("--configurations", nargs="+", default=list(CONFIGURATIONS), choices=CONFIGURATIONS, metavar="NAME", help="which")
+    verb.add_argument("--data", nargs="+", metavar="INDENTER=FILE", help="measured indentations, not our stand-in; the first calibrates")
+    verb.add_argument("--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which")
+    verb.add_argument("--count", type=int, default=1, help="random indentations for each indenter")
+    verb.add_argument("--seed", type=int, default=0, help="of the indentations")
+    verb.add_argument("--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it")
+    verb.add_argument("--reference-skin", default="coarse", help="mesh of the stand-in")
+    verb.add_argument("--reference-element", default="quadratic", choices=("linear", "quadratic"), help="elements of the stand-in")
+    verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
+    verb.add_argument("--material", help="given to all configurations, preset or a calibration's JSON (default: each is calibrated first)")
+    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells")
+    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+    verb.add_argument("--out", default="out/compare", metavar="DIR", help="folder of compare.json")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _compare(args):
+    from .calibration import verbs
+
+    _calm_warp()
+    verbs.compare_verb(args)
 
 
 def _calm_warp():

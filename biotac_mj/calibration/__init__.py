@@ -1,0 +1,29 @@
+"""The paper's four configurations, the fit of their parameters to force-deflection data, and their comparison with a reference."""
+
+from .comparison import Comparison, comparison_table, evaluate, plan_indentations
+from .configurations import CONFIGURATIONS, Configuration, configuration
+from .fit import Calibration, Parameter, calibrate, parameter
+from .forward import Response, simulate
+from .indentation import Indentation, plan_indentation, read_indentation, write_indentation
+from .reference import stand_in
+
+__all__ = [
+    "CONFIGURATIONS",
+    "Calibration",
+    "Comparison",
+    "Configuration",
+    "Indentation",
+    "Parameter",
+    "Response",
+    "calibrate",
+    "comparison_table",
+    "configuration",
+    "evaluate",
+    "parameter",
+    "plan_indentation",
+    "plan_indentations",
+    "read_indentation",
+    "simulate",
+    "stand_in",
+    "write_indentation",
+]

@@ -1,0 +1,59 @@
+"""The four bodies that Narang et al. (ICRA 2021) compared, as skins with options."""
+
+import dataclasses
+
+from ..geometry.assets import asset_path
+from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import load_skin
+from ..skin.model import SkinOptions
+
+__all__ = ["CONFIGURATIONS", "Configuration", "configuration"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Configuration:
+    """One of the four.
+
+    Attributes:
+      name: as in CONFIGURATIONS.
+      geometry: the body, in the BioTac frame.
+      options: how it is solved; never with liquid, which the paper's model did not have.
+    """
+
+    name: str
+    geometry: SkinGeometry
+    options: SkinOptions
+
+
+# The body's mesh (None: the skin asked for) and whether the inner surface can touch the rigid core. All are held where they lie on nail
+# and clamp plate. The shells are held where they are bonded to the core too; `solid_with_core` is bonded to all of it, `solid` fills it.
+CONFIGURATIONS = {
+    "deformable_shell": (None, False),
+    "shell_with_core": (None, True),
+    "solid_with_core": ("solid_with_core", False),
+    "solid": ("solid", False),
+}
+
+
+def configuration(name: str, skin: str = "coarse", **options) -> Configuration:
+    """One of the paper's four configurations.
+
+    Args:
+      name: of CONFIGURATIONS.
+      skin: resolution; shells come as "coarse", "default", "fine" or a file, solids as "coarse" only.
+      options: further SkinOptions; `liquid=True` is for shells.
+
+    Raises:
+      ValueError: unknown name, a solid of another resolution, or a solid with liquid.
+    """
+    if name not in CONFIGURATIONS:
+        raise ValueError(f"unknown configuration {name!r}: choose one of {', '.join(CONFIGURATIONS)}")
+    body, core = CONFIGURATIONS[name]
+    options = SkinOptions(**{"liquid": False, "core_contact": core, **options})
+    if body is None:
+        return Configuration(name, load_skin(skin), options)
+    if options.liquid:
+        raise ValueError(f"configuration {name!r} has no space for a liquid: take a shell, or leave the liquid out")
+    if skin != "coarse":
+        raise ValueError(f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: make others with scripts/make_solids.py")
+    return Configuration(name, SkinGeometry.load(asset_path(f"skins/{body}_coarse.npz")), options)

@@ -1,0 +1,308 @@
+"""Fits material and solver parameters to the forces of one indentation, as Narang et al. (ICRA 2021) did.
+
+The cost is the root mean square over time of the norm of the force error. Sequential least squares (scipy's SLSQP) minimises its square,
+which has the same minimum and a round bottom; a trust-region Gauss-Newton (scipy's least_squares) finishes. The model's value and all
+finite-difference columns of its Jacobian are the worlds of one batch; parameters that a batch shares (solver options) take a batch each.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from ..skin.material import Material
+from ..skin.model import SkinOptions
+from .configurations import Configuration
+from .forward import simulate
+from .indentation import Indentation
+from .statistics import covariance, ljung_box
+
+__all__ = ["PARAMETERS", "Calibration", "Parameter", "calibrate", "forces_and_jacobian", "parameter"]
+
+_STEP = 0.01  # of a scaled parameter: 1 % of a positive one, far above the solver's error at TOLERANCE
+# Of the skin's solver: forces repeat to 1e-5 N. A step given up for want of iterations makes the cost jump, so there are many.
+TOLERANCE, MAX_NEWTON = 1e-6, 200
+_CONFIDENCE = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A number to fit.
+
+    Attributes:
+      name: a number of Material or of SkinOptions.
+      lower, upper: bounds.
+      logarithmic: the fit moves in its logarithm (positive bounds), else in the number over the width of its bounds.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    logarithmic: bool = False
+
+    def scaled(self, value):
+        return np.log(value) if self.logarithmic else 2 * value / (self.upper - self.lower)
+
+    def value(self, scaled):
+        return float(np.exp(scaled)) if self.logarithmic else float(scaled * (self.upper - self.lower) / 2)
+
+    def slope(self, value):
+        """d value / d scaled."""
+        return value if self.logarithmic else (self.upper - self.lower) / 2
+
+
+PARAMETERS = {
+    "youngs_modulus": Parameter("youngs_modulus", 1e4, 1e8, True),
+    "poissons_ratio": Parameter("poissons_ratio", 0.0, 0.49),
+    "friction": Parameter("friction", 0.01, 3.0, True),
+    "contact_stiffness": Parameter("contact_stiffness", 1e9, 1e14, True),
+    "stick_ratio": Parameter("stick_ratio", 1e-3, 1.0, True),
+    "bulk_modulus": Parameter("bulk_modulus", 1e3, 1e10, True),
+}
+_SHORT = {"E": "youngs_modulus", "nu": "poissons_ratio", "mu": "friction"}
+_MATERIAL = [f.name for f in dataclasses.fields(Material) if f.type in (float, "float")]
+_OPTIONS = [f.name for f in dataclasses.fields(SkinOptions) if f.type in (float, "float", float | None, "float | None")]
+
+
+def parameter(text: str) -> Parameter:
+    """A Parameter from "NAME" or "NAME:LOWER:UPPER"; E, nu and mu are short for Young's modulus, Poisson's ratio and friction.
+
+    Raises:
+      ValueError: unknown name, bounds that are no interval, or none where none are known.
+    """
+    name, *bounds = text.split(":")
+    name = _SHORT.get(name, name)
+    if name not in (*_MATERIAL, *_OPTIONS):
+        raise ValueError(f"cannot fit {name!r}: choose E, nu, mu or one of {', '.join((*_MATERIAL, *_OPTIONS))}")
+    if not bounds:
+        if name not in PARAMETERS:
+            raise ValueError(f"no bounds are known for {name}: give them as {name}:LOWER:UPPER")
+        return PARAMETERS[name]
+    try:
+        lower, upper = (float(b) for b in bounds)
+    except ValueError:
+        raise ValueError(f"bounds of {text!r} are not two numbers: write {name}:LOWER:UPPER") from None
+    if not (np.isfinite([lower, upper]).all() and lower < upper):
+        raise ValueError(f"bounds of {text!r} are no interval: write {name}:LOWER:UPPER with LOWER < UPPER, both finite")
+    return Parameter(name, lower, upper, lower > 0 and upper > 10 * lower)
+
+
+@dataclasses.dataclass
+class Calibration:
+    """What a fit found. n samples, p parameters.
+
+    Attributes:
+      configuration, skin, law, element, liquid, indenter: what was fitted with.
+      parameters: names.
+      start, value: (p,) before and after.
+      interval: (p, 2) 95 % confidence; from the larger of the two standard errors.
+      standard_error: (p,) for white residuals; standard_error_robust: (p,) after Newey and West, with `lags`.
+      correlation: (p, p) of the parameters.
+      at_bound: (p,) whether a parameter ended on a bound, where its interval means little.
+      rms, mean: of the norm of the force error over time [N]; peak: largest measured force [N].
+      whiteness: Ljung and Box's test of the residual's components.
+      material, options: of the result; those of the whole skin.
+      measured, fitted: (n, 3) [N]; time: (n,) [s].
+      evaluations: batches; success, message: of the last optimiser.
+      nonconverged: steps of the skin at the result that did not converge.
+    """
+
+    configuration: str
+    skin: str
+    law: str
+    element: str
+    liquid: bool
+    indenter: str
+    parameters: list
+    start: np.ndarray
+    value: np.ndarray
+    interval: np.ndarray
+    standard_error: np.ndarray
+    standard_error_robust: np.ndarray
+    lags: int
+    correlation: np.ndarray
+    at_bound: np.ndarray
+    rms: float
+    mean: float
+    peak: float
+    whiteness: dict
+    material: Material
+    options: SkinOptions
+    time: np.ndarray
+    measured: np.ndarray
+    fitted: np.ndarray
+    evaluations: int
+    success: bool
+    message: str
+    nonconverged: int
+
+
+def forces_and_jacobian(configuration: Configuration, material: Material, parameters, values, indentation: Indentation, device="cpu"):
+    """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one batch.
+
+    Returns:
+      force (n, 3) [N], jacobian (n, 3, p) [N], nonconverged steps of the first world.
+    """
+    values = np.asarray(values, float)
+    scaled = np.array([p.scaled(v) for p, v in zip(parameters, values)])
+    upper = np.array([p.scaled(p.upper) for p in parameters])
+    steps = np.where(scaled + _STEP > upper, -_STEP, _STEP)
+    points = [values]
+    for i, p in enumerate(parameters):
+        point = values.copy()
+        point[i] = p.value(scaled[i] + steps[i])
+        points.append(point)
+    force, lost = [None] * len(points), 0
+    cases = [_case(configuration.options, material, parameters, point) for point in points]
+    for options in dict.fromkeys(options for options, _ in cases):
+        members = [i for i, case in enumerate(cases) if case[0] == options]
+        response = simulate(configuration.geometry, options, [cases[i][1] for i in members], indentation, device)
+        for i, f in zip(members, response.force):
+            force[i] = f
+        if 0 in members:
+            lost = int(response.nonconverged[members.index(0)])
+    jacobian = np.stack([(f - force[0]) / h for f, h in zip(force[1:], steps)], -1)
+    return force[0], jacobian, lost
+
+
+def _case(options, material, parameters, point):
+    """Options and material with the parameters set."""
+    changes = {p.name: float(v) for p, v in zip(parameters, point)}
+    on_material = {name: v for name, v in changes.items() if name in _MATERIAL}
+    on_options = {name: v for name, v in changes.items() if name not in _MATERIAL}
+    return dataclasses.replace(options, **on_options), dataclasses.replace(material, **on_material)
+
+
+def calibrate(
+    configuration: Configuration,
+    material: Material,
+    indentation: Indentation,
+    parameters=("E", "nu", "mu"),
+    max_iterations: int = 20,
+    device: str = "cpu",
+    progress: bool = False,
+) -> Calibration:
+    """Fits parameters to the force of an indentation.
+
+    The contact stiffness stays that of the starting material, unless it is fitted: 180 E per millimetre is so stiff that twice as much
+    hardly changes the force, and the batch needs one.
+
+    Args:
+      configuration: body and options; liquid is `options.liquid`, or the material's where that is None.
+      material: law and starting values.
+      parameters: names, as `parameter` takes them, or Parameters.
+      progress: whether to show a bar.
+
+    Raises:
+      ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not tell the parameters apart.
+    """
+    import tqdm
+    from scipy.optimize import least_squares, minimize
+
+    parameters = [p if isinstance(p, Parameter) else parameter(p) for p in parameters]
+    if not parameters or len({p.name for p in parameters}) != len(parameters):
+        raise ValueError("name each parameter to fit once, and at least one")
+    stiffness = configuration.options.contact_stiffness or 180e3 * material.youngs_modulus
+    exact = dict(tolerance=min(TOLERANCE, configuration.options.tolerance), max_newton=max(MAX_NEWTON, configuration.options.max_newton))
+    options = dataclasses.replace(configuration.options, contact_stiffness=stiffness, **exact)
+    fixed = dataclasses.replace(configuration, options=options)
+    begin = np.array([getattr(material, p.name, None) or getattr(options, p.name, 0.0) for p in parameters], float)
+    for p, value in zip(parameters, begin):
+        if not p.lower <= value <= p.upper:
+            raise ValueError(f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: change the start or the bounds")
+    scale_force = np.sqrt((indentation.force**2).sum(1).mean())
+    if not scale_force > 0:
+        raise ValueError(f"indentation {indentation.name!r} has no force: measure it, or simulate it first")
+
+    bar = tqdm.tqdm(desc="calibrate", unit="batch", disable=not progress, leave=False)
+    cache = {}
+
+    def evaluate(scaled):
+        key = scaled.tobytes()
+        if key not in cache:
+            values = np.clip([p.value(s) for p, s in zip(parameters, scaled)], [p.lower for p in parameters], [p.upper for p in parameters])
+            cache[key] = values, *forces_and_jacobian(fixed, material, parameters, values, indentation, device)
+            bar.update()
+            bar.set_postfix(rms_N=f"{np.sqrt(((cache[key][1] - indentation.force) ** 2).sum(1).mean()):.4f}")
+        return cache[key]
+
+    start = np.array([p.scaled(v) for p, v in zip(parameters, begin)])
+    there = evaluate(start)[2]
+    for p, column in zip(parameters, np.moveaxis(there, -1, 0)):
+        if np.sqrt((column**2).sum(1).mean()) < 1e-6 * scale_force:
+            raise ValueError(f"the force of this indentation does not depend on {p.name}: leave it out, or load the skin so that it shows")
+    # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and this straightens their valley
+    metric = np.einsum("tip,tiq->pq", there, there) / scale_force**2 / len(indentation.time)
+    metric += 1e-6 * np.diag(np.diag(metric))
+    back = np.linalg.inv(np.linalg.cholesky(metric)).T  # scaled = start + back u
+
+    def cost(u):
+        _, force, jacobian, _ = evaluate(start + back @ u)
+        residual = (force - indentation.force) / scale_force
+        gradient = back.T @ np.einsum("tip,ti->p", jacobian / scale_force, residual) / len(residual)
+        return (residual**2).sum(1).mean() / 2, gradient
+
+    lower = np.array([p.scaled(p.lower) for p in parameters])
+    upper = np.array([p.scaled(p.upper) for p in parameters])
+    inside = [
+        dict(type="ineq", fun=lambda u: start + back @ u - lower, jac=lambda u: back),
+        dict(type="ineq", fun=lambda u: upper - start - back @ u, jac=lambda u: -back),
+    ]
+    settings = dict(ftol=1e-5, maxiter=max_iterations)
+    rough = minimize(cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings)
+    # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and Newton's needs no history
+    found = least_squares(
+        lambda s: ((evaluate(s)[1] - indentation.force) / scale_force).ravel(),
+        np.clip(start + back @ rough.x, lower + 1e-9, upper - 1e-9),
+        jac=lambda s: evaluate(s)[2].reshape(-1, len(s)) / scale_force,
+        bounds=(lower, upper),
+        x_scale="jac",
+        ftol=1e-5,
+        xtol=1e-6,
+        max_nfev=max_iterations,
+    )
+    values, force, jacobian, lost = evaluate(found.x)
+    bar.close()
+    return _result(fixed, material, indentation, parameters, begin, values, force, jacobian, lost, len(cache), found)
+
+
+def _result(configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found):
+    from scipy.stats import t as student
+
+    residual = force - indentation.force
+    by_value = jacobian / np.array([p.slope(v) for p, v in zip(parameters, values)])
+    white, robust, lags = covariance(by_value, residual)
+    error, error_robust = np.sqrt(np.diag(white)), np.sqrt(np.diag(robust))
+    half = student.ppf((1 + _CONFIDENCE) / 2, len(residual) - len(parameters)) * np.maximum(error, error_robust)
+    options, fitted = _case(configuration.options, material, parameters, values)
+    norm = np.linalg.norm(residual, axis=1)
+    width = [1e-6 * (p.upper - p.lower) for p in parameters]
+    return Calibration(
+        configuration=configuration.name,
+        skin=configuration.geometry.name,
+        law=material.law,
+        element=options.element or material.element,
+        liquid=bool(material.liquid if options.liquid is None else options.liquid),
+        indenter=indentation.indenter,
+        parameters=[p.name for p in parameters],
+        start=begin,
+        value=values,
+        interval=np.stack([values - half, values + half], 1),
+        standard_error=error,
+        standard_error_robust=error_robust,
+        lags=lags,
+        correlation=white / np.outer(error, error) if (error > 0).all() else np.eye(len(values)),
+        at_bound=np.array([min(v - p.lower, p.upper - v) < w for v, p, w in zip(values, parameters, width)]),
+        rms=float(np.sqrt((norm**2).mean())),
+        mean=float(norm.mean()),
+        peak=float(np.linalg.norm(indentation.force, axis=1).max()),
+        whiteness=ljung_box(residual),
+        material=fitted,
+        options=options,
+        time=np.asarray(indentation.time),
+        measured=indentation.force,
+        fitted=force,
+        evaluations=evaluations,
+        success=bool(found.success),
+        message=str(found.message),
+        nonconverged=lost,
+    )

@@ -1,0 +1,118 @@
+"""The forward model: one indentation of many materials at once, each material a world of one batch."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..press_indenter import make_indenter
+from ..skin import GeomSet, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
+from .indentation import Indentation
+
+__all__ = ["Response", "displacement_norms", "simulate"]
+
+_STRIDE = 2.5e-4  # [m] longer ways between two samples are taken in several steps
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """What k materials answer to one indentation of n samples.
+
+    Attributes:
+      force: (k, n, 3) of the skin on the indenter [N].
+      peak_norm, mean_norm: (k, n) largest nodal displacement of the outer surface and its mean over the area [m].
+      nonconverged: (k,) steps that did not converge.
+      steps: steps taken.
+    """
+
+    force: np.ndarray
+    peak_norm: np.ndarray
+    mean_norm: np.ndarray
+    nonconverged: np.ndarray
+    steps: int
+
+
+def simulate(geometry: SkinGeometry, options: SkinOptions, materials, indentation: Indentation, device="cpu", progress=None) -> Response:
+    """Walks the indentation once, every material as a world of one batch.
+
+    The contact stiffness is `options.contact_stiffness`, or that which belongs to the first material: it is one number for the batch.
+
+    Args:
+      geometry, options: the body; its options count for all.
+      materials: k Materials of one law; Young's modulus, Poisson's ratio and friction may differ.
+      indentation: the way; its force is not looked at.
+      progress: called after every sample.
+
+    Raises:
+      ValueError: materials of several laws, or an indenter deep inside the rigid core.
+    """
+    materials = list(materials)
+    model = SkinModel(geometry, materials[0], options, device)
+    data = SkinData(model, len(materials), materials)
+    geoms, place = _indenter(indentation, materials, device)
+    force, norms, steps = [], [], 0
+    at = indentation.tip[0]
+    geoms.set_pose(*place(at))
+    weight, outer = _outer_weights(geometry)
+    for tip in indentation.tip:
+        count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _STRIDE - 1e-9)))
+        for k in range(1, count + 1):
+            geoms.set_pose(*place(at + (tip - at) * k / count))
+            step(model, data, geoms)
+        steps, at = steps + count, tip
+        force.append(data.wrench[:, 0, :3])
+        norms.append(displacement_norms(data.vert_xpos[:, outer] - geometry.vert[outer], weight))
+        if progress:
+            progress()
+    peak, mean = np.moveaxis(np.array(norms), 0, -1)
+    return Response(np.swapaxes(force, 0, 1), peak, mean, data.nonconverged.copy(), steps)
+
+
+def displacement_norms(displacement, weight):
+    """Largest and mean norm of nodal displacements (..., m, 3) [m], the mean weighted with (m,)."""
+    norm = np.linalg.norm(displacement, axis=-1)
+    return norm.max(-1), norm @ weight / weight.sum()
+
+
+def _outer_weights(geometry):
+    """A third of the area of its faces for each node of the outer surface (m,) [m^2], and the nodes (m,)."""
+    face = geometry.outer_face
+    edge = geometry.vert[face[:, 1:]] - geometry.vert[face[:, :1]]
+    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
+    nodes, index = np.unique(face, return_inverse=True)
+    weight = np.zeros(len(nodes))
+    np.add.at(weight, index.reshape(-1, 3), (area / 3)[:, None])
+    return weight, nodes
+
+
+@functools.lru_cache(maxsize=8)
+def _shape(name):
+    """The indenter of a name and, for a mesh, its distance grid."""
+    shape = make_indenter(name)
+    return shape, bake_distance_grid(shape.vert, shape.face) if shape.type == "mesh" else None
+
+
+def _indenter(indentation, materials, device):
+    """The indenter as a GeomSet with a friction for each world, and tip -> (positions, rotations)."""
+    shape, grid = _shape(indentation.indenter)
+    mesh = grid is not None
+    geoms = GeomSet(
+        [shape.type], [shape.size], rounding=[shape.rounding], grids=[grid] if mesh else (), nworld=len(materials), device=device
+    )
+    geoms.set_friction([[m.friction] for m in materials])
+    frame = _matrix(indentation.quat)
+    offset = np.zeros(3) if mesh else frame @ shape.pos
+    rotation = frame if mesh else frame @ _matrix(shape.quat)
+    return geoms, lambda tip: ((tip + offset)[None], rotation[None])
+
+
+def _matrix(quat):
+    w, x, y, z = np.asarray(quat) / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

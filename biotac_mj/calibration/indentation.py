@@ -1,0 +1,190 @@
+"""One indentation: the way of an indenter and the force that was measured on it; read from CSV or from a press's skin.h5."""
+
+import csv
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from ..press_record import replacing
+
+__all__ = ["COLUMNS", "Indentation", "plan_indentation", "read_indentation", "write_indentation"]
+
+COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
+_ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
+_REACH = 0.2  # [m] a tip further from the BioTac's origin than this is not in metres
+
+
+@dataclasses.dataclass(frozen=True)
+class Indentation:
+    """The way of an indenter that only translates, and what it felt. n is the number of samples.
+
+    Attributes:
+      name: in tables.
+      indenter: as `biotac press --indenter` takes it.
+      time: (n,) [s].
+      tip: (n, 3) origin of the indenter's frame in the BioTac frame [m].
+      quat: (4,) orientation of that frame, w x y z; its +y goes ahead.
+      force: (n, 3) of the skin on the indenter [N].
+      peak_norm, mean_norm: (n,) largest nodal displacement of the outer surface and its mean over the area [m]; None where unknown.
+    """
+
+    name: str
+    indenter: str
+    time: np.ndarray
+    tip: np.ndarray
+    quat: np.ndarray
+    force: np.ndarray
+    peak_norm: np.ndarray | None = None
+    mean_norm: np.ndarray | None = None
+
+    def __post_init__(self):
+        n = len(self.time)
+        for name, shape in dict(tip=(n, 3), quat=(4,), force=(n, 3)).items():
+            value = np.asarray(getattr(self, name), float)
+            if value.shape != shape:
+                raise ValueError(f"{name} of indentation {self.name!r} has shape {value.shape}: {shape} is needed")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} of indentation {self.name!r} contains NaN or infinite numbers: remove those samples")
+            object.__setattr__(self, name, value)
+        if n < 4:
+            raise ValueError(f"indentation {self.name!r} has {n} samples: at least 4 are needed, some of them under load")
+        if not (np.diff(self.time) > 0).all():
+            raise ValueError(f"time_s of indentation {self.name!r} does not increase: sort the rows and remove repeated ones")
+        if np.abs(self.tip).max() > _REACH:
+            raise ValueError(
+                f"the tip of indentation {self.name!r} is up to {np.abs(self.tip).max():g} m from the BioTac's origin: positions must be "
+                "in metres (divide millimetres by 1000) and in the BioTac frame"
+            )
+
+
+def plan_indentation(
+    indenter="sphere_7mm",
+    location=(-0.010, 0.3),
+    depth=1.2e-3,
+    slide=1.2e-3,
+    slide_direction=(1, 0, 0),
+    direction=None,
+    samples=24,
+    skin="coarse",
+) -> Indentation:
+    """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along it.
+
+    Args:
+      indenter: as `biotac press --indenter`.
+      location: x [m] and angle round the finger [rad], or a point (3,) [m].
+      depth, slide: travel along `direction` and then along `slide_direction` [m].
+      direction: (3,); None is the skin's inward normal.
+      samples: rows along the way, the one before first touch not counted.
+      skin: the mesh on which first touch is looked for.
+
+    Raises:
+      ValueError: see `press.plan_path`.
+    """
+    from ..geometry import load_skin
+    from ..press import PressOptions, plan_path
+    from ..press_indenter import make_indenter
+
+    stride = (depth + slide) / samples
+    options = PressOptions(indenter=indenter, location=tuple(location), depth=depth, slide=slide, slide_direction=tuple(slide_direction),
+                           direction=direction, speed=stride, timestep=1.0, hold=0.0)  # fmt: skip
+    path = plan_path(load_skin(skin), make_indenter(indenter), options)
+    tip = np.array([path.position(*travel) for travel in zip(path.depth, path.slid)])
+    time = 0.02 * np.arange(len(tip))
+    return Indentation(indenter, indenter, time, tip, path.quat, np.zeros((len(tip), 3)))
+
+
+def read_indentation(path, indenter: str | None = None, direction=None) -> Indentation:
+    """Reads force-deflection data.
+
+    CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is `direction`, or the columns quat_w
+    to quat_z, or the skin's inward normal where neither is given: along -y of the pad, so +y. A press's skin.h5 holds all of it.
+
+    Args:
+      path: .csv or .h5.
+      indenter: shape; needed for CSV, a press knows its own.
+      direction: (3,) in which the indenter's tip points.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: a column is missing, has another unit or holds what is no number; the text names it.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no force-deflection data at {path}: give a CSV file with columns {', '.join(COLUMNS)}, or a press's skin.h5"
+        )
+    return _read_press(path, indenter) if path.suffix == ".h5" else _read_csv(path, indenter, direction)
+
+
+def write_indentation(indentation: Indentation, path) -> None:
+    """Writes COLUMNS and the orientation as CSV (to a temporary name, then renamed)."""
+    n = len(indentation.time)
+    rows = np.column_stack([indentation.time, indentation.tip, indentation.force, np.tile(indentation.quat, (n, 1))])
+    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*COLUMNS, *_ORIENTATION])
+        writer.writerows([f"{value:.9g}" for value in row] for row in rows)
+
+
+def _read_csv(path, indenter, direction):
+    if indenter is None:
+        raise ValueError(f"{path} does not say what pressed: name it with --indenter, as in --indenter sphere_7mm")
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        rows = list(csv.reader(file))
+    if not rows:
+        raise ValueError(f"{path} is empty: it needs a header with columns {', '.join(COLUMNS)}")
+    header = [name.strip() for name in rows[0]]
+    columns = {name: _column(path, header, rows[1:], name) for name in COLUMNS}
+    value = np.array([columns[name] for name in COLUMNS]).T
+    return Indentation(path.stem, indenter, value[:, 0], value[:, 1:4], _orientation(path, header, rows[1:], direction), value[:, 4:])
+
+
+def _column(path, header, rows, name):
+    if name not in header:
+        stem, _, unit = name.rpartition("_")
+        other = next((h for h in header if h.rpartition("_")[0] == stem or h == stem), None)
+        if other:
+            given = other[len(stem) :].lstrip("_") or "none"
+            raise ValueError(
+                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; convert the numbers and rename it"
+            )
+        raise ValueError(f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; it has {', '.join(header)}")
+    index, values = header.index(name), []
+    for number, row in enumerate(rows, start=2):
+        try:
+            values.append(float(row[index]))
+        except (ValueError, IndexError):
+            cell = row[index] if index < len(row) else ""
+            raise ValueError(f"line {number} of {path}: {name} is {cell!r}, not a number; correct or remove the line") from None
+    return values
+
+
+def _orientation(path, header, rows, direction):
+    from ..press import _rotation_from_y
+
+    if direction is not None:
+        direction = np.asarray(direction, float)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction):
+            raise ValueError(f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are not all zero")
+        return _rotation_from_y(direction / np.linalg.norm(direction))
+    if "quat_w" not in header:
+        return np.array([1.0, 0, 0, 0])
+    quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T
+    if np.abs(quat - quat[0]).max() > 1e-3 or abs(np.linalg.norm(quat[0]) - 1) > 1e-3:
+        raise ValueError(f"the quaternions of {path} turn or are not of length one: the indenter must only translate")
+    return quat[0] / np.linalg.norm(quat[0])
+
+
+def _read_press(path, indenter):
+    import json
+
+    import h5py
+
+    with h5py.File(path) as file:
+        missing = {"time", "force", "indenter_pose"} - set(file)
+        if missing:
+            raise ValueError(f"{path} has no {', '.join(sorted(missing))}: it is not the skin.h5 of a press")
+        known = json.loads(file.attrs["parameters"])
+        pose, force, time = file["indenter_pose"][:], file["force"][:], file["time"][:]
+    return Indentation(path.stem, indenter or known["indenter"], time, pose[:, :3], pose[0, 3:], force)

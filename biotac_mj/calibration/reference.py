@@ -1,0 +1,44 @@
+"""Indentations of known answer: the project's own rubber with liquid, which stands in for ANSYS where the paper's data are not at hand."""
+
+import dataclasses
+
+import numpy as np
+
+from ..geometry.skins import load_skin
+from ..skin.material import material as preset
+from ..skin.model import SkinOptions
+from .forward import simulate
+from .indentation import Indentation
+
+__all__ = ["STAND_IN", "stand_in"]
+
+STAND_IN = "own rubber with liquid, in place of ANSYS"
+
+
+def stand_in(
+    indentation: Indentation, material="rubber", skin="default", noise=0.0, seed=0, liquid=None, element=None, device="cpu"
+) -> Indentation:  # fmt: skip
+    """The same way with the forces and displacements of a skin that we know.
+
+    Args:
+      indentation: the way.
+      material: preset or Material; "rubber" is Neo-Hookean with the paper's ANSYS constants, and has liquid.
+      skin: mesh.
+      noise: standard deviation added to each force component [N].
+      seed: of the noise.
+      liquid, element: see SkinOptions; None takes the material's choice.
+
+    Raises:
+      ValueError: noise that is negative, or a way that the skin cannot follow.
+    """
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")
+    options = SkinOptions(liquid=liquid, element=element, tolerance=1e-4, max_newton=100)
+    answer = simulate(load_skin(skin), options, [preset(material)], indentation, device)
+    if answer.nonconverged[0]:
+        raise ValueError(
+            f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not converge: "
+            "press less deep, or take more samples"
+        )
+    force = answer.force[0] + noise * np.random.default_rng(seed).standard_normal(answer.force[0].shape)
+    return dataclasses.replace(indentation, force=force, peak_norm=answer.peak_norm[0], mean_norm=answer.mean_norm[0])

@@ -1,0 +1,208 @@
+"""Calibration: recovery of known parameters, columns of a batch against single runs, statistics against closed forms, error texts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from biotac_mj import cli
+from biotac_mj.calibration import (
+    CONFIGURATIONS,
+    calibrate,
+    comparison_table,
+    configuration,
+    evaluate,
+    parameter,
+    plan_indentation,
+    read_indentation,
+    simulate,
+    stand_in,
+    write_indentation,
+)
+from biotac_mj.calibration.fit import forces_and_jacobian
+from biotac_mj.calibration.report import read_material, write_json
+from biotac_mj.calibration.statistics import covariance, ljung_box
+from biotac_mj.geometry.tet_mesh import TetMesh
+from biotac_mj.skin import Material
+
+TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5, liquid=False)
+
+
+@pytest.fixture(scope="module")
+def way():
+    return plan_indentation(depth=1.2e-3, slide=1.2e-3, samples=12)
+
+
+@pytest.fixture(scope="module")
+def shell():
+    return configuration("shell_with_core", tolerance=1e-6, max_newton=200, contact_stiffness=2e11)
+
+
+def test_recovers_stiffness_and_friction_quickly(shell):
+    short = plan_indentation(depth=0.6e-3, slide=0.6e-3, samples=8)
+    true = simulate(shell.geometry, shell.options, [TRUTH], short).force[0]
+    data = dataclasses.replace(short, force=true + 0.001 * np.random.default_rng(1).standard_normal(true.shape))
+    found = calibrate(shell, dataclasses.replace(TRUTH, youngs_modulus=1.5e6, friction=0.6), data, ["E", "mu"], max_iterations=8)
+    assert found.success and not found.nonconverged
+    assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=0.02)
+    assert (found.interval[:, 0] < found.value).all() and (found.value < found.interval[:, 1]).all()
+
+
+@pytest.mark.slow
+def test_recovers_known_parameters_from_noisy_forces(way, shell):
+    """Same mesh and noise of half a per cent of the peak; docs/calibration.md has what another mesh does."""
+    true = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
+    noise = 0.002
+    data = dataclasses.replace(way, force=true + noise * np.random.default_rng(1).standard_normal(true.shape))
+    found = calibrate(shell, Material(liquid=False, youngs_modulus=1.5e6, poissons_ratio=0.32, friction=0.6), data)
+    wanted = np.array([TRUTH.youngs_modulus, TRUTH.poissons_ratio, TRUTH.friction])
+    assert found.success and not found.nonconverged and not found.at_bound.any()
+    # 2 %, 2 %, 5 %, or what the noise allows: no fit can be expected within three standard errors of a poorer measurement
+    error = np.maximum(found.standard_error, found.standard_error_robust)
+    assert (np.abs(found.value - wanted) <= np.maximum([0.02, 0.02, 0.05] * wanted, 3 * error)).all(), found.value / wanted
+    assert abs(found.value[0] / wanted[0] - 1) < 0.05 and abs(found.value[2] / wanted[2] - 1) < 0.05
+    assert found.rms < 1.1 * np.sqrt((np.linalg.norm(data.force - true, axis=1) ** 2).mean())  # no worse than the truth itself
+
+
+def test_batch_columns_equal_single_runs(way, shell):
+    names = [parameter(name) for name in ("E", "nu", "mu")]
+    values = np.array([1.2e6, 0.38, 0.5])
+    force, jacobian, _ = forces_and_jacobian(shell, TRUTH, names, values, way)
+    alone = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
+    np.testing.assert_allclose(force, alone, atol=1e-5)
+    for i, change in enumerate(
+        (dict(youngs_modulus=1.2e6 * np.exp(0.01)), dict(poissons_ratio=0.38 + 0.00245), dict(friction=0.5 * np.exp(0.01)))
+    ):
+        moved = simulate(shell.geometry, shell.options, [dataclasses.replace(TRUTH, **change)], way).force[0]
+        column = (moved - alone) / 0.01
+        assert np.linalg.norm(jacobian[..., i] - column) < 0.02 * np.linalg.norm(column), names[i].name
+
+
+def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
+    """Dimensions: E and contact stiffness times two are forces times two, without the liquid."""
+    one = configuration("deformable_shell", tolerance=1e-6, contact_stiffness=2e11)
+    two = dataclasses.replace(one, options=dataclasses.replace(one.options, contact_stiffness=4e11))
+    force = simulate(one.geometry, one.options, [TRUTH], way).force
+    double = simulate(two.geometry, two.options, [dataclasses.replace(TRUTH, youngs_modulus=2.4e6)], way).force
+    np.testing.assert_allclose(double, 2 * force, atol=1e-3 * np.abs(force).max())
+
+
+def test_four_configurations_order_of_stiffness():
+    """More material and more core are stiffer: shell < shell on its core < solid, and shell < solid < solid on its core."""
+    deep = plan_indentation(depth=2.2e-3, slide=0.0, samples=11)
+    peak = {}
+    for name in CONFIGURATIONS:
+        body = configuration(name)
+        answer = simulate(body.geometry, body.options, [TRUTH], deep)
+        assert not answer.nonconverged.any(), name
+        peak[name] = np.linalg.norm(answer.force[0, -1])
+    assert peak["deformable_shell"] < 0.98 * peak["shell_with_core"]
+    assert peak["deformable_shell"] < peak["solid"] < peak["solid_with_core"]
+
+
+@pytest.mark.parametrize("name", ["solid", "solid_with_core"])
+def test_solids_fill_what_they_should(name):
+    skin = configuration(name).geometry
+    shell = configuration("deformable_shell").geometry
+    outside = 1e9 * (TetMesh(shell.vert, shell.elem).volumes.sum()) + 1751.130  # the coarse skin and the cavity of its card [mm^3]
+    wanted = outside - (1395.597 if name == "solid_with_core" else 0.0)
+    mesh = TetMesh(skin.vert, skin.elem).check()
+    assert 1e9 * mesh.volumes.sum() == pytest.approx(wanted, rel=0.02)
+    assert not len(skin.inner_face)
+
+
+def test_robust_covariance_of_autocorrelated_noise():
+    """A constant fitted to AR(1) noise of coefficient a: the mean's variance is (1 + a) / (1 - a) times that of white noise."""
+    rng, a, n = np.random.default_rng(0), 0.6, 20000
+    noise = np.zeros(n)
+    for t, shock in enumerate(rng.standard_normal(n)):
+        noise[t] = a * noise[t - 1] + shock
+    white, robust, lags = covariance(np.ones((n, 1, 1)), noise[:, None])
+    assert white[0, 0] == pytest.approx(1 / (1 - a**2) / n, rel=0.05)
+    weights = 1 + 2 * sum((1 - k / (lags + 1)) * a**k for k in range(1, lags + 1))  # Bartlett's share of (1 + a) / (1 - a)
+    assert robust[0, 0] / white[0, 0] == pytest.approx(weights, rel=0.1)
+
+
+def test_ljung_box_level_and_power():
+    rng = np.random.default_rng(0)
+    rejected = np.mean([ljung_box(rng.standard_normal((100, 1)))["p_value"][0] < 0.05 for _ in range(400)])
+    assert 0.02 < rejected < 0.09
+    assert not ljung_box(np.sin(np.linspace(0, 6, 60))[:, None])["white"]
+
+
+def test_comparison_of_a_skin_with_itself_is_zero(way):
+    body = configuration("deformable_shell")
+    truth = simulate(body.geometry, body.options, [TRUTH], way)
+    case = dataclasses.replace(way, force=truth.force[0], peak_norm=truth.peak_norm[0], mean_norm=truth.mean_norm[0])
+    same, softer = (evaluate(body, m, [case]) for m in (TRUTH, dataclasses.replace(TRUTH, youngs_modulus=0.6e6)))
+    assert same.force_mean < 1e-3 and same.nodal_peak < 1e-7 and same.nodal_mean < 1e-8
+    mean_force = np.linalg.norm(case.force, axis=1).mean()
+    assert softer.force_mean == pytest.approx(0.5 * mean_force, rel=0.05)
+    assert "0.0876" in comparison_table([same, softer], "itself")
+
+
+def test_stand_in_noise_is_what_was_asked(way):
+    short = dataclasses.replace(way, time=way.time[:5], tip=way.tip[:5], force=way.force[:5])
+    a, b = (stand_in(short, "paper", "coarse", noise) for noise in (0.0, 0.5))
+    assert 0.2 < (b.force - a.force).std() < 0.8
+
+
+def test_csv_round_trip_and_errors(way, tmp_path):
+    path = tmp_path / "press.csv"
+    write_indentation(way, path)
+    again = read_indentation(path, "sphere_7mm")
+    for name in ("time", "tip", "force", "quat"):
+        np.testing.assert_allclose(getattr(again, name), getattr(way, name), atol=1e-9)
+    text = path.read_text()
+
+    def refused(changed, match, **options):
+        path.write_text(changed)
+        with pytest.raises(ValueError, match=match):
+            read_indentation(path, **{"indenter": "sphere_7mm", **options})
+
+    refused(text, "what pressed", indenter=None)
+    refused(text.replace("tip_x_m", "tip_x_mm"), "'tip_x_mm' .* has unit mm: it must be 'tip_x_m', in m")
+    refused(text.replace("force_y_N,", "push,"), "no column 'force_y_N'")
+    refused(text.replace("\n0.02,", "\nsoon,"), "line 3 .* time_s is 'soon', not a number")
+    refused("\n".join(text.splitlines()[:3]), "at least 4")
+    refused(text, "no direction", direction=(0, 0, 0))
+    rows = [line.split(",") for line in text.splitlines()]
+    far = [rows[0], *([r[0], str(1e3 * float(r[1])), *r[2:]] for r in rows[1:])]
+    refused("\n".join(",".join(r) for r in far), "must be in metres")
+    with pytest.raises(FileNotFoundError, match="columns time_s"):
+        read_indentation(tmp_path / "none.csv")
+
+
+def test_error_texts(way, shell, tmp_path):
+    for text, match in (
+        ("hardness", "cannot fit 'hardness'"),
+        ("E:2:1", "no interval"),
+        ("E:a:b", "not two numbers"),
+        ("fill_volume", "no bounds are known"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            parameter(text)
+    with pytest.raises(ValueError, match="unknown configuration"):
+        configuration("gel")
+    with pytest.raises(ValueError, match="no space for a liquid"):
+        configuration("solid", liquid=True)
+    with pytest.raises(ValueError, match="coarse mesh only"):
+        configuration("solid", "fine")
+    with pytest.raises(ValueError, match="has no force"):
+        calibrate(shell, TRUTH, way)
+    with pytest.raises(ValueError, match="starts at .* outside"):
+        calibrate(shell, TRUTH, dataclasses.replace(way, force=way.force + 1), ["E:10:20"])
+    with pytest.raises(ValueError, match="fewer"):
+        covariance(np.ones((5, 3, 2)), np.ones((5, 3)))
+    with pytest.raises(FileNotFoundError, match="no calibration"):
+        read_material(tmp_path / "none.json")
+    write_json({"material": TRUTH}, tmp_path / "fit.json")
+    assert read_material(tmp_path / "fit.json") == TRUTH
+
+
+def test_command_line_errors(capsys):
+    assert cli.main(["calibrate"]) == 2
+    assert "--synthetic" in capsys.readouterr().err
+    assert cli.main(["compare", "--data", "press.csv"]) == 2
+    assert "INDENTER=FILE" in capsys.readouterr().err
+    assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
