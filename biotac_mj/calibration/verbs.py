@@ -32,7 +32,7 @@ def calibrate_verb(args) -> None:
         data = stand_in(plan, args.truth, args.truth_skin, args.noise, args.seed, device=args.device)
         write_indentation(data, out / "synthetic.csv")
         truth = material(args.truth)
-        print(f"data: {STAND_IN}: {args.truth} on skin {args.truth_skin}, E {truth.youngs_modulus:g} Pa, nu {truth.poissons_ratio:g}, "
+        print(f"data: our own skin, {args.truth} on mesh {args.truth_skin}, E {truth.youngs_modulus:g} Pa, nu {truth.poissons_ratio:g}, "
               f"mu {truth.friction:g}, noise {args.noise:g} N; kept in {out / 'synthetic.csv'}")  # fmt: skip
     else:
         data = read_indentation(args.data, args.indenter, args.direction)
