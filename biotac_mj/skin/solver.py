@@ -112,10 +112,32 @@ class _Step:
         self._predict()
         good = self._newton(np.ones(self.d.nworld, bool))
         if not good.all():  # the guess may have been the trouble
-            for w in np.flatnonzero(~good):
-                self.x[:, w] = self.start[:, w]
+            self._back(~good)
             good |= self._newton(~good)
+        if not good.all() and self.m.material.poissons_ratio > 0.45 and not self.m.device.is_cuda and self.d.nworld == 1:
+            self._back(~good)
+            good = self._newton_from_deformed()
         self._finish(good)
+
+    def _back(self, worlds):
+        for w in np.flatnonzero(worlds):
+            self.x[:, w] = self.start[:, w]
+
+    def _newton_from_deformed(self):
+        """Nearly incompressible rubber, turned and strained, is no longer like that at rest: solved with the factor of its present shape.
+
+        For this step alone, so that a step remains a function of the state it starts from.
+        """
+        try:
+            factor = self.m.factor_at(self.start[:, 0])
+        except ValueError:  # a tetrahedron is inverted: no factor there
+            return np.zeros(1, bool)
+        kept = self.M.factor, self.M._rows
+        self.M.factor, self.M._rows = factor, {}
+        try:
+            return self._newton(np.ones(1, bool))
+        finally:
+            self.M.factor, self.M._rows = kept
 
     def _newton(self, active):
         """Newton's method in the active worlds; which of them are now in balance."""
