@@ -303,8 +303,9 @@ def test_dm_control_loads_and_steps_it(tmp_path):
 def test_nodes_of_the_skin_from_the_handle():
     """`Handle.vert_xpos` gives the skin at rest, and of the right BioTac where there are two."""
     spec = mujoco.MjSpec()
-    handles = [biotac_mj.attach(spec, prefix=prefix, skin=skin, pos=(0, 0, z)) for prefix, skin, z in (("a_", "coarse", 0), ("b_", "default", 1))]
+    a = biotac_mj.attach(spec, prefix="a_", skin="coarse")
+    b = biotac_mj.attach(spec, prefix="b_", skin="default", pos=(0, 0, 1))
     model = spec.compile()
     data = mujoco.MjData(model)
-    for handle, skin in zip(handles, ("coarse", "default")):
+    for handle, skin in ((a, "coarse"), (b, "default")):
         np.testing.assert_array_equal(handle.vert_xpos(model, data), biotac_mj.load_skin(skin).vert)
