@@ -76,7 +76,8 @@ def check_weight(mass, timestep, **settings):
         skin = solved_skin(data)
         force.append(handle.read(data, "contact_force")[:3])
         balance.append(data.qfrc_passive[0] + damping * data.qvel[0])
-        clamp.append(skin.reaction[0] + skin.core_force[0].sum(0))
+        # what holds the skin: clamp and nail, the core it lies on, and the liquid, which rests on the core too
+        clamp.append(skin.reaction[0] + skin.core_force[0].sum(0) + skin.liquid_force[0].sum(0))
         speed.append(data.qvel[0])
     force, clamp = np.array(force), np.array(clamp)
     assert handle.read(data, "status")[:2].tolist() == [1, 0]
