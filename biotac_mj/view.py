@@ -78,12 +78,19 @@ def view(skin="default", material="default", liquid=None, seed=0, device="cpu", 
     from mujoco import viewer
 
     with viewer.launch_passive(model, data) as window:
+        _aim(window.cam)
         while window.is_running():
             begin = time.perf_counter()
             mujoco.mj_step(model, data)
             plugin.check()
             window.sync()
             time.sleep(max(0.0, model.opt.timestep - (time.perf_counter() - begin)))
+
+
+def _aim(camera):
+    """Looks at the pad from beside and above."""
+    camera.lookat[:] = [-0.008, 0, 0.004]
+    camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
 def _render(model, data, path, seconds):
@@ -96,7 +103,7 @@ def _render(model, data, path, seconds):
             mujoco.mj_step(model, data)
             plugin.check()
         camera = mujoco.MjvCamera()
-        camera.lookat, camera.distance, camera.azimuth, camera.elevation = [-0.008, 0, 0.004], 0.05, 60, -25
+        _aim(camera)
         picture = screen.render(data, camera)
     with replacing(path) as temporary:
         imsave(temporary, picture)
