@@ -37,7 +37,7 @@ EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])  # of the nod
 # the eight linear tetrahedra that the ten nodes make: four at the corners, four around the octahedron's diagonal 4-9
 PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3], [4, 9, 5, 6], [4, 9, 8, 5], [4, 9, 7, 8], [4, 9, 6, 7]])
 
-POINTWISE = wp.constant(5.0)  # of mu; benchmarks/locking.py prints the skin's error for others
+POINTWISE = wp.constant(5.0)  # of mu; docs/elements.md has the error of other values
 
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric coordinates of the four Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
