@@ -206,3 +206,34 @@ def test_numbers_of_worlds(model):
 def test_bad_options(options, text):
     with pytest.raises(ValueError, match=text):
         SkinOptions(**options)
+
+
+def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
+    """Nearly incompressible rubber whose first two tries fail is solved with another factor: the same answer, and the old one is back."""
+    from biotac_mj.geometry import load_skin
+    from biotac_mj.skin import solver
+
+    def press(fail):
+        model = SkinModel(load_skin("coarse"), Material("neo_hookean", 2.8e5, 0.49), SkinOptions(tolerance=1e-5, max_newton=60))
+        data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.0])
+        newton, tries = solver._Step._newton, []
+
+        def failing(self, active):
+            tries.append(self.M.factor)
+            return newton(self, active) & (len(tries) > fail)
+
+        monkeypatch.setattr(solver._Step, "_newton", failing)
+        for depth in (2e-4, 4e-4):
+            tries.clear()
+            geoms.set_pose([[-0.012, -0.00825 + depth - 3.5e-3, 0.0]])
+            step(model, data, geoms)
+            assert data.converged.all() and len(tries) == fail + 1
+        monkeypatch.setattr(solver._Step, "_newton", newton)
+        return data, model, tries
+
+    plain, _, _ = press(0)
+    other, model, tries = press(2)
+    assert tries[2] is not model.factor and other.preconditioner.factor is model.factor
+    assert np.abs(plain.wrench).max() > 0.01
+    np.testing.assert_allclose(other.vert_xpos, plain.vert_xpos, atol=2e-8)
+    np.testing.assert_allclose(other.wrench, plain.wrench, atol=1e-4 * np.abs(plain.wrench).max())

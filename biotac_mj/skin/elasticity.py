@@ -53,6 +53,18 @@ def edge_matrix(x: wp.array2d(dtype=vec3), t: wp.vec4i, w: int):
     return wp.matrix_from_cols(x[t[1], w] - x0, x[t[2], w] - x0, x[t[3], w] - x0)
 
 
+@wp.func
+def write_corners(H: mat33, e: int, w: int, corner_out: wp.array2d(dtype=vec3)):
+    """The columns of H are the forces on corners 1 to 3; corner 0 balances them."""
+    f1 = vec3(H[0, 0], H[1, 0], H[2, 0])
+    f2 = vec3(H[0, 1], H[1, 1], H[2, 1])
+    f3 = vec3(H[0, 2], H[1, 2], H[2, 2])
+    corner_out[4 * e, w] = -f1 - f2 - f3
+    corner_out[4 * e + 1, w] = f1
+    corner_out[4 * e + 2, w] = f2
+    corner_out[4 * e + 3, w] = f3
+
+
 @wp.kernel
 def elastic_force(
     # In:
@@ -77,13 +89,7 @@ def elastic_force(
         rotation_out[e, w] = R
     jacobian_out[e, w] = wp.determinant(F)
     H = -volume[e] * mat.stress(law, mu[w], lam[w], F, R) * wp.transpose(inverse_edges[e])
-    f1 = vec3(H[0, 0], H[1, 0], H[2, 0])
-    f2 = vec3(H[0, 1], H[1, 1], H[2, 1])
-    f3 = vec3(H[0, 2], H[1, 2], H[2, 2])
-    corner_out[4 * e, w] = -f1 - f2 - f3
-    corner_out[4 * e + 1, w] = f1
-    corner_out[4 * e + 2, w] = f2
-    corner_out[4 * e + 3, w] = f3
+    write_corners(H, e, w, corner_out)
 
 
 @wp.kernel
@@ -110,13 +116,7 @@ def hessian_product(
     if law == 0:
         R = rotation[e, w]
     H = volume[e] * mat.stress_derivative(law, mu[w], lam[w], F, R, dF) * wp.transpose(B)
-    f1 = vec3(H[0, 0], H[1, 0], H[2, 0])
-    f2 = vec3(H[0, 1], H[1, 1], H[2, 1])
-    f3 = vec3(H[0, 2], H[1, 2], H[2, 2])
-    corner_out[4 * e, w] = -f1 - f2 - f3
-    corner_out[4 * e + 1, w] = f1
-    corner_out[4 * e + 2, w] = f2
-    corner_out[4 * e + 3, w] = f3
+    write_corners(H, e, w, corner_out)
 
 
 @wp.kernel
