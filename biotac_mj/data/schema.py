@@ -1,0 +1,114 @@
+"""What a data set of tactile interactions holds: names, shapes, units. The file's layout is in `docs/data.md`."""
+
+import dataclasses
+
+import numpy as np
+
+from ..sensor.channels import CHANNELS
+
+__all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
+
+SCHEMA = "biotac_mj.data/1"
+KINDS = ("press", "slide", "twist", "tap", "recorded")
+SPLITS = ("train", "validation", "test")
+DISPLACEMENT_SCALE = 2.5e-7  # [m] of one unit of the stored integers: rounding of at most 0.125 um, reach of 8.19 mm
+
+# Of each time step: name -> (shape, stored type, unit). "nvert" and "nouter" stand for the skin's node numbers.
+COLUMNS = {
+    "time": ((), "f8", "s"),
+    "displacement": (("nvert", 3), "i2", "2.5e-7 m"),
+    "wrench": ((6,), "f4", "N, N m"),
+    "contact_force": (("nouter", 3), "f4", "N"),
+    "pressure": ((), "f4", "Pa"),
+    "impedance": ((19,), "f4", "ohm"),
+    "counts": ((len(CHANNELS),), "f4", "count"),
+    "indenter_pos": ((3,), "f8", "m"),
+    "indenter_quat": ((4,), "f8", "w x y z"),
+    "converged": ((), "u1", "0 or 1"),
+    "measured_counts": ((len(CHANNELS),), "f4", "count"),
+    "measured_wrench": ((6,), "f4", "N, N m"),
+}
+
+
+@dataclasses.dataclass
+class Interaction:
+    """One contact from beginning to end: n time steps in the BioTac frame. What is None was not recorded.
+
+    Attributes:
+      id: unique in its set.
+      object: what touched, as `biotac generate --objects` names it, or as the file read says.
+      kind: of KINDS.
+      split: of SPLITS, the default split by interaction.
+      seed: of its random numbers.
+      parameters: how it was made; numbers, strings and lists, so that JSON keeps it.
+      time: (n,) increasing [s].
+      displacement: (n, nvert, 3) float32, nodes against the skin's `vert` [m].
+      wrench: (n, 6) of the skin on the object, torque about the BioTac frame's origin [N, N m].
+      contact_force: (n, nouter, 3) of the object on the nodes of the outer surface, `nodes_of(geometry)` [N].
+      pressure: (n,) of the liquid above rest [Pa].
+      impedance: (n, 19) e1..e19 of the simulated film [ohm].
+      counts: (n, 23) simulated readings in the order of sensor.channels.CHANNELS [counts].
+      indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
+      converged: (n,) whether the skin's step converged.
+      measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it has no such channel.
+      measured_wrench: (n, 6) measured with it; NaN where it was not.
+    """
+
+    id: str
+    object: str
+    kind: str
+    split: str
+    seed: int
+    parameters: dict
+    time: np.ndarray
+    displacement: np.ndarray | None = None
+    wrench: np.ndarray | None = None
+    contact_force: np.ndarray | None = None
+    pressure: np.ndarray | None = None
+    impedance: np.ndarray | None = None
+    counts: np.ndarray | None = None
+    indenter_pos: np.ndarray | None = None
+    indenter_quat: np.ndarray | None = None
+    converged: np.ndarray | None = None
+    measured_counts: np.ndarray | None = None
+    measured_wrench: np.ndarray | None = None
+
+    @property
+    def labelled(self) -> bool:
+        """Whether it has measured counts."""
+        return self.measured_counts is not None
+
+    def check(self, nvert: int | None = None, nouter: int | None = None) -> "Interaction":
+        """Returns itself.
+
+        Raises:
+          ValueError: a wrong kind, split, shape, a time that does not increase, or NaN where none may be; the text names it.
+        """
+        where = f"interaction {self.id!r}"
+        if self.kind not in KINDS:
+            raise ValueError(f"{where} has kind {self.kind!r}: choose one of {', '.join(KINDS)}")
+        if self.split not in SPLITS:
+            raise ValueError(f"{where} has split {self.split!r}: choose one of {', '.join(SPLITS)}")
+        n = len(self.time)
+        if not n:
+            raise ValueError(f"{where} has no time steps: leave it out")
+        sizes = {"nvert": nvert, "nouter": nouter}
+        for name, (shape, _, unit) in COLUMNS.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            wanted = (n, *(sizes.get(s, s) if isinstance(s, str) else s for s in shape))
+            if None in wanted:
+                raise ValueError(f"{where} has {name} but its set has no skin: pass the geometry that the nodes belong to")
+            if np.shape(value) != wanted:
+                raise ValueError(f"{name} of {where} has shape {np.shape(value)}: {wanted} is needed [{unit}]")
+            if not name.startswith("measured") and not np.isfinite(value).all():
+                raise ValueError(f"{name} of {where} contains NaN or infinite numbers: drop those steps, or keep the last good ones")
+        if n > 1 and not (np.diff(self.time) > 0).all():
+            raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")
+        return self
+
+
+def nodes_of(geometry) -> np.ndarray:
+    """(nouter,) sorted nodes of a skin's outer surface: those that `contact_force` is stored for."""
+    return np.unique(geometry.outer_face)

@@ -1,0 +1,72 @@
+"""Which interactions train, choose and judge a model. Whole interactions or whole objects, never time steps: neighbours are alike."""
+
+import dataclasses
+
+import numpy as np
+
+__all__ = ["FRACTIONS", "Split", "assign", "split_by_interaction", "split_by_object"]
+
+FRACTIONS = (0.72, 0.18, 0.10)  # train, validation, test: Narang et al., ICRA 2021
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Sorted numbers of interactions (k,) each; no interaction is in two of them."""
+
+    train: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+
+    def check(self) -> "Split":
+        """Returns itself; ValueError where a part is empty."""
+        for name in ("train", "validation", "test"):
+            if not len(getattr(self, name)):
+                raise ValueError(f"the {name} part of the split is empty: more interactions are needed, or another object or fractions")
+        return self
+
+
+def assign(count: int, seed: int = 0, fractions=FRACTIONS) -> np.ndarray:
+    """(count,) of "train", "validation", "test" in random order and the given fractions, rounded."""
+    fractions = np.asarray(fractions, float)
+    if fractions.shape != (3,) or (fractions < 0).any() or abs(fractions.sum() - 1) > 1e-9:
+        raise ValueError(f"fractions {fractions.tolist()} must be three numbers that add up to 1: train, validation, test")
+    bound = np.rint(np.cumsum(fractions) * count).astype(int)
+    part = np.searchsorted(bound, np.arange(count), side="right")
+    return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
+
+
+def split_by_interaction(data, seed: int = 0, fractions=FRACTIONS) -> Split:
+    """Random interactions; labelled and unlabelled ones are divided each on their own, so that both appear in every part.
+
+    Args:
+      data: TactileSet.
+      seed: of the division.
+
+    Raises:
+      ValueError: a part that would be empty, or fractions that do not add up to 1.
+    """
+    part = np.empty(len(data), "<U10")
+    for k, flag in enumerate((False, True)):
+        mine = np.flatnonzero(data.labelled == flag)
+        part[mine] = assign(len(mine), [seed, k], fractions)
+    return Split(*(np.flatnonzero(part == name) for name in ("train", "validation", "test"))).check()
+
+
+def split_by_object(data, unseen="ring_7mm", seed: int = 0, validation: float = 0.2) -> Split:
+    """All interactions of the unseen object (or objects) test; of the others a share chooses and the rest train.
+
+    Raises:
+      ValueError: an object that the set does not have; the text lists those it has.
+    """
+    unseen = [unseen] if isinstance(unseen, str) else list(unseen)
+    known = sorted(set(data.object.tolist()))
+    for name in unseen:
+        if name not in known:
+            raise ValueError(f"the set has no object {name!r}: it has {', '.join(known)}")
+    test = np.isin(data.object, unseen)
+    part = np.empty(len(data), "<U10")
+    part[test] = "test"
+    for k, flag in enumerate((False, True)):
+        mine = np.flatnonzero(~test & (data.labelled == flag))
+        part[mine] = assign(len(mine), [seed, k], (1 - validation, validation, 0.0))
+    return Split(*(np.flatnonzero(part == name) for name in ("train", "validation", "test"))).check()

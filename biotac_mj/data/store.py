@@ -1,0 +1,300 @@
+"""A data set on disk: a folder of HDF5 shards. `write_shard` writes one, `TactileSet` reads all of them as if they were one array."""
+
+import bisect
+import dataclasses
+import json
+import pathlib
+
+import h5py
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..press_record import replacing, versions
+from ..sensor.channels import CHANNELS
+from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
+
+__all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
+
+_GEOMETRY = tuple(f.name for f in dataclasses.fields(SkinGeometry) if f.name != "name")
+_TABLE = ("id", "object", "kind", "split", "seed", "labelled", "parameters", "start", "stop")  # of each interaction
+_TEXT = ("id", "object", "kind", "split", "parameters")
+
+
+def shard_path(folder, number: int) -> pathlib.Path:
+    """Where shard `number` of a set lies."""
+    return pathlib.Path(folder) / f"shard-{number:05d}.h5"
+
+
+def write_shard(path, interactions, geometry: SkinGeometry | None = None, attributes: dict | None = None) -> None:
+    """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the versions alone.
+
+    Args:
+      path: see `shard_path`.
+      interactions: Interactions that all have the same columns.
+      geometry: the skin that displacement and contact_force belong to; None where there are none.
+      attributes: what holds for all of them: material, element, tier, device, settings; JSON's types.
+
+    Raises:
+      ValueError: no interactions, one that does not fit (see `Interaction.check`), different columns, a name that occurs twice, or a
+        displacement beyond 8.19 mm.
+    """
+    interactions = list(interactions)
+    if not interactions:
+        raise ValueError(f"there are no interactions to write to {path}: a shard needs at least one")
+    outer = None if geometry is None else nodes_of(geometry)
+    for one in interactions:
+        one.check(*(() if geometry is None else (geometry.nvert, len(outer))))
+    names = [one.id for one in interactions]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"interaction {twice!r} occurs twice in {path}: give every interaction its own id")
+    columns = [name for name in COLUMNS if getattr(interactions[0], name) is not None]
+    for one in interactions:
+        if [name for name in COLUMNS if getattr(one, name) is not None] != columns:
+            raise ValueError(f"interaction {one.id!r} has other columns than {interactions[0].id!r}: write them to different sets")
+    length = np.array([len(one.time) for one in interactions])
+    stop = np.cumsum(length)
+    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+        file.attrs.update({"schema": SCHEMA, "frame": "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x", "channels": CHANNELS})
+        file.attrs["attributes"] = json.dumps(attributes or {}, sort_keys=True)
+        file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
+        table = file.create_group("interaction", track_order=True)
+        values = {name: [getattr(one, name) for one in interactions] for name in ("id", "object", "kind", "split", "seed", "labelled")}
+        values |= {"parameters": [json.dumps(one.parameters, sort_keys=True) for one in interactions], "start": stop - length, "stop": stop}
+        for name in _TABLE:
+            table[name] = np.array(values[name], dtype=h5py.string_dtype() if name in _TEXT else None)
+        steps = file.create_group("step", track_order=True)
+        for name in columns:
+            _write_column(steps, name, [getattr(one, name) for one in interactions], length)
+        if geometry is not None:
+            group = file.create_group("geometry", track_order=True)
+            group.attrs["name"] = geometry.name
+            for name in _GEOMETRY:
+                group.create_dataset(name, data=getattr(geometry, name), compression="gzip", shuffle=True)
+            group["outer_node"] = outer
+
+
+def _write_column(steps, name, parts, length):
+    shape, kind, unit = COLUMNS[name]
+    if name == "displacement":
+        parts = [_integers(part) for part in parts]
+    value = np.concatenate([np.asarray(part) for part in parts]).astype(kind)
+    wide = value.ndim > 1 and value[0].size > 64
+    chunks = (int(min(length.max(), len(value))), *value.shape[1:]) if wide else True
+    steps.create_dataset(name, data=value, chunks=chunks, compression="gzip", compression_opts=2, shuffle=True)
+    steps[name].attrs["unit"] = unit
+
+
+def _integers(displacement):
+    units = np.rint(np.asarray(displacement) / DISPLACEMENT_SCALE)
+    if np.abs(units).max(initial=0) > 32767:
+        raise ValueError(
+            f"a node is displaced by {np.abs(displacement).max() * 1e3:.2f} mm: the store reaches 8.19 mm; check units (metres) and the run"
+        )
+    return units.astype(np.int16)
+
+
+class Column:
+    """One column of all shards, read when it is indexed: `column[3]`, `column[10:20]`, `column[mask]`, `column[indices]`.
+
+    Attributes:
+      name; shape (nstep, ...); dtype of what indexing returns.
+    """
+
+    def __init__(self, name, parts, shape, offsets):
+        self.name, self._parts, self._offsets = name, parts, offsets
+        self.shape = shape
+        self.dtype = np.dtype("f4") if name == "displacement" else np.dtype(bool if name == "converged" else COLUMNS[name][1])
+
+    def __len__(self):
+        return self.shape[0]
+
+    def __getitem__(self, index):
+        scalar = isinstance(index, (int, np.integer))
+        wanted = np.arange(len(self))[index]  # numpy's rules and errors
+        wanted = np.atleast_1d(wanted)
+        out = np.empty((len(wanted), *self.shape[1:]), self.dtype)
+        home = np.searchsorted(self._offsets, wanted, side="right") - 1
+        for k in np.unique(home):
+            mine = np.flatnonzero(home == k)
+            out[mine] = self._read(k, wanted[mine] - self._offsets[k])
+        return out[0] if scalar else out
+
+    def _read(self, k, rows):
+        part = self._parts[k]
+        if part is None:
+            return np.full((len(rows), *self.shape[1:]), np.nan, self.dtype)
+        low, high = int(rows.min()), int(rows.max()) + 1
+        if high - low == len(rows):  # one piece
+            value = part[low:high]
+            value = value if (np.diff(rows) > 0).all() else value[rows - low]
+        else:
+            ordered, inverse = np.unique(rows, return_inverse=True)
+            value = np.concatenate([part[a:b] for a, b in _runs(ordered)])[inverse]
+        return value * np.float32(DISPLACEMENT_SCALE) if self.name == "displacement" else value
+
+
+def _runs(rows):
+    """Pieces (first, beyond) of sorted numbers: HDF5 reads pieces a hundred times faster than single rows."""
+    cut = np.flatnonzero(np.diff(rows) > 1)
+    return zip(rows[np.r_[0, cut + 1]].tolist(), (rows[np.r_[cut, len(rows) - 1]] + 1).tolist())
+
+
+class TactileSet:
+    """All shards of a data set as one. Use it as a context, or `close` it.
+
+        with TactileSet("out/set") as data:
+            train = data.steps(np.flatnonzero(data.split == "train"))
+            x, y = data["displacement"][train], data["counts"][train]
+
+    Args:
+      path: folder of shards, or one shard.
+
+    Attributes:
+      path; geometry: SkinGeometry, or None; attributes, versions: dicts of the first shard.
+      id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each interaction, its time steps are
+        start..stop-1 of every column.
+      columns: names of the columns that are there; "measured_counts" and "measured_wrench" are NaN in interactions without a label.
+
+    Raises:
+      FileNotFoundError: no such folder or file, or no shards in it.
+      ValueError: a file that is no shard, of another schema, or shards that do not belong together.
+    """
+
+    def __init__(self, path):
+        self.path = pathlib.Path(path)
+        files = sorted(self.path.glob("shard-*.h5")) if self.path.is_dir() else [self.path]
+        if not files or not files[0].is_file():
+            raise FileNotFoundError(f"no shards (shard-*.h5) at {self.path}: make a set with `biotac generate` or `biotac import-data`")
+        self._files = []
+        try:
+            for name in files:
+                self._files.append(_open(name))
+            self._read_tables()
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_tables(self):
+        first = self._files[0]
+        self.attributes, self.versions = json.loads(first.attrs["attributes"]), json.loads(first.attrs["versions"])
+        self.geometry = _geometry(first)
+        self.columns = tuple(name for name in COLUMNS if any(name in f["step"] for f in self._files))
+        for file in self._files[1:]:
+            missing = [c for c in self.columns if not c.startswith("measured") and (c in first["step"]) != (c in file["step"])]
+            if missing or not _same_skin(first, file):
+                what = f"columns {', '.join(missing)}" if missing else "skin"
+                raise ValueError(f"{file.filename} differs from {first.filename} in its {what}: keep different sets in different folders")
+        nstep = [len(f["step/time"]) for f in self._files]
+        self._offsets = np.concatenate([[0], np.cumsum(nstep)])
+        self.nstep = int(self._offsets[-1])
+        for name in ("id", "object", "kind", "split"):
+            setattr(self, name, np.concatenate([f["interaction"][name].asstr()[:] for f in self._files]).astype(str))
+        self.seed = np.concatenate([f["interaction/seed"][:] for f in self._files])
+        self.labelled = np.concatenate([f["interaction/labelled"][:] for f in self._files]).astype(bool)
+        for name in ("start", "stop"):
+            value = [f["interaction"][name][:] + offset for f, offset in zip(self._files, self._offsets)]
+            setattr(self, name, np.concatenate(value).astype(np.int64))
+        names, count = np.unique(self.id, return_counts=True)
+        if (count > 1).any():
+            raise ValueError(
+                f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: one of them is left from another run"
+            )
+
+    def __len__(self):
+        return len(self.id)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        for file in self._files:
+            file.close()
+
+    @property
+    def rest_vert(self) -> np.ndarray:
+        """(nvert, 3) nodes that the displacements are measured from [m]."""
+        return self._skin().vert
+
+    @property
+    def outer_node(self) -> np.ndarray:
+        """(nouter,) nodes that `contact_force` is given for."""
+        return nodes_of(self._skin())
+
+    def _skin(self):
+        if self.geometry is None:
+            raise ValueError(f"{self.path} has no skin: it holds recordings only; use a set made by `biotac generate`")
+        return self.geometry
+
+    def __getitem__(self, name) -> Column:
+        """A column of all time steps, read lazily; see `schema.COLUMNS`.
+
+        Raises:
+          ValueError: the set has no such column.
+        """
+        if name not in self.columns:
+            raise ValueError(f"{self.path} has no column {name!r}: it has {', '.join(self.columns)}")
+        parts = [f["step"].get(name) for f in self._files]
+        shape = next(p for p in parts if p is not None).shape[1:]
+        return Column(name, parts, (self.nstep, *shape), self._offsets[:-1])
+
+    def vert_xpos(self, index) -> np.ndarray:
+        """(..., nvert, 3) float32 positions of the nodes at time steps [m]."""
+        rest = self.rest_vert.astype(np.float32)
+        return self["displacement"][index] + rest
+
+    def steps(self, interactions) -> np.ndarray:
+        """Time steps (k,) of interactions, given by number or as a mask."""
+        chosen = np.atleast_1d(np.arange(len(self))[interactions])
+        return np.concatenate([np.arange(self.start[i], self.stop[i]) for i in chosen] or [np.zeros(0, int)])
+
+    def owner(self) -> np.ndarray:
+        """(nstep,) number of the interaction of each time step."""
+        return np.repeat(np.arange(len(self)), self.stop - self.start)
+
+    def parameters(self, i: int) -> dict:
+        """How interaction i was made."""
+        k = bisect.bisect_right(self._offsets.tolist(), int(self.start[i])) - 1
+        file = self._files[k]
+        row = int(np.searchsorted(file["interaction/start"][:], self.start[i] - self._offsets[k]))
+        return json.loads(file["interaction/parameters"].asstr()[row])
+
+    def interaction(self, i: int) -> Interaction:
+        """Interaction i, all of it."""
+        i = range(len(self))[i]
+        rows = slice(self.start[i], self.stop[i])
+        columns = {name: self[name][rows] for name in self.columns if self.labelled[i] or not name.startswith("measured")}
+        return Interaction(str(self.id[i]), str(self.object[i]), str(self.kind[i]), str(self.split[i]), int(self.seed[i]),
+                           self.parameters(i), **columns)  # fmt: skip
+
+
+def _open(path):
+    try:
+        file = h5py.File(path)
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}): it is no HDF5 file or it is damaged; delete it and run the command again"
+        ) from error
+    if file.attrs.get("schema") != SCHEMA:
+        found = file.attrs.get("schema")
+        file.close()
+        raise ValueError(f"{path} has schema {found!r}: this version reads {SCHEMA!r}; generate or import it again")
+    return file
+
+
+def _geometry(file):
+    if "geometry" not in file:
+        return None
+    group = file["geometry"]
+    return SkinGeometry(name=str(group.attrs["name"]), **{name: group[name][:] for name in _GEOMETRY})
+
+
+def _same_skin(a, b):
+    if ("geometry" in a) != ("geometry" in b):
+        return False
+    return "geometry" not in a or (
+        a["geometry/vert"].shape == b["geometry/vert"].shape and (a["geometry/vert"][:] == b["geometry/vert"][:]).all()
+    )
