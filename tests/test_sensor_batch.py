@@ -1,0 +1,147 @@
+"""Film and acquisition of many worlds against the single sensor's."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from biotac_mj.geometry import load_skin
+from biotac_mj.sensor import channels
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.batch_acquisition import BatchAcquisition
+from biotac_mj.sensor.batch_film import BatchFilm
+from biotac_mj.sensor.film import FilmConduction
+
+DT = 2e-3
+
+
+@pytest.fixture(scope="module")
+def film():
+    return FilmConduction(load_skin("coarse"))
+
+
+def dented(film, count, seed=0):
+    """(count, nvert, 3) skins pushed towards the core at random places, some onto it: synthetic."""
+    rng, vert = np.random.default_rng(seed), film.geometry.vert
+    foot = film.core.closest(vert)[1]
+    out = []
+    for _ in range(count):
+        center = np.array([rng.uniform(-16e-3, -2e-3), -6e-3, rng.uniform(-4e-3, 4e-3)])
+        share = rng.uniform(0.6, 1.1) * np.exp(-((np.linalg.norm(vert - center, axis=1) / 3e-3) ** 2))
+        out.append(vert + share[:, None] * (foot - vert) + 2e-5 * rng.normal(size=vert.shape))
+    return np.stack(out)
+
+
+def as_warp(x):
+    return wp.array(np.ascontiguousarray(np.swapaxes(x, 0, 1)), dtype=wp.vec3d, ndim=2)
+
+
+def test_film_is_that_of_the_single_sensor(film):
+    x = dented(film, 5)
+    batch = BatchFilm(film, 5)
+    batch.solve(as_warp(x), wp.ones(5, dtype=int))
+    expected = channels.counts_from_impedance(film.impedance(x))
+    assert np.abs(expected - channels.counts_from_impedance(film.impedance(film.geometry.vert))).max() > 100  # something happened
+    np.testing.assert_allclose(channels.counts_from_impedance(batch.impedance.numpy()), expected, atol=0.1)
+    assert batch.valid.numpy().all()
+
+
+def test_film_at_rest_before_the_first_solve(film):
+    np.testing.assert_allclose(BatchFilm(film, 2).impedance.numpy()[1], film.impedance(film.geometry.vert))
+
+
+def test_only_worlds_that_are_due_are_solved(film):
+    x = dented(film, 3)
+    batch = BatchFilm(film, 3)
+    batch.solve(as_warp(x), wp.array([0, 1, 0], dtype=int))
+    z = batch.impedance.numpy()
+    np.testing.assert_array_equal(z[0], z[2])
+    np.testing.assert_allclose(z[0], batch.rest)
+    assert np.abs(z[1] / z[0] - 1).max() > 0.03
+
+
+def test_a_film_that_fails_keeps_its_impedance_and_leaves_the_others_alone(film):
+    x = dented(film, 4)
+    good, bad = BatchFilm(film, 4), BatchFilm(film, 4)
+    due = wp.ones(4, dtype=int)
+    for batch in (good, bad):
+        batch.solve(as_warp(x), due)
+    moved = dented(film, 4, seed=1)
+    good.solve(as_warp(moved), due)
+    moved[1, film.node[7]] = np.nan
+    moved[2, film.node] += [0, -6e-3, 0]  # off the electrodes
+    bad.solve(as_warp(moved), due)
+    assert bad.valid.numpy().tolist() == [1, 0, 0, 1] and good.valid.numpy().all()
+    now = bad.impedance.numpy()
+    np.testing.assert_array_equal(now[[0, 3]], good.impedance.numpy()[[0, 3]])
+    np.testing.assert_allclose(now[[1, 2]], film.impedance(x[[1, 2]]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize("dt", [2e-4, 2e-3, 15e-3])
+@pytest.mark.parametrize("every_step", [False, True])
+def test_acquisition_is_that_of_the_single_sensor(film, noise, dt, every_step):
+    nworld, rng = 3, np.random.default_rng(0)
+    rest = film.impedance(film.geometry.vert)
+    batch = BatchAcquisition(rest, nworld, seed=2**63, noise=noise, film_every_step=every_step)
+    singles = [Acquisition(seed=2**63 + w, noise=noise, film_every_step=every_step) for w in range(nworld)]
+    states = np.zeros((nworld, 69))
+    for single, state in zip(singles, states):
+        single.reset(state, rest)
+    valid, time, asked = wp.ones(nworld, dtype=int), 0.0, 0
+    for step in range(60):
+        z = rest * rng.uniform(0.5, 2, (nworld, 19))
+        pressure = 3000 * np.sin(50 * time + np.arange(nworld)) + rng.normal(size=nworld)
+        warm = 31 + 0.05 * np.sin(3 * time + np.arange(nworld))
+        needs = [single.needs_impedance(state, time, dt) for single, state in zip(singles, states)]
+        asked += needs[0]
+        assert batch.find_due(dt).numpy().tolist() == needs
+        for w, single in enumerate(singles):
+            single.advance(states[w], time, dt, z[w] if needs[w] else None, pressure[w], warm[w])
+        wp.copy(batch.temperature, wp.array(warm, dtype=wp.float64))
+        batch.advance(dt, wp.array(z, dtype=wp.float64, ndim=2), valid, wp.array(pressure, dtype=wp.float64))
+        time += dt
+        np.testing.assert_allclose(batch.state.numpy(), states, rtol=1e-9, atol=1e-9, err_msg=f"step {step}")
+    assert 0 < asked < 61
+    np.testing.assert_allclose(batch.time.numpy(), time)
+
+
+def test_an_impedance_that_is_not_valid_is_held(film):
+    rest = film.impedance(film.geometry.vert)
+    batch = BatchAcquisition(rest, 2, noise=False, film_every_step=True)
+    nothing = wp.zeros(2, dtype=wp.float64)
+    for _ in range(6):
+        batch.find_due(DT)
+        batch.advance(DT, wp.array(np.tile(2 * rest, (2, 1)), dtype=wp.float64, ndim=2), wp.array([1, 0], dtype=int), nothing)
+    held = batch.state.numpy()[:, 25:44]
+    np.testing.assert_allclose(held[0], channels.counts_from_impedance(2 * rest), atol=0.5)
+    np.testing.assert_allclose(held[1], channels.counts_from_impedance(rest), atol=0.5)
+
+
+def test_reset_of_some_worlds(film):
+    rest = film.impedance(film.geometry.vert)
+    batch = BatchAcquisition(rest, 3)
+    start = batch.state.numpy().copy()
+    for _ in range(5):
+        batch.find_due(DT)
+        batch.advance(
+            DT, wp.array(np.tile(2 * rest, (3, 1)), dtype=wp.float64, ndim=2), wp.ones(3, dtype=int), wp.full(3, 500.0, wp.float64)
+        )
+    before = batch.state.numpy().copy()
+    batch.reset(wp.array([False, True, False], dtype=bool))
+    np.testing.assert_array_equal(batch.state.numpy()[1], start[1])
+    np.testing.assert_array_equal(batch.state.numpy()[[0, 2]], before[[0, 2]])
+    np.testing.assert_allclose(batch.time.numpy(), [5 * DT, 0, 5 * DT])
+
+
+def test_seeds_that_do_not_fit_are_refused(film):
+    rest = film.impedance(film.geometry.vert)
+    with pytest.raises(ValueError, match="2 seeds for 3 worlds: pass one for each"):
+        BatchAcquisition(rest, 3, seed=[1, 2])
+    with pytest.raises(ValueError, match="seed is -1"):
+        BatchAcquisition(rest, 2, seed=-1)
+
+
+def test_a_film_with_other_excitation_is_refused():
+    film = FilmConduction(load_skin("coarse"), excitation=[(0.0, 1.0), (-5e-3, 1.0)], sensor=None)
+    with pytest.raises(ValueError, match="needs the sensor's four"):
+        BatchFilm(film, 1)
