@@ -1,0 +1,97 @@
+"""What all tasks share: arena, machine with BioTacs, actions in [-1, 1], observables by preset, rewards in [0, 1]."""
+
+import abc
+
+import numpy as np
+from dm_control import composer
+from dm_control.composer.observation import observable
+from dm_env import specs
+
+from .biotac import PRIVILEGED, TACTILE, BioTac
+
+__all__ = ["AWAY", "TouchTask", "arena"]
+
+AWAY = (0.0, 0.0, -1.0)  # [m] where a mocap object waits that is not in use
+CONTROL_TIMESTEP = 0.01  # [s] one frame of the sensor
+_OBSERVE = {"tactile": TACTILE, "privileged": TACTILE + PRIVILEGED, "none": ()}
+
+
+def arena():
+    """A lit scene with a camera on the finger and nothing to touch."""
+    out = composer.Arena()
+    root = out.mjcf_model
+    root.compiler.angle = "radian"
+    root.option.integrator = "implicitfast"
+    root.visual.headlight.set_attributes(ambient=[0.35] * 3, diffuse=[0.5] * 3, specular=[0.1] * 3)
+    getattr(root.visual, "global").set_attributes(offwidth=1280, offheight=960)
+    root.visual.map.set_attributes(znear=0.001, zfar=30)
+    root.statistic.set_attributes(center=[0, 0, 0.01], extent=0.1)
+    root.asset.add(
+        "texture", name="sky", type="skybox", builtin="gradient", rgb1=[0.95, 0.97, 1.0], rgb2=[0.6, 0.65, 0.7], width=64, height=384
+    )
+    root.worldbody.add("light", pos=[-0.1, -0.2, 0.5], dir=[0.2, 0.4, -1], directional=True, castshadow=True, diffuse=[0.4] * 3)
+    root.worldbody.add("camera", name="side", pos=[-0.075, -0.115, 0.06], xyaxes=[0.84, -0.55, 0, 0.22, 0.34, 0.91], fovy=35)
+    return out
+
+
+class TouchTask(composer.Task, abc.ABC):
+    """A machine with BioTacs feels for something.
+
+    Args:
+      observe: "tactile" (what real sensors report), "privileged" (forces, patches and the skin besides) or "none" (no touch at all).
+      physics_timestep: [s].
+      biotac: settings of every `BioTac`.
+
+    Attributes:
+      estimated: names of what a controller may want to know of the hidden state, `hidden(physics)` gives it; for calibration only.
+    """
+
+    estimated: tuple
+    seconds = 4.0  # an episode
+
+    def __init__(self, machine, mounts, observe="tactile", physics_timestep=2.5e-3, biotac=None):
+        if observe not in _OBSERVE:
+            raise ValueError(f"unknown preset observe={observe!r}: choose one of {', '.join(_OBSERVE)}")
+        self._arena, self.machine = arena(), machine
+        self._arena.attach(machine)
+        names = ["biotac"] if len(mounts) == 1 else [f"biotac_{i}" for i in range(len(mounts))]
+        self.biotacs = [BioTac(name=name, **(biotac or {})) for name in names]
+        for entity, mount in zip(self.biotacs, mounts, strict=True):
+            machine.attach(entity, mount)
+            entity.observables.enable(_OBSERVE[observe])
+        self.set_timesteps(control_timestep=CONTROL_TIMESTEP, physics_timestep=physics_timestep)
+        self._task_observables = {"position": observable.Generic(machine.position)}
+        for item in self._task_observables.values():
+            item.enabled = True
+
+    def _observe(self, name, read):
+        self._task_observables[name] = observable.Generic(read)
+        self._task_observables[name].enabled = True
+
+    @property
+    def root_entity(self):
+        return self._arena
+
+    @property
+    def task_observables(self):
+        return self._task_observables
+
+    def action_spec(self, physics):
+        return specs.BoundedArray((len(self.machine.axes),), np.float64, -1.0, 1.0, name="\t".join(self.machine.axes))
+
+    def before_step(self, physics, action, random_state):
+        self.machine.command(physics, action)
+
+    def force(self, physics, index=0):
+        """(3,) force on a BioTac in its frame [N]."""
+        return self.biotacs[index].read(physics, "contact_force")[:3]
+
+    @abc.abstractmethod
+    def hidden(self, physics) -> np.ndarray:
+        """(nbiotac, nestimated) true values of `estimated`, which no touch-only controller may read."""
+
+    @abc.abstractmethod
+    def initialize_episode(self, physics, random_state): ...
+
+    @abc.abstractmethod
+    def get_reward(self, physics): ...

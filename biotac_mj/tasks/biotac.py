@@ -1,0 +1,228 @@
+"""The BioTac as a composer Entity: attach it to any site of an arena or a robot; its observables own rate, delay and noise."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
+
+from ..sensor.channels import FULL_SCALE, OTHER_NOISE, electrode_noise
+
+__all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
+
+TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # what the real sensor reports
+PRIVILEGED = ("contact_force", "contact_patch", "skin")  # what only a simulation knows
+_RATE = 100.0  # [Hz] of a frame: 19 electrodes, PDC, TAC, TDC once, PAC 22 times (BioTac manual)
+_PREFIX = "build_"  # of all names until the Entity has its own scope
+
+
+class Reading(observable.Generic):
+    """An observable in seconds: its rate and delay become physics steps when the time step is known.
+
+    Attributes:
+      rate: how often it is read [Hz]; None in every physics step.
+      lag: how old a value is when it arrives [s].
+      noise: f(values, random_state) -> values; None leaves them as they are.
+    """
+
+    def __init__(self, read, rate=_RATE, lag=0.0, noise=None):
+        super().__init__(read)
+        self.rate, self.lag, self.corruptor = rate, lag, noise
+
+    @property
+    def noise(self):
+        return self.corruptor
+
+    @noise.setter
+    def noise(self, value):
+        self.corruptor = value
+
+    def resolve(self, timestep):
+        """Sets dm_control's `update_interval` and `delay` for a physics time step [s]."""
+        self.update_interval = 1 if self.rate is None else max(1, round(1 / (self.rate * timestep)))
+        self.delay = round(self.lag / timestep)
+
+
+class BioTac(composer.Entity):
+    """A BioTac for composer: `robot.attach(BioTac(), site)`; its frame (tip -x, pad -y) is the site's.
+
+    The skin's constants are built when the model is compiled and shared by all BioTacs of the same settings; an episode's reset writes the
+    rest state, nothing is built again. The sensor's own noise is off: noise belongs to the observables, drawn from the environment's
+    random state.
+    """
+
+    def _build(
+        self, name="biotac", skin="coarse", tier="condensed", slots=8, noise=True, geoms=None, rounding=None, options=None, **settings
+    ):
+        """
+        Args:
+          name: scope of its names.
+          skin, tier: see `biotac_mj.attach`; "condensed" steps in real time.
+          slots: how many bodies of the whole model may touch it two-way.
+          noise: whether the observables have the real sensor's noise.
+          geoms, rounding: see `biotac_mj.coupling.Config`; names are those of the whole model.
+          options, settings: further ones of `biotac_mj.attach`.
+
+        Raises:
+          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a place (site, body, pos, quat, prefix) is given.
+        """
+        from ..coupling import attach
+
+        for key in ("site", "body", "pos", "quat", "prefix"):
+            if key in settings:
+                raise ValueError(f"BioTac got {key}={settings[key]!r}: an Entity is placed with robot.attach(BioTac(...), site)")
+        options = {**(options or {})}
+        options["readings"] = {**options.get("readings", {}), "noise": False}
+        spec = mujoco.MjSpec()
+        self.handle = attach(spec, prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options, **settings)
+        spec.compile()
+        root = mjcf.from_xml_string(spec.to_xml())
+        root.model = name
+        for namespace in ("body", "geom", "mesh", "site", "sensor", "equality", "plugin", "deformable"):
+            for element in root.find_all(namespace):
+                element.name = element.name.removeprefix(_PREFIX)
+        for element in root.find_all("default"):
+            if (element.dclass or "").startswith(_PREFIX):
+                element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
+        self._name_geoms(root, geoms, rounding)
+        self._mjcf_root, self._noise = root, noise
+        self._outer = _outer_nodes(skin)
+
+    def _name_geoms(self, root, geoms, rounding):
+        """Settings about geoms that are not here yet, but in the arena."""
+        named = {"geoms": None if geoms is None else tuple(geoms), "rounding": dict(rounding or {})}
+        self.handle = dataclasses.replace(self.handle, config=dataclasses.replace(self.handle.config, **named))
+        texts = self.handle.config.strings()
+        for entry in root.find("plugin", "skin").config:
+            entry.value = texts[entry.key]
+
+    def _build_observables(self):
+        return BioTacObservables(self)
+
+    @property
+    def mjcf_model(self):
+        return self._mjcf_root
+
+    @property
+    def core(self):
+        """The body whose frame is the BioTac frame."""
+        return self._mjcf_root.find("body", "core")
+
+    @property
+    def noise(self):
+        return self._noise
+
+    @property
+    def outer(self):
+        """(nouter,) indices of the skin's nodes that the world can touch."""
+        return self._outer
+
+    def after_compile(self, physics, random_state):
+        for reading in self.observables.readings():
+            reading.resolve(physics.timestep())
+
+    def read(self, physics, channel) -> np.ndarray:
+        """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m], status; see `Handle.read`."""
+        return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
+
+    def rest(self) -> np.ndarray:
+        """(19,) counts of the electrodes at rest: the published ones of the sensor that `options` names."""
+        from ..sensor.channels import REST_COUNTS
+
+        return REST_COUNTS[self.handle.config.options["readings"].get("sensor", "1")].copy()
+
+    def vert_xpos(self, physics) -> np.ndarray:
+        """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
+        from ..coupling.attach import Handle
+
+        return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(physics.model.ptr, physics.data.ptr)
+
+    def contact_patch(self, physics) -> np.ndarray:
+        """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to the line of the total contact
+        force, and the outward direction there (against the force); zeros below 1 mN."""
+        force = self.read(physics, "contact_force")
+        size = np.linalg.norm(force[:3])
+        if size < 1e-3:
+            return np.zeros(6)
+        along, lever = force[:3] / size, np.cross(force[:3], force[3:]) / size**2
+        node = self.vert_xpos(physics)[self._outer]
+        off = np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along  # of the two sides, the one that is pushed
+        return np.concatenate([node[off.argmin()], -along])
+
+
+class BioTacObservables(composer.Observables):
+    """electrodes (19,), pac (22,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and contact_patch
+    (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
+
+    def readings(self):
+        """All of them, as `Reading`s."""
+        return [self.get_observable(name) for name in TACTILE + PRIVILEGED]
+
+    def enable(self, names):
+        """Enables a preset (TACTILE, PRIVILEGED) or any of the names, and nothing else.
+
+        Raises:
+          ValueError: an unknown name.
+        """
+        for name in names:
+            if name not in TACTILE + PRIVILEGED:
+                raise ValueError(f"a BioTac has no observable {name!r}: choose from {', '.join(TACTILE + PRIVILEGED)}")
+        for name in TACTILE + PRIVILEGED:
+            self.get_observable(name).enabled = name in names
+
+    def _channel(self, name, noise):
+        entity = self._entity
+        return Reading(lambda physics: entity.read(physics, name), noise=noise if entity.noise else None)
+
+    @composer.observable
+    def electrodes(self):
+        return self._channel("electrodes", _electrode_noise)
+
+    @composer.observable
+    def pac(self):
+        return self._channel("pac", _other_noise)
+
+    @composer.observable
+    def pdc(self):
+        return self._channel("pdc", _other_noise)
+
+    @composer.observable
+    def tac(self):
+        return self._channel("tac", _other_noise)
+
+    @composer.observable
+    def tdc(self):
+        return self._channel("tdc", _other_noise)
+
+    @composer.observable
+    def contact_force(self):
+        return self._channel("contact_force", None)
+
+    @composer.observable
+    def contact_patch(self):
+        return Reading(self._entity.contact_patch)
+
+    @composer.observable
+    def skin(self):
+        entity = self._entity
+        return Reading(lambda physics: entity.vert_xpos(physics)[entity.outer])
+
+
+def _counts(values):
+    return np.clip(np.round(values), 0, FULL_SCALE)
+
+
+def _electrode_noise(counts, random_state):
+    return _counts(counts + electrode_noise(counts) * random_state.standard_normal(np.shape(counts)))
+
+
+def _other_noise(counts, random_state):
+    return _counts(counts + OTHER_NOISE * random_state.standard_normal(np.shape(counts)))
+
+
+def _outer_nodes(skin):
+    from ..geometry import SkinGeometry, load_skin
+
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    return np.unique(geometry.outer_face)

@@ -1,0 +1,136 @@
+"""Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--tasks press,explore] [--episodes 12]
+
+Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch is recorded around where it
+will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are kept in out/calibration, so that an interrupted run goes on.
+"""
+
+import argparse
+import pathlib
+
+import numpy as np
+from tqdm import tqdm
+
+from ..data.objects import OBJECTS
+from . import suite
+from .scripted import SCRIPTED, make_controller
+from .touch import Estimator
+
+__all__ = ["main", "record", "record_explore"]
+
+_SEED = 100000
+_HOLD = 40  # frames that a random error lasts
+# standard deviation of the error that is added to the truth, per estimated quantity
+_ERRORS = {
+    "press": [0.6],
+    "follow_edge": [1e-3, 0.12, 0.35],
+    "roll_ball": [1.2e-3, 0.6e-3, 0.2],
+    "hold": [0.25, 0.15],
+    "lift": [0.25, 0.15],
+}
+
+
+def record(domain, task, seed):
+    """One episode: touch (n, 20) while something touches, and the hidden values (n, k) with it, one row per BioTac and frame."""
+    env = suite.load(domain, task, task_kwargs={"random": seed})
+    controller, rng = make_controller(task), np.random.RandomState(seed)
+    controller.reset()
+    step, touch, hidden = env.reset(), [], []
+    while not step.last():
+        truth = env.task.hidden(env.physics)
+        if controller.frame % _HOLD == 0:
+            error = rng.standard_normal(truth.shape[1]) * _ERRORS[task]
+        action = controller.act(step.observation, truth + error)
+        if np.abs(controller.felt).max() > 0.6:
+            touch.append(controller.felt)
+            hidden.append(truth)
+        step = env.step(action)
+    env.close()
+    return np.concatenate(touch), np.concatenate(hidden)
+
+
+def record_explore(seed, name):
+    """The presses (100,) of one exploration of an object."""
+    env = suite.load("finger", "explore", task_kwargs={"random": seed, "objects": [name]})
+    controller = make_controller("explore")
+    controller.decide = lambda: None
+    controller.reset()
+    step = env.reset()
+    while not step.last() and controller.stage != "done":
+        step = env.step(controller.act(step.observation))
+    env.close()
+    if controller.stage != "done":
+        raise ValueError(f"exploring {name} with seed {seed} did not end in time")
+    return np.ravel(controller.felt_at)
+
+
+def _kept(path, make):
+    """Arrays of a recording, made if it is not there."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = make()
+        temporary = path.with_suffix(".part.npz")
+        np.savez(temporary, *(arrays if isinstance(arrays, tuple) else (arrays,)))
+        temporary.rename(path)
+    with np.load(path) as file:
+        return [file[name] for name in file.files]
+
+
+def _discriminant(presses, label, shrink=0.2):
+    """Weights (100, 17) and bias (17,) of Fisher's linear discriminant, with the classes' common covariance shrunk to its diagonal."""
+    mean = np.stack([presses[label == k].mean(0) for k in range(len(OBJECTS))])
+    rest = presses - mean[label]
+    covariance = rest.T @ rest / len(rest)
+    diagonal = np.diag(np.diag(covariance) + 1e-3)
+    weight = np.linalg.solve((1 - shrink) * covariance + shrink * diagonal, mean.T)
+    return weight, -0.5 * np.einsum("kf,fk->k", mean, weight)
+
+
+def _explore(folder, episodes):
+    rows = [(k, i) for i in range(episodes) for k in range(len(OBJECTS))]
+    presses = np.stack([
+        _kept(folder / f"explore_{OBJECTS[k]}_{i}.npz", lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k]))[0]
+        for k, i in tqdm(rows, desc="explore")
+    ])  # fmt: skip
+    label, fold = np.array([k for k, _ in rows]), np.array([i for _, i in rows]) % 4
+    right = 0
+    for held in range(4):
+        weight, bias = _discriminant(presses[fold != held], label[fold != held])
+        right += (np.argmax(presses[fold == held] @ weight + bias, axis=1) == label[fold == held]).sum()
+    print(f"explore: {right} of {len(rows)} right in four-fold cross-validation")
+    weight, bias = _discriminant(presses, label)
+    return {"explore/weight": weight, "explore/bias": bias, "explore/accuracy": right / len(rows)}
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--tasks", default=",".join(SCRIPTED), help="comma-separated")
+    parser.add_argument("--episodes", type=int, default=12, help="of each task, and of each object of explore")
+    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).with_name("calibration.npz"), help="file to write")
+    options = parser.parse_args(arguments)
+    stored = {}
+    if options.out.exists():
+        with np.load(options.out) as file:
+            stored = {name: file[name] for name in file.files}
+    domain = {task: domain for domain, task in suite.tasks()}
+    for task in options.tasks.split(","):
+        if task not in SCRIPTED:
+            raise ValueError(f"no task {task!r} to calibrate: choose from {', '.join(SCRIPTED)}")
+        if task == "explore":
+            stored |= _explore(options.folder, options.episodes)
+        else:
+            made = [
+                _kept(options.folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i))
+                for i in tqdm(range(options.episodes), desc=task)
+            ]
+            touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
+            fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
+            print(f"{task}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
+            stored |= {f"{task}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
+        temporary = options.out.with_suffix(".part.npz")
+        np.savez_compressed(temporary, **stored)
+        temporary.rename(options.out)
+
+
+if __name__ == "__main__":
+    main()

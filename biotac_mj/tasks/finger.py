@@ -1,0 +1,41 @@
+"""Tasks of one finger on a gantry."""
+
+from dm_control.utils import containers
+
+from .suite import environment
+
+__all__ = ["SUITE", "explore", "follow_edge", "press", "roll_ball"]
+
+SUITE = containers.TaggedTasks()
+
+
+@SUITE.add("benchmarking", "easy")
+def press(**settings):
+    """Press to a target force."""
+    from .press import Press
+
+    return environment(Press, **settings)
+
+
+@SUITE.add("benchmarking")
+def follow_edge(**settings):
+    """Follow the rim of a plate."""
+    from .edge import FollowEdge
+
+    return environment(FollowEdge, **settings)
+
+
+@SUITE.add("benchmarking")
+def roll_ball(**settings):
+    """Roll a ball to a target."""
+    from .roll import RollBall
+
+    return environment(RollBall, **settings)
+
+
+@SUITE.add("benchmarking", "hard")
+def explore(**settings):
+    """Tell which of seventeen objects lies under the finger."""
+    from .explore import Explore
+
+    return environment(Explore, **settings)

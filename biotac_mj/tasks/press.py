@@ -1,0 +1,47 @@
+"""Press to a target force: a plate of unknown height and tilt; the wanted force is told, the felt one is not."""
+
+import numpy as np
+from dm_control.utils import rewards
+
+from .base import TouchTask
+from .robots import Gantry
+
+__all__ = ["Press"]
+
+_PAD = 8.2e-3  # of the pad below the BioTac's axis [m]
+_FORCES = (0.5, 3.0)  # [N]
+_TILT = 0.08  # [rad]
+
+
+class Press(TouchTask):
+    """Reward: 1 where the normal force is within 10 % of the target, down to 0 where it is off by the whole target, which changes once."""
+
+    estimated = ("force",)
+    seconds = 3.0
+
+    def __init__(self, **settings):
+        gantry = Gantry()
+        super().__init__(gantry, [gantry.mount], **settings)
+        self._plate = self._arena.mjcf_model.worldbody.add("body", name="plate", mocap=True)
+        self._plate.add("geom", name="plate", type="box", size=[0.04, 0.04, 0.005], pos=[0, 0, -0.005], rgba=[0.75, 0.6, 0.4, 1])
+        self._targets = np.zeros(2)
+        self._observe("target", lambda physics: np.array([self.target(physics)]))
+
+    def target(self, physics) -> float:
+        """The wanted force [N]."""
+        return self._targets[int(physics.data.time > self.seconds / 2)]
+
+    def initialize_episode(self, physics, random_state):
+        self._targets = random_state.uniform(*_FORCES, size=2)
+        angle = random_state.uniform(-_TILT, _TILT, size=2)
+        plate = physics.bind(self._plate)
+        plate.mocap_pos = [0, 0, -_PAD - random_state.uniform(1e-3, 4e-3)]
+        plate.mocap_quat = np.array([1, *(angle / 2), 0]) / np.linalg.norm([1, *(angle / 2)])
+        self.machine.place(physics, np.append(random_state.uniform(-5e-3, 5e-3, size=2), 0.0))
+
+    def hidden(self, physics):
+        return self.force(physics)[None, 1:2]
+
+    def get_reward(self, physics):
+        target = self.target(physics)
+        return float(rewards.tolerance(self.force(physics)[1], (0.9 * target, 1.1 * target), 0.9 * target, "linear", 0.0))

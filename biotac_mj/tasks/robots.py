@@ -1,0 +1,139 @@
+"""The machines that carry BioTacs in the tasks: a gantry for one finger, a parallel gripper with two."""
+
+import mujoco
+import numpy as np
+from dm_control import composer, mjcf
+
+__all__ = ["Gantry", "Gripper"]
+
+_MASS = 0.15  # of a carriage [kg]
+_STIFFNESS = 3000.0  # of a servo [N/m]: 1 N moves it by 0.3 mm
+_DAMPING = 2 * np.sqrt(_STIFFNESS * _MASS)  # critical
+_YAW_INERTIA, _YAW_STIFFNESS = 1e-4, 20.0  # [kg m^2], [N m/rad]
+_LARGEST_FORCE = 12.0  # of a servo [N]: past it the finger gives way
+_PAD = 8.2e-3  # from the BioTac's axis to its pad [m]
+_GREY = (0.55, 0.58, 0.62, 1.0)
+
+
+def _quaternion(columns):
+    """(w, x, y, z) of the rotation whose columns are the BioTac's axes in the parent frame."""
+    out = np.empty(4)
+    mujoco.mju_mat2Quat(out, np.asarray(columns, float).T.ravel())
+    return out
+
+
+class _Machine(composer.Entity):
+    """Sliding (and turning) carriages driven by servos that integrate a commanded velocity.
+
+    A command lies in [-1, 1] for each axis; `speed` is what 1 means.
+    """
+
+    def _start(self, name):
+        self._root = mjcf.RootElement(model=name)
+        self._root.compiler.angle = "radian"
+        self._joints, self._actuators, self._speed = [], [], []
+
+    def _axis(self, body, name, direction, limits, speed, hinge=False):
+        stiffness = _YAW_STIFFNESS if hinge else _STIFFNESS
+        inertia = _YAW_INERTIA if hinge else _MASS
+        joint = body.add("joint", name=name, type="hinge" if hinge else "slide", axis=direction, range=limits, limited=True)
+        actuator = self._root.actuator.add(
+            "general", name=name, joint=joint, dyntype="integrator", biastype="affine", gainprm=[stiffness],
+            biasprm=[0, -stiffness, -2 * np.sqrt(stiffness * inertia)], ctrllimited=True, ctrlrange=[-speed, speed], actlimited=True,
+            actrange=limits, forcelimited=True, forcerange=[-_LARGEST_FORCE, _LARGEST_FORCE],
+        )  # fmt: skip
+        self._joints.append(joint)
+        self._actuators.append(actuator)
+        self._speed.append(speed)
+
+    def _carriage(self, parent, name, pos=(0, 0, 0), inertia=_YAW_INERTIA):
+        body = parent.add("body", name=name, pos=pos, gravcomp=1)
+        body.add("inertial", pos=[0, 0, 0], mass=_MASS, diaginertia=[inertia] * 3)
+        return body
+
+    @property
+    def mjcf_model(self):
+        return self._root
+
+    @property
+    def joints(self):
+        return self._joints
+
+    @property
+    def actuators(self):
+        return self._actuators
+
+    @property
+    def axes(self):
+        """Names of what a command moves."""
+        return [a.name for a in self._actuators]
+
+    @property
+    def speed(self):
+        """(naxis,) what a command of 1 means [m/s], [rad/s]."""
+        return np.array(self._speed[: len(self.axes)])
+
+    def command(self, physics, action):
+        """Sets the velocities of the axes: action (naxis,) in [-1, 1]."""
+        physics.bind(self._actuators).ctrl = np.clip(action, -1, 1) * np.array(self._speed)
+
+    def place(self, physics, position):
+        """Puts the axes at position (naxis,) [m], [rad], at rest, and the servos with them."""
+        physics.bind(self._joints).qpos = position
+        physics.bind(self._joints).qvel = 0.0
+        physics.bind(self._actuators).act = position
+
+    def position(self, physics):
+        """(naxis,) [m], [rad]."""
+        return np.array(physics.bind(self._joints).qpos)
+
+
+class Gantry(_Machine):
+    """Carries one BioTac, pad down: axes x, y, z and, if asked, yaw about the vertical through the BioTac's origin.
+
+    At rest the BioTac's axes are x along the world's x (tip at -x), y up, z along -y of the world.
+    """
+
+    def _build(self, name="finger", yaw=False):
+        self._start(name)
+        body = self._root.worldbody
+        for axis, direction in (("x", [1, 0, 0]), ("y", [0, 1, 0])):
+            body = self._carriage(body, f"carriage_{axis}")
+            self._axis(body, axis, direction, [-0.06, 0.06], 0.03)
+        body = self._carriage(body, "carriage_z")
+        self._axis(body, "z", [0, 0, 1], [-0.03, 0.05], 0.03)
+        if yaw:
+            body = self._carriage(body, "wrist")
+            self._axis(body, "yaw", [0, 0, 1], [-1.6, 1.6], 1.0, hinge=True)
+        body.add(
+            "geom", name="arm", type="capsule", fromto=[0.014, 0, 0, 0.014, 0, 0.05], size=[0.005], rgba=_GREY, contype=0, conaffinity=0
+        )
+        body.add(
+            "geom", name="holder", type="capsule", fromto=[0.008, 0, 0, 0.014, 0, 0], size=[0.005], rgba=_GREY, contype=0, conaffinity=0
+        )
+        self.mount = body.add("site", name="mount", quat=_quaternion([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
+
+
+class Gripper(_Machine):
+    """Two facing BioTacs, tips down: lift raises both, grip moves each towards the other, until at 0 the pads would just meet."""
+
+    def _build(self, name="gripper", lift=True):
+        self._start(name)
+        body = self._carriage(self._root.worldbody, "carriage")
+        if lift:
+            self._axis(body, "lift", [0, 0, 1], [-0.02, 0.08], 0.03)
+        body.add("geom", name="beam", type="capsule", fromto=[0, -0.03, 0.055, 0, 0.03, 0.055], size=[0.005], rgba=_GREY, contype=0, conaffinity=0)  # fmt: skip
+        self.mounts = []
+        for side, name in ((1, "left"), (-1, "right")):
+            finger = self._carriage(body, name, pos=[0, side * _PAD, 0])
+            self._axis(finger, name, [0, -side, 0], [-0.05, 0.002], 0.02)
+            finger.add("geom", type="capsule", fromto=[0, 0, 0.012, 0, 0, 0.052], size=[0.005], rgba=_GREY, contype=0, conaffinity=0)
+            self.mounts.append(finger.add("site", name=f"mount_{name}", quat=_quaternion([[0, 0, 1], [0, side, 0], [-side, 0, 0]])))
+
+    @property
+    def axes(self):
+        return ["lift", "grip"] if len(self._actuators) == 3 else ["grip"]
+
+    def command(self, physics, action):
+        """action: (lift, grip) or (grip,) in [-1, 1]; a grip of 1 closes."""
+        super().command(physics, np.append(action, action[-1]))

@@ -1,0 +1,210 @@
+"""Controllers that solve the tasks from touch, the machine's own position and the told target; and one that acts at random.
+
+A controller never sees the simulation's hidden state. What it believes about force, place and load comes from `touch.Estimator`, a regression
+calibrated on other episodes (`calibrate`), or, in the calibration itself, from the truth handed to `act`.
+"""
+
+import numpy as np
+
+from ..data.objects import OBJECTS
+from .touch import Touch, load_calibration, load_estimator
+
+__all__ = ["SCRIPTED", "Random", "make_controller"]
+
+_FRICTION = 0.783414394  # of the skin; what the gripper knows about friction
+
+
+class Scripted:
+    """Reads touch, estimates, acts. `act(observation, truth)` takes (nbiotac, nestimated) true values in place of the estimates."""
+
+    task: str
+    estimator = None
+
+    def reset(self):
+        """Before an episode."""
+        self.touch, self.frame = Touch(), 0
+
+    def act(self, observation, truth=None) -> np.ndarray:
+        """The action for an observation."""
+        self.felt = self.touch.update(observation)
+        self.frame += 1
+        if truth is None:
+            if self.estimator is None:
+                self.estimator = load_estimator(self.task)
+            truth = self.estimator(self.felt)
+        touching = float(np.abs(self.felt).max()) > 0.6
+        return np.clip(self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1)
+
+    def wait(self, observation):
+        return np.zeros(3)
+
+    def control(self, observation, estimate, touching):
+        raise NotImplementedError
+
+
+class Press(Scripted):
+    """Goes down until it touches, then moves in proportion to the error of the force."""
+
+    task = "press"
+
+    def control(self, observation, estimate, touching):
+        error = estimate[0, 0] - observation["target"][0]
+        return np.array([0, 0, 0.25 * error if touching else -0.4])
+
+
+class FollowEdge(Scripted):
+    """Keeps the force, steers the pad onto the rim, turns with it, and goes tip first."""
+
+    task = "follow_edge"
+
+    def wait(self, observation):
+        return np.zeros(4)
+
+    def control(self, observation, estimate, touching):
+        offset, turn, force = estimate[0]
+        if not touching:
+            return np.array([0, 0, -0.4, 0])
+        yaw = observation["position"][3]
+        along, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        velocity = np.clip(6.0 * offset, -8e-3, 8e-3) * left - 9e-3 * (abs(offset) < 1.5e-3) * along
+        return np.array([*(velocity / 0.03), np.clip(0.2 * (force - 0.8), -0.2, 0.2), np.clip(-4.0 * turn, -0.8, 0.8)])
+
+
+class RollBall(Scripted):
+    """Presses lightly and moves the finger twice as fast as the ball should go."""
+
+    task = "roll_ball"
+
+    def control(self, observation, estimate, touching):
+        ball, force = observation["position"][:2] + estimate[0, :2], estimate[0, 2]
+        if not touching:
+            return np.array([0, 0, -0.3])
+        velocity = np.clip(6.0 * (observation["target"] - ball), -0.015, 0.015) if force > 0.1 else np.zeros(2)
+        return np.array([*(velocity / 0.03), np.clip(0.3 * (force - 0.4), -0.2, 0.2)])
+
+
+class Explore(Scripted):
+    """Presses at five places to one depth below the first touch, then names the object whose presses felt most alike."""
+
+    task = "explore"
+    places = 1e-3 * np.array([[0, 0], [3, 0], [-3, 0], [0, 3], [0, -3]])
+    depth, clear = 0.9e-3, 0.7e-3
+    settle = 4  # frames at depth before the reading
+
+    def reset(self):
+        super().reset()
+        self.stage, self.first, self.count, self.felt_at = "search", None, 0, []
+        self.belief = np.zeros(len(OBJECTS))
+
+    def act(self, observation, truth=None):
+        self.felt = self.touch.update(observation)
+        self.frame += 1
+        motion = self._move(observation["position"]) if self.touch.tared else np.zeros(3)
+        return np.concatenate([np.clip(motion, -1, 1), self.belief])
+
+    def _to(self, position, goal):
+        """Velocity towards a goal [m], and whether it is there."""
+        error = np.asarray(goal) - position
+        return np.clip(25.0 * error / 0.03, -1, 1), np.abs(error).max() < 1.5e-4
+
+    def _move(self, position):
+        if self.stage == "search":
+            if np.abs(self.felt).max() > 0.6:
+                self.first, self.stage = position[2], "press"
+            return np.array([0, 0, -0.3])
+        if self.stage == "done":
+            return self._to(position, [0, 0, self.first + 2e-3])[0]
+        place = self.places[len(self.felt_at)]
+        if self.stage in ("press", "hold"):
+            motion, there = self._to(position, [*place, self.first - self.depth])
+            self.count = self.count + 1 if there else 0
+            if self.count >= self.settle:
+                self.felt_at.append(self.felt[0])
+                self.count, self.stage = 0, "lift"
+                if len(self.felt_at) == len(self.places):
+                    self.stage = "done"
+                    self.decide()
+            return motion
+        if self.stage == "lift":
+            motion, there = self._to(position, [*position[:2], self.first + self.clear])
+            self.stage = "shift" if there else "lift"
+            return motion
+        motion, there = self._to(position, [*place, self.first + self.clear])
+        self.stage = "press" if there else "shift"
+        return motion
+
+    def decide(self):
+        """Linear discriminant analysis of the presses."""
+        stored = load_calibration()
+        score = np.ravel(self.felt_at) @ stored["explore/weight"] + stored["explore/bias"]
+        self.belief[:] = -1
+        self.belief[np.argmax(score)] = 1
+
+
+class Hold(Scripted):
+    """Grips as hard as the load that it feels needs, with a margin; where the load nears the friction limit, which is slip, it closes fast."""
+
+    task = "hold"
+    least = 0.35  # [N] before there is a load
+
+    def wait(self, observation):
+        return np.zeros(1)
+
+    def control(self, observation, estimate, touching):
+        return np.array([self.grip(estimate, touching)])
+
+    def grip(self, estimate, touching):
+        if not touching:
+            return 0.4
+        grip, load = estimate[:, 0].mean(), max(0.0, estimate[:, 1].sum())
+        needed = load / (2 * _FRICTION)
+        self.slipping = needed > 0.85 * max(grip, 0.1)
+        return np.clip(0.7 * (max(self.least, 1.3 * needed + 0.15) - grip), -0.15, 1.0) + 0.3 * self.slipping
+
+
+class Lift(Hold):
+    """As `Hold`; raises when it has gripped, slowly while the load grows."""
+
+    task = "lift"
+    goal = 0.0315  # [m] of the gripper
+
+    def wait(self, observation):
+        return np.zeros(2)
+
+    def reset(self):
+        super().reset()
+        self.ready = self.slipping = False
+
+    def control(self, observation, estimate, touching):
+        grip = self.grip(estimate, touching)
+        self.ready = self.ready or (touching and estimate[:, 0].mean() > 0.9 * self.least)
+        height = observation["position"][0]
+        speed = 0.15 if height < 1.5e-3 else 0.9
+        return np.array([min(speed * (not self.slipping), 20 * (self.goal - height) / 0.03) if self.ready else 0.0, grip])
+
+
+class Random:
+    """Uniform in the action's bounds."""
+
+    def __init__(self, spec, seed=0):
+        self.spec, self.rng = spec, np.random.RandomState(seed)
+
+    def reset(self):
+        """Nothing to forget."""
+
+    def act(self, observation):
+        return self.rng.uniform(self.spec.minimum, self.spec.maximum)
+
+
+SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}
+
+
+def make_controller(task) -> Scripted:
+    """The scripted controller of a task.
+
+    Raises:
+      ValueError: there is none.
+    """
+    if task not in SCRIPTED:
+        raise ValueError(f"no scripted controller for task {task!r}: there are {', '.join(SCRIPTED)}")
+    return SCRIPTED[task]()

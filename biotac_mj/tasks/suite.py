@@ -1,0 +1,57 @@
+"""`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
+
+import importlib
+
+__all__ = ["DOMAINS", "environment", "load", "tasks"]
+
+DOMAINS = ("finger", "gripper")
+
+
+def environment(task, environment_kwargs=None, random=None, time_limit=None, **settings):
+    """A composer.Environment of a TouchTask class.
+
+    Args:
+      task: the class; settings: its arguments.
+      random: seed or RandomState of episodes and noise.
+      time_limit: length of an episode [s]; None takes the task's.
+      environment_kwargs: further arguments of `composer.Environment`.
+    """
+    import warp
+    from dm_control import composer
+
+    warp.config.log_level = warp.LOG_WARNING
+    made = task(**settings)
+    # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the forces that act in it
+    options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
+    return composer.Environment(
+        made, time_limit=made.seconds if time_limit is None else time_limit, random_state=random, **options | (environment_kwargs or {})
+    )
+
+
+def _domain(name):
+    if name not in DOMAINS:
+        raise ValueError(f"no domain {name!r}: choose one of {', '.join(DOMAINS)}")
+    return importlib.import_module(f".{name}", __package__)
+
+
+def tasks() -> list[tuple[str, str]]:
+    """All (domain, task) pairs."""
+    return [(domain, task) for domain in DOMAINS for task in _domain(domain).SUITE]
+
+
+def load(domain_name, task_name, task_kwargs=None, environment_kwargs=None):
+    """An environment: `load("finger", "press", task_kwargs={"random": 0})`.
+
+    Args:
+      domain_name, task_name: see `tasks()`, docs/tasks.md.
+      task_kwargs: random (seed), time_limit [s], observe ("tactile", "privileged", "none"), physics_timestep [s],
+        biotac (dict, settings of `BioTac`).
+      environment_kwargs: further arguments of `composer.Environment`.
+
+    Raises:
+      ValueError: no such domain or task.
+    """
+    suite = _domain(domain_name).SUITE
+    if task_name not in suite:
+        raise ValueError(f"domain {domain_name!r} has no task {task_name!r}: choose one of {', '.join(suite)}")
+    return suite[task_name](environment_kwargs=environment_kwargs, **(task_kwargs or {}))

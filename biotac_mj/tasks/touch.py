@@ -1,0 +1,118 @@
+"""From touch to what a controller wants to know: tared readings, and a regression of hidden quantities on them."""
+
+import dataclasses
+import functools
+import importlib.resources
+
+import numpy as np
+
+from ..sensor.channels import FULL_SCALE
+
+__all__ = ["Estimator", "Touch", "load_calibration"]
+
+_TARE = 5  # frames averaged before anything is touched
+_PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # make features of order one
+_SMOOTHING = 0.5  # share of the newest frame
+
+
+class Touch:
+    """Readings of all BioTacs of a task, from its observations: tared over the first frames, smoothed.
+
+    Attributes:
+      tared: whether the tare is complete.
+    """
+
+    def __init__(self):
+        self._frames, self._rest, self._value = [], None, None
+
+    @property
+    def tared(self):
+        return self._rest is not None
+
+    def update(self, observation) -> np.ndarray:
+        """(nbiotac, 20) changes from rest: of ln Z of the electrodes in tenths, of PDC in hundreds of counts.
+
+        Raises:
+          ValueError: the observation has no electrodes.
+        """
+        names = sorted(name.removesuffix("electrodes") for name in observation if name.endswith("/electrodes"))
+        if not names:
+            raise ValueError("no electrodes in the observation: load the task with observe='tactile'")
+        counts = np.stack([observation[n + "electrodes"] for n in names])
+        raw = np.concatenate([np.log(FULL_SCALE / np.clip(counts, 1, FULL_SCALE - 1) - 1) / _LOG_SCALE,
+                              np.stack([observation[n + "pdc"] for n in names]) / _PDC_SCALE], axis=1)  # fmt: skip
+        if not self.tared:
+            self._frames.append(raw)
+            self._value = np.zeros_like(raw)
+            if len(self._frames) == _TARE:
+                self._rest = np.mean(self._frames, axis=0)
+            return self._value.copy()
+        self._value = self._value + _SMOOTHING * (raw - self._rest - self._value)
+        return self._value.copy()
+
+
+def _features(touch):
+    """(n, 1 + 20 + 210): constant, linear and quadratic terms of (n, 20)."""
+    i, j = np.triu_indices(touch.shape[1])
+    return np.concatenate([np.ones((len(touch), 1)), touch, touch[:, i] * touch[:, j]], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimator:
+    """Ridge regression of hidden quantities on quadratic features of one BioTac's touch.
+
+    Attributes:
+      scale: (231,) of the features; weight: (231, nestimated); error: (nestimated,) RMS on episodes that were held out.
+    """
+
+    scale: np.ndarray
+    weight: np.ndarray
+    error: np.ndarray
+
+    def __call__(self, touch) -> np.ndarray:
+        """(nbiotac, nestimated) of (nbiotac, 20)."""
+        return (_features(touch) / self.scale) @ self.weight
+
+    @classmethod
+    def fit(cls, touch, hidden, episode, ridges=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)):
+        """From samples touch (n, 20), hidden (n, k) of episodes (n,); the ridge that predicts every fourth episode best is taken.
+
+        Raises:
+          ValueError: fewer than four episodes.
+        """
+        if len(np.unique(episode)) < 4:
+            raise ValueError(f"{len(np.unique(episode))} episodes: a fit needs four, one of them to test it")
+        feature = _features(touch)
+        scale = np.sqrt((feature**2).mean(0)) + 1e-9
+        spread = hidden.std(0) + 1e-12
+        held = np.isin(episode, np.unique(episode)[::4])
+
+        def solve(rows, ridge):
+            a = feature[rows] / scale
+            return np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ hidden[rows])
+
+        def error(weight):
+            return np.sqrt((((feature[held] / scale) @ weight - hidden[held]) ** 2).mean(0))
+
+        errors = [error(solve(~held, ridge)) for ridge in ridges]
+        best = int(np.argmin([(e / spread).sum() for e in errors]))
+        return cls(scale, solve(np.ones(len(held), bool), ridges[best]), errors[best])
+
+
+@functools.cache
+def load_calibration() -> dict:
+    """Arrays of `biotac_mj/tasks/calibration.npz`, made by `python -m biotac_mj.tasks.calibrate`."""
+    with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as path, np.load(path) as file:
+        return {name: file[name] for name in file.files}
+
+
+def load_estimator(task) -> Estimator:
+    """The calibrated estimator of a task.
+
+    Raises:
+      ValueError: the task has none.
+    """
+    stored = load_calibration()
+    if f"{task}/weight" not in stored:
+        raise ValueError(f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --tasks {task}`")
+    return Estimator(*(stored[f"{task}/{part}"] for part in ("scale", "weight", "error")))
