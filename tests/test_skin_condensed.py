@@ -20,6 +20,7 @@ from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_step, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
+from biotac_mj.skin.contact import face_samples
 from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
 
 RADIUS = 3.5e-3
@@ -166,13 +167,14 @@ def test_friction_stays_in_its_cone(coarse):
 
     def loads(out):
         """Normal and tangential force of every touching sample [N]."""
-        force = skin._force[np.flatnonzero(skin._geom[: 9 * skin._count[0], 0] >= 0), 0]
-        number, point = out.memory.contacts[:, 0].astype(int), skin._sample
+        force = skin.faces.sample_forces()
+        number, point = out.memory.contacts[:, 0].astype(int), face_samples(3)
         face = coarse.geometry.outer_face[number // len(point)]
         place = np.einsum("kc,kci->ki", point[number % len(point)], skin._x[face, 0])
         outward = place - out.memory.geom_pos[0]
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        assert np.allclose(-force.sum(0), out.wrench[0, :3])
+        # the wrench is that of the balanced forces, which differ from the stiff contact law's by what Newton's method left
+        assert np.allclose(-force.sum(0), out.wrench[0, :3], atol=5e-3 * np.linalg.norm(out.wrench[0, :3]))
         normal = np.einsum("ij,ij->i", force, outward)
         return normal, np.linalg.norm(force - normal[:, None] * outward, axis=1)
 

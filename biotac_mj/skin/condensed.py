@@ -16,25 +16,28 @@ import numpy as np
 import warp as wp
 from scipy.linalg.blas import saxpy
 
-from . import contact, liquid
+from . import liquid
+from .condensed_faces import CandidateFaces
 from .condensed_step import Memory, Outcome, Step
 from .contact import Geoms
 from .core_contact import CoreContact
 from .geoms import GeomSet
 from .shapes import distance_bound
 from .surface_compliance import SurfaceCompliance
-from .types import mat33, real, vec3
+from .types import real, vec3
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
 wp.set_module_options({"enable_backward": False})
 
+_NONE = np.zeros(0, int)
 _REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
 
 
 @wp.kernel
 def _near(
     # In:
+    count: wp.array(dtype=int),
     number: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
     sample: wp.array(dtype=vec3),
@@ -44,62 +47,52 @@ def _near(
     # Out:
     near_out: wp.array(dtype=int),
 ):
-    """Faces with a sample that is nearer to a geom than the reach."""
-    i = wp.tid()
-    t = face[number[i]]
-    x0 = x[t[0], 0]
-    x1 = x[t[1], 0]
-    x2 = x[t[2], 0]
-    center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
-    near = int(0)
-    for g in range(geoms.count):
-        R = wp.transpose(geoms.mat[g, 0])
-        y = R * (center - geoms.pos[g, 0])
-        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < radius + reach[0]:
-            for s in range(sample.shape[0]):
-                b = sample[s]
-                y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
-                if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < reach[0]:
-                    near = 1
-    near_out[i] = near
+    """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach; count[1] of them."""
+    found = int(0)
+    for i in range(count[0]):
+        f = number[i]
+        t = face[f]
+        x0 = x[t[0], 0]
+        x1 = x[t[1], 0]
+        x2 = x[t[2], 0]
+        center = (x0 + x1 + x2) / real(3.0)
+        radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+        near = int(0)
+        for g in range(geoms.count):
+            if near == 0:
+                R = wp.transpose(geoms.mat[g, 0])
+                y = R * (center - geoms.pos[g, 0])
+                bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                if bound < radius + reach[0]:
+                    for s in range(sample.shape[0]):
+                        if near == 0:
+                            b = sample[s]
+                            y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
+                            bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                            if bound < reach[0]:
+                                near = 1
+        if near == 1:
+            near_out[found] = f
+            found += 1
+    count[1] = found
 
 
 @wp.kernel
-def _assemble(
+def _core_clearance(
     # In:
-    count: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
-    slot: wp.array(dtype=int),
-    touching: wp.array2d(dtype=int),
-    corner: wp.array2d(dtype=vec3),
-    block: wp.array2d(dtype=mat33),
+    core_vert: wp.array(dtype=vec3),
+    geoms: Geoms,
     # Out:
-    force_out: wp.array(dtype=real),
-    stiffness_out: wp.array(dtype=real),
+    clearance_out: wp.array(dtype=real),
 ):
-    """Nodal forces and stiffness (count[1], count[1]) of the first count[0] faces; one thread, so that the order of sums is fixed."""
-    n = count[1]
-    for i in range(n):
-        force_out[i] = real(0.0)
-    for i in range(n * n):
-        stiffness_out[i] = real(0.0)
-    for f in range(count[0]):
-        if touching[f, 0] == 1:
-            t = face[f]
-            for a in range(3):
-                i = 3 * slot[t[a]]
-                if i >= 0:
-                    for k in range(3):
-                        force_out[i + k] += corner[3 * f + a, 0][k]
-                    for b in range(3):
-                        j = 3 * slot[t[b]]
-                        if j >= 0:
-                            low = wp.min(a, b)
-                            K = block[6 * f + low * (5 - low) // 2 + wp.max(a, b), 0]
-                            for k in range(3):
-                                for l in range(3):
-                                    stiffness_out[(i + k) * n + j + l] += K[k, l]
+    """Distance of each geom to the nearest vertex of the core, negative where it is inside the geom."""
+    g = wp.tid()
+    least = real(1.0)
+    R = wp.transpose(geoms.mat[g, 0])
+    for i in range(core_vert.shape[0]):
+        y = R * (core_vert[i] - geoms.pos[g, 0])
+        least = wp.min(least, distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y))
+    clearance_out[g] = least
 
 
 def _key(memory):
@@ -138,76 +131,52 @@ class CondensedSkin:
         self._number = np.full(model.nvert, -1)
         self._number[self._outer] = np.arange(len(self._outer))
         self._rest = g.vert.astype(float)
-        self._sample = contact.face_samples(model.options.samples)
-        self._allocate(64, 300)
+        self._prepare_search()
+        self.faces = CandidateFaces(model, geoms, self._x_wp, self._last_wp, self._slot_wp)
         self._core = CoreContact(model, self._x_wp, self._x) if model.has_core else None
         if self._core and geoms.count:
-            depth = wp.zeros((geoms.count, 1), dtype=real, device="cpu")
-            self._depth = depth.numpy()
-            self._depths = self._record(contact.depth_in_core, (geoms.count, 1), [model.core_vert, geoms.struct], [depth])
+            clearance = wp.zeros(geoms.count, dtype=real, device="cpu")
+            self._clearance = clearance.numpy()
+            self._clearances = self._record(_core_clearance, [model.core_vert, geoms.struct], [clearance], geoms.count)
         self._inner = self._core.node if self._core else np.zeros(0, int)
         self._away = self._core.direction if self._core else np.zeros((0, 3))
         self.compliance = SurfaceCompliance(model, self._outer, self._inner, self._away, cache)
         self._prepare_liquid()
-        self._systems, self._fields = {}, {}
+        self._systems, self._fields, self._last_system = {}, {}, None
+        self._away32 = self._away.astype(np.float32)
 
     # --- preparation -------------------------------------------------------------------------------------------------------------
 
-    def _allocate(self, nface, ndof):
-        """Buffers for nface candidate faces and ndof contact coordinates of outer nodes, and the kernels' launches on them."""
-        m, nsample = self.model, len(self.model.sample)
-        self._capacity = nface, ndof
+    def _prepare_search(self):
+        m = self.model
 
         def zeros(shape, dtype):
             array = wp.zeros(shape, dtype=dtype, device="cpu")
             return array, array.numpy()
 
-        if not hasattr(self, "_x"):
-            self._x_wp, self._x = zeros((m.nvert, 1), vec3)
-            self._last_wp, self._last = zeros((m.nvert, 1), vec3)
-            self._slot_wp, self._slot = zeros(m.nvert, int)
-            near, self._near = zeros(len(self._face), int)
-            number, self._asked = zeros(len(self._face), int)
-            self._reach_wp, self._reach = zeros(1, real)
-            self._x[:, 0] = self._last[:, 0] = self._rest
-            self._detect = self._record(
-                _near, len(self._face), [number, m.outer.face, m.sample, self.geoms.struct, self._x_wp, self._reach_wp], [near]
-            )
-            self._region = None
-        self._count_wp, self._count = zeros(2, int)
-        face, self._cface = zeros(nface, wp.vec3i)
-        area, self._carea = zeros(nface, real)
-        anchor_geom, self._anchor_geom = zeros((nface * nsample, 1), int)
-        anchor, self._anchor = zeros((nface * nsample, 1), vec3)
-        corner = zeros((3 * nface, 1), vec3)[0]
-        block = zeros((6 * nface, 1), mat33)[0]
-        touching, self._touching = zeros((nface, 1), int)
-        geom, self._geom = zeros((nface * nsample, 1), int)
-        trial, self._trial = zeros((nface * nsample, 1), vec3)
-        force, self._force = zeros((nface * nsample, 1), vec3)
-        nodal, self._nodal = zeros(ndof, real)
-        stiffness, self._stiffness = zeros(ndof * ndof, real)
-        o = m.options
-        self._contact = self._record(
-            contact.contact_force, (nface, 1),
-            [face, area, m.sample, m.contact_stiffness, o.stick_ratio, self.geoms.struct, self._x_wp, self._last_wp, anchor_geom, anchor],
-            [corner, block, touching, geom, trial, force],
-        )  # fmt: skip
-        self._gather = self._record(_assemble, 1, [self._count_wp, face, self._slot_wp, touching, corner, block], [nodal, stiffness])
+        self._x_wp, self._x = zeros((m.nvert, 1), vec3)
+        self._last_wp, self._last = zeros((m.nvert, 1), vec3)
+        self._slot_wp, self.slot = zeros(m.nvert, int)
+        near, self._near = zeros(len(self._face), int)
+        number, self._asked = zeros(len(self._face), int)
+        count, self._count = zeros(2, int)
+        reach, self._reach = zeros(1, real)
+        self._x[:, 0] = self._last[:, 0] = self._rest
+        self._detect = self._record(_near, [count, number, m.outer.face, m.sample, self.geoms.struct, self._x_wp, reach], [near])
+        self._region = None
 
-    def _record(self, kernel, dim, inputs, outputs):
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+    def _record(self, kernel, inputs, outputs, dim=1):
+        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
 
     def _prepare_liquid(self):
         m = self.model
         self._gradient = np.zeros((m.nvert, 3))
         self._give = np.zeros(self.compliance.size)
         if m.inner is None:
-            self._linear_volume = 0.0
             return
         share = wp.zeros((len(m.inner.face), 1), dtype=real, device="cpu")
         self._share = share.numpy()
-        self._volume = self._record(liquid.cavity_volume, share.shape, [m.inner.face, self._x_wp], [share])
+        self._volume = self._record(liquid.cavity_volume, [m.inner.face, self._x_wp], [share], share.shape)
         if not m.has_liquid:
             return
         corner = wp.zeros((3 * len(m.inner.face), 1), dtype=vec3, device="cpu")
@@ -222,7 +191,7 @@ class CondensedSkin:
 
     def _measure_volume(self):
         if self.model.inner is not None:
-            self._volume.launch()
+            self._volume()
 
     # --- a step ------------------------------------------------------------------------------------------------------------------
 
@@ -241,9 +210,9 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         if not len(memory.force):  # at rest: what no sample touches changes nothing
             self._x[:, 0] = self._rest
-            if not len(self._faces_near(0.0, geom_pos, geom_mat, 0.0)):
+            if not len(self.faces_near(0.0, 0.0, (geom_pos, geom_mat))):
                 return self._at_rest(geom_pos, geom_mat, geom_pos - last[0])
-        self._refuse_core()
+        self._refuse_core(self._travel(geom_pos, geom_mat))
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self._rest + u
         step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
@@ -261,49 +230,59 @@ class CondensedSkin:
         n = self.geoms.ngroup
         return Outcome(memory, np.zeros((n, 6)), np.zeros((n, 6, 6)), self._rest.copy(), self.model.liquid_volume, True, 0, 0.0)
 
-    def _refuse_core(self):
-        limit = self.model.options.max_core_depth
+    def _refuse_core(self, travel):
+        """Raises ValueError for a geom deep inside the core; `travel` is how far geoms have moved since the region was chosen."""
         if self._core is None or not self.geoms.count:
             return
-        self._depths.launch()
-        if self._depth.max() > limit:
-            g = int(self._depth.argmax())
+        # a bound may change a little faster than the geom moves: grids are trilinear
+        if self._region is not None and self._region[-1] is not None and self._region[-1] - 2 * travel > -self.model.options.max_core_depth:
+            return
+        self._clearances()
+        if -self._clearance.min() > self.model.options.max_core_depth:
+            g = int(self._clearance.argmin())
             raise ValueError(
-                f"geom {g} ({self.geoms.types[g]}) is {self._depth.max() * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
+                f"geom {g} ({self.geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
                 "move it out, press less deep or take smaller steps"
             )
 
-    def _faces_near(self, reach, pos, mat, moved):
+    def _travel(self, pos, mat):
+        """How far points of geoms near the skin may have moved since the region around them was chosen [m]."""
+        if self._region is None:
+            return math.inf
+        _, pos0, mat0, lever, *_ = self._region
+        dp, dm = pos - pos0, (mat - mat0).reshape(-1, 9)
+        turned = np.sqrt(np.einsum("ij,ij->i", dm, dm)) * lever
+        return float((turned + np.sqrt(np.einsum("ij,ij->i", dp, dp))).max())
+
+    def faces_near(self, reach, moved, pose):
         """Faces with a sample nearer to a geom than the reach; `moved` bounds how far the nodes are from rest.
 
         Only a region around the geoms is searched, wider than what they and the skin can have moved since it was chosen.
         """
         if not self.geoms.count:
-            return np.zeros(0, int)
-        slack = moved + reach
-        if self._region is not None:
-            _, pos0, mat0, width = self._region
-            turned = np.sqrt(((mat - mat0) ** 2).sum((1, 2))) * (np.sqrt((pos0 * pos0).sum(1)) + 0.05)
-            slack += (turned + np.sqrt(((pos - pos0) ** 2).sum(1))).max()
-        if self._region is None or slack > width:
+            return _NONE
+        travel = self._travel(*pose)
+        if self._region is None or moved + reach + travel > self._region[4]:
             self._asked[:] = np.arange(len(self._face))
             here = self._x.copy()
             self._x[:, 0] = self._rest
             width = moved + reach + _REGION
-            self._look(len(self._face), width)
+            faces = self._look(len(self._face), width)
             self._x[:] = here
-            self._region = np.flatnonzero(self._near), np.array(pos), np.array(mat), width
-        faces = self._region[0]
-        if not len(faces):
-            return faces
-        self._asked[: len(faces)] = faces
-        self._look(len(faces), reach)
-        return faces[self._near[: len(faces)] == 1]
+            pos, mat = np.array(pose[0]), np.array(pose[1])
+            clearance = None
+            if self._core:
+                self._clearances()
+                clearance = float(self._clearance.min())
+            self._region = faces, pos, mat, np.sqrt((pos * pos).sum(1)) + 0.05, width, clearance
+            self._asked[: len(faces)] = faces
+        count = len(self._region[0])
+        return self._look(count, reach) if count else self._region[0]
 
     def _look(self, count, reach):
-        self._reach[0] = reach
-        self._detect.set_dim(count)
-        self._detect.launch()
+        self._reach[0], self._count[0] = reach, count
+        self._detect()
+        return self._near[: self._count[1]].astype(np.int64)
 
     def displacement(self, memory: Memory) -> np.ndarray:
         """(nvert, 3) of a memory [m]."""
@@ -329,18 +308,45 @@ class CondensedSkin:
         return out
 
     def _system(self, outer, inner):
-        """Coordinates and compliance (n, n) over candidate outer nodes and inner nodes (numbers in self._inner), times E."""
+        """Coordinates and compliance (n, n) float32 over candidate outer nodes and inner nodes (numbers in self._inner), times E."""
         key = (outer.tobytes(), inner.tobytes())
         if key not in self._systems:
             if len(self._systems) > 64:
                 self._systems.clear()
             c = np.concatenate([(3 * self._number[outer][:, None] + np.arange(3)).ravel(), 3 * len(self._outer) + inner])
-            node = self.compliance.position(np.concatenate([outer, self._inner[inner]]))
-            at = (3 * node[:, None] + np.arange(3)).ravel()
-            part = self.compliance.part(c, at)
-            m = 3 * len(outer)
-            W = np.empty((len(c), len(c)))
-            W[:, :m] = part[:, :m]
-            W[:, m:] = (part[:, m:].reshape(len(c), -1, 3) * self._away[inner]).sum(2)
-            self._systems[key] = c, (W + W.T) / 2
+            self._systems[key] = c, self._restricted(c, outer, inner)
         return self._systems[key]
+
+    def _restricted(self, c, outer, inner):
+        """Compliance over the coordinates c: entries that the last system had are copied, each is the same whenever it is computed."""
+        W = np.empty((len(c), len(c)), np.float32)
+        known, old = np.zeros(len(c), bool), None
+        if self._last_system is not None:
+            last, old = self._last_system
+            place = np.full(self.compliance.count, -1)
+            place[last] = np.arange(len(last))
+            known = place[c] >= 0
+            here = np.flatnonzero(known)
+            if len(here):
+                there = place[c[here]]
+                W[np.ix_(here, here)] = old.take(there, 0).take(there, 1)
+        new = np.flatnonzero(~known)
+        if len(new):
+            rows, columns = self._entries(c[new], c), self._entries(c, c[new])
+            W[new] = (rows + columns.T) / 2  # rows are rounded one by one
+            W[:, new] = W[new].T
+        self._last_system = c, W
+        return W
+
+    def _entries(self, force, motion):
+        """Motion along contact coordinates (k,) per unit force at contact coordinates (n,), times E: (n, k) float32."""
+        first = 3 * len(self._outer)
+        outer, inner = motion < first, motion[motion >= first] - first
+        node = self.compliance.position(self._inner[inner])
+        position = 3 * self.compliance.position(self._outer[motion[outer] // 3]) + motion[outer] % 3
+        at = np.concatenate([position, (3 * node[:, None] + np.arange(3)).ravel()])
+        fresh, m = self.compliance.part(force, at), len(position)
+        out = np.empty((len(force), len(motion)), np.float32)
+        out[:, outer] = fresh[:, :m]
+        out[:, ~outer] = (fresh[:, m:].reshape(len(force), -1, 3) * self._away32[inner]).sum(2)
+        return out

@@ -4,7 +4,8 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.linalg.lapack import dgesv
+
+from .condensed_linear import Compliance, Lumped, Springs, solve
 
 __all__ = ["Memory", "Outcome", "Step"]
 
@@ -87,7 +88,7 @@ class Step:
     def _choose(self):
         """Candidates: faces that are near a geom or the core; whether there are more than before."""
         s = self.skin
-        near = s._faces_near(self.reach, *self.pose, np.sqrt(3) * max(self.u.max(), -self.u.min()))
+        near = s.faces_near(self.reach, np.sqrt(3) * max(self.u.max(), -self.u.min()), self.pose)
         count = len(self.faces) + len(self.inner)
         if len(self.faces):
             chosen = np.zeros(len(s._face), bool)
@@ -106,29 +107,16 @@ class Step:
 
     def _set(self):
         """Hands the candidate faces and their anchors to the kernels."""
-        s, nsample = self.skin, len(self.skin.model.sample)
-        n = len(self.faces)
-        nodes = np.unique(s._face[self.faces])
+        s = self.skin
+        corner = s._face[self.faces]
+        used = np.zeros(len(s._number), bool)
+        used[corner] = True
+        nodes = used.nonzero()[0]
         self.outer = nodes[s._number[nodes] >= 0]
         self.m = 3 * len(self.outer)
-        nface, ndof = s._capacity
-        if n > nface or self.m > ndof:
-            s._allocate(max(nface, 2 * n), max(ndof, 2 * self.m))
-        s._cface[:n], s._carea[:n] = s._face[self.faces], s._area[self.faces]
-        s._count[:] = n, self.m
-        s._slot[nodes] = -1
-        s._slot[self.outer] = np.arange(len(self.outer))
-        s._contact.set_dim((n, 1))
-        self.nsample = n * nsample
-        s._anchor_geom[: self.nsample] = -1
-        contacts = self.memory.contacts
-        if len(contacts):
-            sample = contacts[:, 0].astype(int)
-            place = np.searchsorted(self.faces, sample // nsample)
-            known = place < n
-            known[known] = self.faces[place[known]] == sample[known] // nsample
-            here = place[known] * nsample + sample[known] % nsample
-            s._anchor_geom[here, 0], s._anchor[here, 0] = contacts[known, 1], contacts[known, 2:]
+        s.slot[nodes] = -1
+        s.slot[self.outer] = np.arange(len(self.outer))
+        s.faces.choose(self.faces, corner, s._area[self.faces], len(self.outer), self.memory.contacts)
         self.c, self.rest_W = s._system(self.outer, self.inner)
         self.a = s._give_at[self.c] if s.model.has_liquid else None
 
@@ -137,25 +125,28 @@ class Step:
         s = self.skin
         scale = self.softening / s.model.material.youngs_modulus
         if self.a is None:
-            return scale * self.rest_W, 0.0
+            return Compliance(self.rest_W, scale), 0.0
         m = s.model
-        share = 1 / (m.liquid_volume / m.options.bulk_modulus + scale * s._liquid_give)
-        a = scale * self.a
-        self.share, self.along = share, a
-        return scale * self.rest_W - np.outer(share * a, a), -share * self.bulge * a
+        self.share = 1 / (m.liquid_volume / m.options.bulk_modulus + scale * s._liquid_give)
+        self.along = scale * self.a
+        return Compliance(self.rest_W, scale, self.share, self.along), -self.share * self.bulge * self.along
 
     def _evaluate(self, u):
-        """Contact forces at displacements u (n,) of the contact coordinates and their stiffness blocks."""
+        """Contact forces (n,) at displacements u (n,) of the contact coordinates."""
         s, m = self.skin, self.m
         f = np.zeros(len(u))
+        self.closed = None
         if m:
             s._x[self.outer, 0] = s._rest[self.outer] + u[:m].reshape(-1, 3)
-            s._contact.launch()
-            s._gather.launch()
-            f[:m] = s._nodal[:m]
+            s.faces.evaluate()
+            f[:m] = s.faces.force.ravel()
         if len(self.inner):
             f[m:], self.closed = self.meeting.force(u[m:])
         return f
+
+    def _springs(self):
+        """Stiffness of what touches at the last evaluation."""
+        return Springs(self.skin.faces, self.closed, len(self.inner))
 
     def _soften(self):
         """s of the nodes that touched and their displacements."""
@@ -170,7 +161,7 @@ class Step:
         """Newton's method, repeated until the cavity's exact volume agrees."""
         s = self.skin
         if not len(self.faces) and not len(self.force):
-            self.outer, self.nsample = self.faces, 0
+            self.outer = self.faces
             self.pressure = self.bulge = 0.0
             s._measure_volume()
             return
@@ -179,7 +170,7 @@ class Step:
         if self.force is self.memory.force:
             f += self.repeat * self._at_candidates(self.memory.change)
         for number in range(_PASSES):
-            f = self._newton(f)
+            f = self.last = self._newton(f)
             if not f.any():  # nothing touches any more
                 self.bulge = 0.0
             order = np.argsort(self.c)
@@ -213,45 +204,23 @@ class Step:
         s._x[:, 0] = s._rest + u
 
     def _newton(self, f):
+        """Balanced forces, from forces f."""
         self.W, shift = self._scaled()
-        W = self.W
-        u = W @ f + shift
+        u = self.W @ f + shift
         g = self._evaluate(u)
-        self.converged = False
+        self.converged, self.lumped = False, None
         for _ in range(_MAX_NEWTON):
             r = g - f
-            self.error = math.sqrt(max(r @ (W @ r), 0.0) / (abs(g @ u) + 1e-14))
+            df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped)
+            slope = float(r @ du)
+            self.error = math.sqrt(max(slope, 0.0) / (abs(float((f + df) @ (u + du))) + 1e-14))
             if self.error < _TOLERANCE:
                 self.converged = True
-                return g
+                self._evaluate(u + du)  # the contacts of the balanced skin
+                return f + df
             self.iterations += 1
-            df = r.copy()
-            D, on = self._springs()
-            if len(on):  # (1 + D W) df = r, of which only the rows of closed contacts are coupled
-                df[on] = 0
-                Won = W[on]
-                matrix = D @ Won[:, on]
-                matrix.ravel()[:: len(on) + 1] += 1
-                df[on] = dgesv(matrix, r[on] - D @ (Won @ df), overwrite_a=1)[2]
-            du = W @ df
-            f, u, g = self._search(f, u, df, du, float(r @ du))
-        return g
-
-    def _springs(self):
-        """Stiffness of the closed contacts, and the contact coordinates that it couples."""
-        s, m = self.skin, self.m
-        K = s._stiffness[: m * m].reshape(m, m)
-        sliding = np.flatnonzero(K.diagonal())
-        n = len(sliding)
-        if not len(self.inner) or not len(self.closed[1]):
-            return K[np.ix_(sliding, sliding)], sliding
-        B, k = self.closed
-        core = (B.T * k) @ B
-        pressed = np.flatnonzero(core.diagonal())
-        D = np.zeros((n + len(pressed), n + len(pressed)))
-        D[:n, :n] = K[np.ix_(sliding, sliding)]
-        D[n:, n:] = core[np.ix_(pressed, pressed)]
-        return D, np.concatenate([sliding, m + pressed])
+            f, u, g = self._search(f, u, df, du, slope)
+        return f
 
     def _search(self, f, u, df, du, slope):
         """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi where the step overshoots)."""
@@ -279,19 +248,15 @@ class Step:
         s = self.skin
         wrench, contacts = np.zeros((s.geoms.ngroup, 6)), np.zeros((0, 5))
         tangent = np.zeros((s.geoms.ngroup, 6, 6))
-        nsample = len(s._sample)
-        geom = s._geom[: self.nsample, 0]
-        here = np.flatnonzero(geom >= 0)
-        if len(here):
-            face = self.faces[here // nsample]
-            contacts = np.column_stack([face * nsample + here % nsample, geom[here], s._trial[here, 0]])
-            point = np.einsum("kc,kci->ki", s._sample[here % nsample], s._x[s._face[face], 0])
-            force = s._force[here, 0]
-            load = np.concatenate([force, np.cross(point, force)], axis=1)
-            group = s.geoms.groups[geom[here]]
-            for k in np.unique(group):
-                wrench[k] = -load[group == k].sum(0)
-                tangent[k] = self._tangent(k)
+        if len(self.outer):
+            contacts = s.faces.contacts()
+        if len(contacts):
+            load, share = s.faces.loads()
+            # what Newton's last step changed, to first order; the samples' forces are those of the stiff law after it
+            x, n = s._x[self.outer, 0], len(self.outer)
+            rest = self.last[: 3 * n].reshape(n, 3) - s.faces.force
+            wrench = -load - share @ np.concatenate([rest, np.cross(x, rest)], axis=1)
+            self._tangents(tangent, share, x)
         pos, mat = self.pose
         now = (
             self.coordinate,
@@ -318,34 +283,21 @@ class Step:
         place = np.minimum(np.searchsorted(memory.coordinate, self.coordinate), len(memory.coordinate) - 1)
         return self.force - np.where(memory.coordinate[place] == self.coordinate, memory.force[place], 0)
 
-    def _tangent(self, group):
-        """Stiffness against rigid motions of a group of geoms about the origin, G' (D_g - D_g W (I + D W)^-1 D_g) G, symmetric."""
-        s, m = self.skin, self.m
-        D, on = self._springs()
-        outer = on[on < m]
-        if not len(outer):  # only held nodes are touched
-            return np.zeros((6, 6))
-        n = len(outer)
-        mine = D[:n, :n]
-        if s.geoms.ngroup > 1:
-            nface = len(self.faces)
-            touching = s._touching[:nface, 0].copy()
-            geom = s._geom[: self.nsample, 0].reshape(nface, -1).max(1)
-            s._touching[:nface, 0] = touching * ((geom >= 0) & (s.geoms.groups[geom] == group))
-            s._gather.launch()
-            mine = s._stiffness[: m * m].reshape(m, m)[np.ix_(outer, outer)]
-            s._touching[:nface, 0] = touching
-            s._gather.launch()
-        x = s._x[self.outer, 0]
-        rigid = np.zeros((len(x), 3, 6))
-        rigid[:, :, :3] = np.eye(3)
+    def _tangents(self, out, share, x):
+        """Stiffness (ngroup, 6, 6) against rigid motions of each group of geoms about the origin, springs lumped at the nodes."""
+        springs = self._springs()
+        if not len(springs.outer):  # only held nodes are touched
+            return
+        rigid = np.zeros((len(self.c), 6))
+        motion = rigid[: self.m].reshape(-1, 3, 6)
+        motion[:, :, :3] = np.eye(3)
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            rigid[:, i, 3 + j], rigid[:, i, 3 + k] = x[:, k], -x[:, j]
-        rigid = rigid.reshape(m, 6)[outer]
-        pull = np.zeros((len(on), 6))
-        pull[:n] = mine @ rigid
-        W = self.W[np.ix_(on, on)]
-        give = W @ dgesv(np.eye(len(on)) + D @ W, pull)[2]
-        stiffness = rigid.T @ pull[:n] - pull.T @ give
-        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
-        return (vectors * np.maximum(values, 0)) @ vectors.T
+            motion[:, i, 3 + j], motion[:, i, 3 + k] = x[:, k], -x[:, j]
+        lumped = self.lumped if self.lumped and self.lumped.fits(springs) else Lumped(springs, self.W)
+        for k in range(len(out)):
+            mine = rigid
+            if len(out) > 1:
+                mine = rigid.copy()
+                mine[: self.m] *= np.repeat(share[k], 3)[:, None]
+            K = lumped.stiffness(mine)
+            out[k] = (K + K.T) / 2

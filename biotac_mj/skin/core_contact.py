@@ -20,43 +20,82 @@ wp.set_module_options({"enable_backward": False})
 _PROBE = 2e-4  # half a step of the differences that give the directions, half a cell of the core's grid [m]
 
 
-@wp.kernel
-def _core_distance(
+@wp.func
+def _measure_face(
+    f: int,
     # In:
     face: wp.array(dtype=wp.vec3i),
     sample: wp.array(dtype=vec3),
     core: Geoms,
-    rest: wp.array2d(dtype=vec3),
-    rest_gap: wp.array(dtype=real),
     x: wp.array2d(dtype=vec3),
-    share: wp.array(dtype=real),
-    kept: wp.array(dtype=int),
     # Out:
-    near_out: wp.array(dtype=int),
     distance_out: wp.array2d(dtype=real),
 ):
-    """Distances of the samples to the core, of faces that are kept or nearer to it than a share of their displacement."""
-    f = wp.tid()
     t = face[f]
-    x0 = x[t[0], 0]
-    x1 = x[t[1], 0]
-    x2 = x[t[2], 0]
-    a = wp.length_sq(x0 - rest[t[0], 0])
-    b = wp.length_sq(x1 - rest[t[1], 0])
-    c = wp.length_sq(x2 - rest[t[2], 0])
-    moved = wp.sqrt(wp.max(a, wp.max(b, c)))
-    reach = share[0] * moved
-    near = kept[f]
-    if near == 1 or rest_gap[f] - moved < reach:
-        half = real(0.5) * core.grids.spacing[core.grid[0]]
-        for s in range(sample.shape[0]):
-            w = sample[s]
-            p = w[0] * x0 + w[1] * x1 + w[2] * x2
-            d = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p) + half
-            distance_out[f, s] = d
-            if d < reach:
-                near = 1
-    near_out[f] = near
+    half = real(0.5) * core.grids.spacing[core.grid[0]]
+    least = real(1.0)
+    for s in range(sample.shape[0]):
+        w = sample[s]
+        p = w[0] * x[t[0], 0] + w[1] * x[t[1], 0] + w[2] * x[t[2], 0]
+        d = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p) + half
+        distance_out[f, s] = d
+        least = wp.min(least, d)
+    return least
+
+
+@wp.kernel
+def _measure(
+    # In:
+    count: wp.array(dtype=int),
+    number: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    core: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    distance_out: wp.array2d(dtype=real),
+):
+    """Distances of the samples of the first count[0] numbered faces to the core."""
+    for i in range(count[0]):
+        _measure_face(number[i], face, sample, core, x, distance_out)
+
+
+@wp.kernel
+def _meet(
+    # In:
+    node: wp.array(dtype=int),
+    node_gap: wp.array(dtype=real),
+    start: wp.array(dtype=int),
+    incident: wp.array(dtype=int),
+    rest_gap: wp.array(dtype=real),
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    core: Geoms,
+    rest: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    share: wp.array(dtype=real),
+    # Out:
+    seen_out: wp.array(dtype=int),
+    distance_out: wp.array2d(dtype=real),
+):
+    """Marks with 2 the faces that are nearer to the core than a share of their displacement.
+
+    What has moved by m and gets nearer by a share of m cannot touch if it began further away than both.
+    """
+    most = real(1.0) + share[0]
+    for i in range(node.shape[0]):
+        n = node[i]
+        if most * wp.length(x[n, 0] - rest[n, 0]) > node_gap[i]:
+            for k in range(start[i], start[i + 1]):
+                f = incident[k]
+                if seen_out[f] == 0:
+                    seen_out[f] = 1
+                    t = face[f]
+                    moved = wp.max(wp.length(x[t[0], 0] - rest[t[0], 0]), wp.length(x[t[1], 0] - rest[t[1], 0]))
+                    moved = wp.max(moved, wp.length(x[t[2], 0] - rest[t[2], 0]))
+                    if most * moved > rest_gap[f]:
+                        if _measure_face(f, face, sample, core, x, distance_out) < share[0] * moved:
+                            seen_out[f] = 2
 
 
 @dataclasses.dataclass
@@ -107,48 +146,63 @@ class CoreContact:
         self._number = np.full(model.nvert, -1)
         self._number[self.node] = np.arange(len(self.node))
         nface, nsample = len(self._face), len(self._sample)
-        rest_gap, share, kept = (wp.zeros(n, dtype=t, device="cpu") for n, t in ((nface, real), (1, real), (nface, int)))
-        near, gap = wp.zeros(nface, dtype=int, device="cpu"), wp.zeros((nface, nsample), dtype=real, device="cpu")
-        self._rest_gap, self._share, self._kept, self._near, self._gap = (a.numpy() for a in (rest_gap, share, kept, near, gap))
-        self._look = wp.launch(
-            _core_distance, dim=nface, device="cpu", record_cmd=True,
-            inputs=[model.core_surface.face, model.sample, model.core(1).struct, model.vert, rest_gap, x_wp, share, kept],
-            outputs=[near, gap],
-        )  # fmt: skip
-        self._kept[:] = 1
+        surface = [model.core_surface.face, model.sample, model.core(1).struct]
+        gap = wp.zeros((nface, nsample), dtype=real, device="cpu")
+        number, count = wp.zeros(nface, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
+        self._asked, self._count, self._gap = number.numpy(), count.numpy(), gap.numpy()
+        self._look = self._record(_measure, [count, number, *surface, x_wp], [gap])
+        everything = np.arange(nface)
         gradient = np.zeros((nface, 3))
         for axis in range(3):
             for sign in (1, -1):
                 x[:, 0, axis] += sign * _PROBE
-                self._look.launch()
-                gradient[:, axis] += sign * self._gap.mean(1)
+                gradient[:, axis] += sign * self._measured(everything).mean(1)
                 x[:, 0] = self._rest
         nodal = np.zeros((model.nvert, 3))
         np.add.at(nodal, self._face, np.repeat(gradient[:, None], 3, 1))
         self.direction = nodal[self.node] / np.linalg.norm(nodal[self.node], axis=1, keepdims=True)
-        self._look.launch()
-        self._rest_gap[:] = self._gap.min(1)
+        rest_gap = self._measured(everything).min(1)
         # the grid rounds edges of the core by micrometres: what starts outside stays outside
         self._offset = np.minimum(self._gap, 0)
+        self._corner = self._number[self._face]
+        node_gap = np.full(len(self.node) + 1, np.inf)  # of the nearest face of each node; held corners, -1, are the last
+        np.minimum.at(node_gap, self._corner, rest_gap[:, None])
+        order = np.argsort(self._corner.ravel(), kind="stable")
+        order = order[self._corner.ravel()[order] >= 0]
+        start = np.searchsorted(self._corner.ravel()[order], np.arange(len(self.node) + 1))
+        constants = [(self.node, int), (node_gap[:-1], real), (start, int), (order // 3, int), (rest_gap, real)]
+        constants = [wp.array(array, dtype=dtype, device="cpu") for array, dtype in constants]
+        rest = wp.array(self._rest[:, None], dtype=vec3, device="cpu")
+        share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
+        self._share, self._seen = share.numpy(), seen.numpy()
+        self._search = self._record(_meet, [*constants, *surface, rest, x_wp, share], [seen, gap])
+
+    def _record(self, kernel, inputs, outputs):
+        return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+
+    def _measured(self, face):
+        """Gaps (n, nsample) of faces (n,), before what they had at rest is taken off."""
+        self._asked[: len(face)], self._count[0] = face, len(face)
+        self._look()
+        return self._gap[face]
 
     def meet(self, u, share, last: Meeting | None) -> Meeting:
         """Faces with a sample nearer to the core than a share of their displacement, and those of the last meeting.
 
         Args:
-          u: (nvert, 3) displacements at the present positions, for which the faces are looked at [m].
+          u: (nvert, 3) displacements at the present positions, which the Warp array holds [m].
           share: how much of its displacement a face may make in this step.
           last: candidates so far; returned as they are where there are no more.
         """
-        self._share[0] = share
-        self._kept[:] = 0
+        self._share[0], self._seen[:] = share, 0
+        self._search()
         if last is not None:
-            self._kept[last.face] = 1
-        self._look.launch()
-        face = np.flatnonzero(self._near)
+            self._seen[last.face] = 2
+        face = np.flatnonzero(self._seen == 2)
         if last is not None and len(face) == len(last.face):
             return last
-        gap = self._gap[face] - self._offset[face]
-        corner = self._number[self._face[face]]
+        gap = self._measured(face) - self._offset[face]
+        corner = self._corner[face]
         used = np.zeros(len(self.node) + 1, bool)
         used[corner] = True  # fixed corners, -1, mark the last
         node = np.flatnonzero(used[:-1])

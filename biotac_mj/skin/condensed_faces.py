@@ -1,0 +1,323 @@
+"""The faces that a geom may touch in a step of the condensed skin: contact forces at their nodes, stiffness, wrenches.
+
+Few faces are at stake, so what counts is the number of launches: each kernel is one thread that does all of them, which also fixes the
+order of sums.
+"""
+
+import numpy as np
+import warp as wp
+
+from .contact import Geoms, touch_face
+from .types import mat33, real, vec3
+
+__all__ = ["CandidateFaces"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _touch(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    sample_force_out: wp.array2d(dtype=vec3),
+    force_out: wp.array(dtype=vec3),
+    lumped_out: wp.array(dtype=mat33),
+    touched_out: wp.array(dtype=int),
+):
+    """Forces, lumped stiffness (rows summed) and whether it is touched of the count[1] nodes of the first count[0] faces."""
+    for i in range(count[1]):
+        force_out[i] = vec3()
+        lumped_out[i] = mat33()
+        touched_out[i] = 0
+    for f in range(count[0]):
+        touch_face(
+            f, 0, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
+            anchor, corner_out, block_out, touching_out, geom_out, anchor_out, sample_force_out,
+        )  # fmt: skip
+        if touching_out[f, 0] == 1:
+            t = face[f]
+            b01 = block_out[6 * f + 1, 0]
+            b02 = block_out[6 * f + 2, 0]
+            b12 = block_out[6 * f + 4, 0]
+            i = slot[t[0]]
+            if i >= 0:
+                force_out[i] += corner_out[3 * f, 0]
+                lumped_out[i] += block_out[6 * f, 0] + b01 + b02
+                touched_out[i] = 1
+            i = slot[t[1]]
+            if i >= 0:
+                force_out[i] += corner_out[3 * f + 1, 0]
+                lumped_out[i] += b01 + block_out[6 * f + 3, 0] + b12
+                touched_out[i] = 1
+            i = slot[t[2]]
+            if i >= 0:
+                force_out[i] += corner_out[3 * f + 2, 0]
+                lumped_out[i] += b02 + b12 + block_out[6 * f + 5, 0]
+                touched_out[i] = 1
+
+
+@wp.kernel
+def _matrix(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    touching: wp.array2d(dtype=int),
+    block: wp.array2d(dtype=mat33),
+    place: wp.array(dtype=int),
+    # Out:
+    stiffness_out: wp.array(dtype=real),
+):
+    """Stiffness as a matrix over count[2] of the nodes; place is a node's number among them."""
+    n = 3 * count[2]
+    for i in range(n * n):
+        stiffness_out[i] = real(0.0)
+    for f in range(count[0]):
+        if touching[f, 0] == 1:
+            t = face[f]
+            for a in range(3):
+                i = slot[t[a]]
+                if i >= 0:
+                    i = 3 * place[i]
+                    for b in range(3):
+                        j = slot[t[b]]
+                        if j >= 0:
+                            j = 3 * place[j]
+                            low = wp.min(a, b)
+                            K = block[6 * f + low * (5 - low) // 2 + wp.max(a, b), 0]
+                            for k in range(3):
+                                for l in range(3):
+                                    stiffness_out[(i + k) * n + j + l] += K[k, l]
+
+
+@wp.kernel
+def _product(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    touching: wp.array2d(dtype=int),
+    block: wp.array2d(dtype=mat33),
+    p: wp.array(dtype=vec3),
+    # Out:
+    product_out: wp.array(dtype=vec3),
+):
+    """Stiffness times p over all nodes."""
+    for i in range(count[1]):
+        product_out[i] = vec3()
+    for f in range(count[0]):
+        if touching[f, 0] == 1:
+            t = face[f]
+            i = slot[t[0]]
+            j = slot[t[1]]
+            k = slot[t[2]]
+            p0 = vec3()
+            p1 = vec3()
+            p2 = vec3()
+            if i >= 0:
+                p0 = p[i]
+            if j >= 0:
+                p1 = p[j]
+            if k >= 0:
+                p2 = p[k]
+            b01 = block[6 * f + 1, 0]
+            b02 = block[6 * f + 2, 0]
+            b12 = block[6 * f + 4, 0]
+            if i >= 0:
+                product_out[i] += block[6 * f, 0] * p0 + b01 * p1 + b02 * p2
+            if j >= 0:
+                product_out[j] += b01 * p0 + block[6 * f + 3, 0] * p1 + b12 * p2
+            if k >= 0:
+                product_out[k] += b02 * p0 + b12 * p1 + block[6 * f + 5, 0] * p2
+
+
+@wp.kernel
+def _loads(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    ngroup: int,
+    x: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    load_out: wp.array2d(dtype=real),
+    share_out: wp.array2d(dtype=real),
+):
+    """Force and moment of each group of geoms on the skin (ngroup, 6), and how much each group touches each node (ngroup, nnode)."""
+    for g in range(ngroup):
+        for k in range(6):
+            load_out[g, k] = real(0.0)
+        for i in range(count[1]):
+            share_out[g, i] = real(0.0)
+    for f in range(count[0]):
+        if touching[f, 0] == 1:
+            t = face[f]
+            for s in range(sample.shape[0]):
+                g = geom[f * sample.shape[0] + s, 0]
+                if g >= 0:
+                    group = geoms.group[g]
+                    b = sample[s]
+                    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0]
+                    F = force[f * sample.shape[0] + s, 0]
+                    M = wp.cross(p, F)
+                    for k in range(3):
+                        load_out[group, k] += F[k]
+                        load_out[group, 3 + k] += M[k]
+                        i = slot[t[k]]
+                        if i >= 0:
+                            share_out[group, i] += b[k]
+
+
+class CandidateFaces:
+    """Candidate faces, `count[0]` of them over `count[1]` free nodes, on buffers that grow as needed.
+
+    Args:
+      model: SkinModel. geoms: GeomSet of one world.
+      x, x_last, slot: present positions of all nodes, those at the start of the step, a node's number among the candidates' nodes (-1: it
+        is held), as Warp arrays.
+
+    Attributes:
+      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (nnode,). geom, trial: of the samples; all of the last `evaluate`.
+    """
+
+    def __init__(self, model, geoms, x, x_last, slot):
+        self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = model, geoms, x, x_last, slot, slot.numpy()
+        self._nsample = len(model.sample)
+        self._limit = 0, 0
+        self._allocate(64, 100)
+
+    def _allocate(self, nface, nnode):
+        m, geoms, nsample = self._model, self._geoms, self._nsample
+        self._limit = nface, nnode
+
+        def zeros(shape, dtype):
+            array = wp.zeros(shape, dtype=dtype, device="cpu")
+            return array, array.numpy()
+
+        count, self.count = zeros(3, int)
+        face, self._face = zeros(nface, wp.vec3i)
+        area, self._area = zeros(nface, real)
+        anchor_geom, self._anchor_geom = zeros((nface * nsample, 1), int)
+        anchor, self._anchor = zeros((nface * nsample, 1), vec3)
+        corner = zeros((3 * nface, 1), vec3)[0]
+        block = zeros((6 * nface, 1), mat33)[0]
+        touching = zeros((nface, 1), int)[0]
+        geom, self._geom = zeros((nface * nsample, 1), int)
+        trial, self._trial = zeros((nface * nsample, 1), vec3)
+        sample_force, self._sample_force = zeros((nface * nsample, 1), vec3)
+        force, self._force = zeros(nnode, vec3)
+        lumped, self._lumped = zeros(nnode, mat33)
+        touched, self._touched = zeros(nnode, int)
+        place, self._place = zeros(nnode, int)
+        p, self._p = zeros(nnode, vec3)
+        product, self._result = zeros(nnode, vec3)
+        load, self._load = zeros((geoms.ngroup, 6), real)
+        share, self._share = zeros((geoms.ngroup, nnode), real)
+        faces, springs = [count, face, self._slot_wp], [touching, block]
+        self.evaluate = self._record(
+            _touch,
+            [*faces, area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, self._x, self._last, anchor_geom, anchor],
+            [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
+        )  # fmt: skip
+        self._multiply = self._record(_product, [*faces, *springs, p], [product])
+        self._loads = self._record(
+            _loads,
+            [*faces, m.sample, geoms.struct, geoms.ngroup, self._x, touching, geom, sample_force], [load, share],
+        )  # fmt: skip
+        self._matrix_inputs, self._dense = [*faces, *springs, place], None
+
+    def _record(self, kernel, inputs, outputs):
+        return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+
+    def choose(self, number, face, area, nnode, contacts):
+        """Takes faces (n,), their nodes and areas (n, 3), (n,) and the sticking contacts of the last step (k, 5) that are theirs."""
+        n, nsample = len(number), self._nsample
+        if n > self._limit[0] or nnode > self._limit[1]:
+            self._allocate(max(self._limit[0], 2 * n), max(self._limit[1], 2 * nnode))
+        self.count[:2] = n, nnode
+        self._face[:n], self._area[:n] = face, area
+        self._anchor_geom[: n * nsample] = -1
+        self.number = number
+        if len(contacts):
+            sample = contacts[:, 0].astype(int)
+            place = np.searchsorted(number, sample // nsample)
+            known = place < n
+            known[known] = number[place[known]] == sample[known] // nsample
+            here = place[known] * nsample + sample[known] % nsample
+            self._anchor_geom[here, 0], self._anchor[here, 0] = contacts[known, 1], contacts[known, 2:]
+
+    @property
+    def force(self):
+        return self._force[: self.count[1]]
+
+    @property
+    def lumped(self):
+        return self._lumped[: self.count[1]]
+
+    @property
+    def touched(self):
+        """Numbers of the nodes that are touched."""
+        return self._touched[: self.count[1]].nonzero()[0]
+
+    def product(self, p):
+        """Stiffness times p (3 nnode,)."""
+        n = self.count[1]
+        self._p[:n] = p.reshape(n, 3)
+        self._multiply()
+        return self._result[:n].ravel()
+
+    def matrix(self, node):
+        """Stiffness over the touched nodes (k,): (3 k, 3 k)."""
+        n = 3 * len(node)
+        if self._dense is None or len(self._dense[0]) < n * n:
+            array = wp.zeros(4 * n * n, dtype=real, device="cpu")
+            self._dense = array.numpy(), self._record(_matrix, self._matrix_inputs, [array])
+        self.count[2] = len(node)
+        self._place[node] = np.arange(len(node))
+        self._dense[1]()
+        return self._dense[0][: n * n].reshape(n, n)
+
+    def contacts(self):
+        """(k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches."""
+        nsample = self._nsample
+        geom = self._geom[: len(self.number) * nsample, 0]
+        here = np.flatnonzero(geom >= 0)
+        out = np.empty((len(here), 5))
+        out[:, 0] = self.number[here // nsample] * nsample + here % nsample
+        out[:, 1], out[:, 2:] = geom[here], self._trial[here, 0]
+        return out
+
+    def sample_forces(self):
+        """(k, 3) forces on the samples that `contacts` lists [N]."""
+        n = len(self.number) * self._nsample
+        return self._sample_force[:n, 0][self._geom[:n, 0] >= 0]
+
+    def loads(self):
+        """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in the contact of each node."""
+        self._loads()
+        share = self._share[:, : self.count[1]]
+        if len(share) > 1:
+            return self._load, share / np.maximum(share.sum(0), 1e-12)
+        return self._load, np.ones_like(share)
