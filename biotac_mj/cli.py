@@ -10,6 +10,9 @@ INDENTERS = "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_s
 TIERS = ("full", "condensed")
 MATERIALS = ("default", "paper", "rubber", "ansys")
 SKINS = ("coarse", "default", "fine")
+PEGS = "peg_round_4mm peg_round_8mm peg_square_5mm peg_square_10mm peg_hexagon_8mm peg_triangle_8mm".split()
+OBJECTS = (*INDENTERS, *PEGS, "table_surface", "table_edge", "table_corner")
+INTERACTIONS = ("press", "slide", "twist", "tap")
 CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "solid")
 
 
@@ -42,6 +45,8 @@ def parser() -> argparse.ArgumentParser:
     _add_import_mesh(verbs)
     _add_calibrate(verbs)
     _add_compare(verbs)
+    _add_generate(verbs)
+    _add_learning(verbs)
     return top
 
 
@@ -238,6 +243,37 @@ def _compare(args):
 
     _calm_warp()
     verbs.compare_verb(args)
+
+
+def _add_learning(verbs):
+    from .learning.verbs import add_verbs
+
+    add_verbs(verbs, _verb)
+
+
+def _add_generate(verbs):
+    verb = _verb(verbs, "generate", _generate, "Make a synthetic data set of random interactions; goes on where it was interrupted.")
+    verb.add_argument("--count", type=int, default=2600, help="interactions")
+    verb.add_argument("--steps", type=int, default=20, help="time steps of each")
+    verb.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="of the time steps")
+    verb.add_argument("--labelled", type=int, help="of them, how many get the synthetic measured sensor's counts too (default: 359)")
+    verb.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches")
+    verb.add_argument("--kinds", nargs="+", default=list(INTERACTIONS), choices=INTERACTIONS, metavar="KIND", help="how it moves")
+    verb.add_argument("--element", choices=("linear", "quadratic"), help="of the skin (default: the material's, or the mesh's)")
+    verb.add_argument("--batch", type=int, default=160, help="worlds at most that are solved together; a shard holds one batch")
+    verb.add_argument("--measured-seed", type=int, default=0, help="number of the synthetic measured sensor")
+    verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
+    verb.add_argument("--workers", type=int, help="processes that compute electrode readings (default: one per core)")
+    _add_skin(verb)
+    verb.add_argument("--out", default="out/set", metavar="DIR", help="folder of the set")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _generate(args):
+    from .data import verbs
+
+    _calm_warp()
+    verbs.generate_verb(args)
 
 
 def _calm_warp():

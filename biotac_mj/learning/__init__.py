@@ -1,0 +1,1 @@
+"""Learned models between the deformed skin and the electrodes: training, evaluation, use. torch is loaded when a model is."""

@@ -1,0 +1,60 @@
+"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant that starts as principal components."""
+
+import torch
+from torch import nn
+
+__all__ = ["ElectrodeVAE", "mlp"]
+
+
+def mlp(widths, dropout=0.0) -> nn.Sequential:
+    """Fully connected layers with ELU between them (none after the last); dropout after each hidden layer."""
+    layers = []
+    for i, (a, b) in enumerate(zip(widths, widths[1:])):
+        layers.append(nn.Linear(a, b))
+        if i < len(widths) - 2:
+            layers.append(nn.ELU())
+            if dropout:
+                layers.append(nn.Dropout(dropout))
+    return nn.Sequential(*layers)
+
+
+class ElectrodeVAE(nn.Module):
+    """Code of the 19 electrodes. "64, 8" of the paper is read as a hidden layer of 64 and heads of 8 for mean and log variance.
+
+    Args:
+      channels: 19. hidden: widths of the encoder. latent: size of the code.
+      linear: the variant: (latent, channels) orthonormal rows, principal components of the inputs. The code is then
+        the components plus what the network adds, and so is the decoder, so training starts near PCA's error. None is the paper's network.
+    """
+
+    def __init__(self, channels=19, hidden=(256, 128, 64), latent=8, linear=None):
+        super().__init__()
+        self.latent = latent
+        self.encoder = mlp([channels, *hidden, 2 * latent])
+        self.decoder = mlp([latent, *hidden[::-1], channels])
+        self.skip_in = self.skip_out = None
+        if linear is not None:
+            if tuple(linear.shape) != (latent, channels):
+                raise ValueError(f"linear has shape {tuple(linear.shape)}: the code of {latent} from {channels} channels needs that shape")
+            self.skip_in, self.skip_out = nn.Linear(channels, latent, bias=False), nn.Linear(latent, channels, bias=False)
+            with torch.no_grad():
+                self.skip_in.weight.copy_(linear), self.skip_out.weight.copy_(linear.T)
+                for last in (self.encoder[-1], self.decoder[-1]):
+                    last.weight.mul_(0.1), last.bias.zero_()
+
+    def encode(self, x):
+        """Mean and log variance of the code, (n, latent) each, of x (n, channels)."""
+        mean, log_variance = self.encoder(x).chunk(2, -1)
+        if self.skip_in is not None:
+            mean = mean + self.skip_in(x)
+        return mean, log_variance.clamp(-14, 4)
+
+    def decode(self, z):
+        """(n, channels) of codes z (n, latent)."""
+        return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)
+
+    def forward(self, x):
+        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log variance."""
+        mean, log_variance = self.encode(x)
+        z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
+        return self.decode(z), mean, log_variance

@@ -1,0 +1,213 @@
+"""Force from electrodes, causal: nothing later than the row that is predicted, and nothing of the test part, is ever used.
+
+ln Z of the 19 electrodes, causal averages of it and products of its first principal components go into ridge regressions. The sensor's
+warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t / tau): with its own weight for each force component, or as
+one gain shared by all electrodes and removed from ln Z. Which of these, and how strong the ridge, is chosen for every component by walk-
+forward trials inside the training part. A small network then learns what the ridge leaves, where it helps in those trials.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from scipy.signal import lfilter
+
+from .recording import log_impedance
+
+__all__ = ["ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
+
+_WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
+_PRODUCTS = (0, 3, 5)  # principal components whose products are features
+_RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
+_WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
+
+
+def causal_average(x, tau):
+    """Exponential average of x (n, k) over the past, time constant tau [rows]; it starts at the first row."""
+    a = 1 - np.exp(-1 / tau)
+    return lfilter([a], [1, a - 1], x, axis=0, zi=x[:1] * (1 - a))[0]
+
+
+def walk_forward(n, folds=4, first=0.4):
+    """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it."""
+    edge = np.rint(np.linspace(first, 1, folds + 1) * n).astype(int)
+    return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
+
+
+def ridge(x, y, strength):
+    """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y (n, m)."""
+    mean, scale = x.mean(0), x.std(0)
+    scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
+    a = (x - mean) / scale
+    weight = np.linalg.solve(a.T @ a / len(a) + strength * np.eye(a.shape[1]), a.T @ (y - y.mean(0)) / len(a)) / scale[:, None]
+    return weight, y.mean(0) - mean @ weight
+
+
+def shared_gain(log_z, force, tau):
+    """Amplitude a of the gain a (1 - exp(-t / tau)) that all electrodes have in common in ln Z besides what the force explains.
+
+    Args:
+      log_z: (n, 19); force: (n, 3) [N]; tau: [rows].
+    """
+    i, j = np.triu_indices(3)
+    explained = np.linalg.qr(np.column_stack([np.ones(len(force)), force, force[:, i] * force[:, j]]))[0]
+    rise = 1 - np.exp(-np.arange(len(force)) / tau)
+    rise_left = rise - explained @ (explained.T @ rise)
+    left = log_z - explained @ (explained.T @ log_z)
+    each = rise_left @ left / (rise_left @ rise_left)
+    weight = 1 / np.maximum((left - rise_left[:, None] * each).var(0), 1e-8)
+    return float(weight @ each / weight.sum())
+
+
+@dataclasses.dataclass(frozen=True)
+class _Candidate:
+    window: tuple
+    warm_up: float | None
+    shared: bool
+    products: int
+    strength: float
+
+    def text(self):
+        words = ["ln Z"]
+        if self.window:
+            words.append(f"averages over {', '.join(map(str, self.window))} rows")
+        if self.products:
+            words.append(f"products of {self.products} components")
+        if self.warm_up:
+            words.append(f"{'shared gain' if self.shared else 'warm-up'} tau {self.warm_up:g} n")
+        return f"{' + '.join(words)}; ridge {self.strength:g}"
+
+
+def _candidates():
+    for window, products, strength in itertools.product(_WINDOWS, _PRODUCTS, _RIDGE):
+        for warm_up in _WARM_UP:
+            for shared in (False, True) if warm_up else (False,):
+                yield _Candidate(window, warm_up, shared, products, strength)
+
+
+def _kinds(candidates):
+    return [[c for c in candidates if c.products == products] for products in _PRODUCTS]
+
+
+def _features(log_z, force, part, candidate):
+    """All rows' features; what has to be fitted is fitted on the rows of `part`. tau is relative to the length of `part`."""
+    n = len(log_z)
+    rise = None
+    if candidate.warm_up:
+        tau = candidate.warm_up * part.stop
+        rise = 1 - np.exp(-np.arange(n) / tau)
+        if candidate.shared:
+            log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
+    columns = [log_z, *(causal_average(log_z, tau) for tau in candidate.window)]
+    if candidate.products:
+        centred = log_z - log_z[part].mean(0)
+        covariance = centred[part].T @ centred[part]
+        main = centred @ np.linalg.eigh(covariance)[1][:, ::-1][:, : candidate.products]
+        main = np.clip(main, main[part].min(0), main[part].max(0))  # products must not run away beyond what was seen
+        i, j = np.triu_indices(candidate.products)
+        columns.append(main[:, i] * main[:, j])
+    if rise is not None and not candidate.shared:
+        columns.append(rise[:, None])
+    return np.hstack(columns)
+
+
+class ForceModel:
+    """Predicts force from the counts up to each row; made by `fit_force`.
+
+    Attributes:
+      chosen: for x, y, z, descriptions of the candidates whose mean predicts.
+      network: whether the network's correction was kept, for x, y, z.
+      trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
+    """
+
+    def __init__(self, prediction, chosen, network, trials, gain):
+        self.prediction, self.chosen, self.network, self.trials, self.gain = prediction, chosen, network, trials, gain
+
+
+def fit_force(counts, force, ntrain, seed=0, network=True, progress=None) -> ForceModel:
+    """Fits on rows 0..ntrain-1 and predicts every row.
+
+    Args:
+      counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are read.
+
+    Returns:
+      ForceModel whose `prediction` is (n, 3) [N].
+    """
+    log_z = log_impedance(counts)
+    force = force[:ntrain]
+    folds = walk_forward(ntrain)
+    candidates = list(_candidates())
+    groups = {}
+    for c in candidates:
+        groups.setdefault(dataclasses.replace(c, strength=0.0), []).append(c)
+    error = {c: [] for c in candidates}
+    for key, members in groups.items():
+        for train, test in folds:
+            x = _features(log_z[: test.stop], force, train, key)
+            for c in members:
+                w, b = ridge(x[train], force[train], c.strength)
+                error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
+        if progress:
+            progress()
+    # one of each degree of flexibility: their mean is steadier than any of them where the recording goes on to something new
+    best = [[min(kin, key=lambda c: np.mean(error[c], axis=0)[k]) for kin in _kinds(candidates)] for k in range(3)]
+    prediction = _mean_of(best, log_z, force, slice(0, ntrain))
+    base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]
+    plain = np.array([np.sqrt(((b[test] - force[test]) ** 2).mean(0)) for b, (_, test) in zip(base, folds)]).mean(0)
+    trials, kept = {"ridge": plain.tolist()}, [False] * 3
+    if network:
+        helped = []
+        for b, (train, test) in zip(base[-2:], folds[-2:]):
+            correction = _network(log_z[: test.stop], force[train] - b[train], train, seed)
+            old, new = (np.sqrt(((p[test] - force[test]) ** 2).mean(0)) for p in (b, b + correction))
+            helped.append(new / old)
+        kept = (np.max(helped, axis=0) < 1).tolist()  # in both trials, or not at all
+        trials["network_over_ridge"] = np.mean(helped, axis=0).tolist()
+        if any(kept):
+            correction = _network(log_z, force - prediction[:ntrain], slice(0, ntrain), seed)
+            prediction = prediction + correction * kept
+    gain = shared_gain(log_z[:ntrain], force, 1.5 * ntrain) * (1 - np.exp(-len(log_z) / (1.5 * ntrain)))
+    return ForceModel(prediction, [[c.text() for c in cs] for cs in best], kept, trials, gain)
+
+
+def _mean_of(best, log_z, force, part):
+    """(n, 3): mean of each component's chosen candidates, fitted on the rows of `part`."""
+    out = np.zeros((len(log_z), 3))
+    for c in {c for cs in best for c in cs}:
+        x = _features(log_z, force, part, c)
+        w, b = ridge(x[part], force[part], c.strength)
+        value = x @ w + b
+        for k in range(3):
+            out[:, k] += best[k].count(c) / len(best[k]) * value[:, k]
+    return out
+
+
+def _network(log_z, target, part, seed, members=2, epochs=8, width=64, batch=256):
+    """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a common gain, against drift."""
+    import torch
+
+    mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)
+    size = np.maximum(target.std(0), 1e-6)
+    x = torch.tensor((log_z - mean) / scale, dtype=torch.float32)
+    y = torch.tensor(target / size, dtype=torch.float32)
+    common = torch.tensor(0.05 / scale, dtype=torch.float32)
+    out = 0
+    generator = torch.Generator().manual_seed(seed)
+    for k in range(members):
+        torch.manual_seed(seed + k)
+        net = torch.nn.Sequential(
+            torch.nn.Linear(x.shape[1], width), torch.nn.ELU(), torch.nn.Dropout(0.1),
+            torch.nn.Linear(width, width), torch.nn.ELU(), torch.nn.Dropout(0.1), torch.nn.Linear(width, 3),
+        )  # fmt: skip
+        steps = epochs * max(1, len(y) // batch)
+        optimizer = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=0.01)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
+        for _ in range(steps):
+            row = torch.randint(len(y), (batch,), generator=generator)
+            shaken = x[row] + 0.05 * torch.randn(batch, x.shape[1]) + torch.randn(batch, 1) * common
+            loss = ((net(shaken) - y[row]) ** 2).mean()
+            optimizer.zero_grad(), loss.backward(), optimizer.step(), schedule.step()
+        net.eval()
+        with torch.no_grad():
+            out = out + net(x).numpy() * size / members
+    return out

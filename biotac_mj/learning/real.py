@@ -1,0 +1,191 @@
+"""`biotac evaluate --electrodes`: reconstruction and force on a real recording, first 70 % of the time against the last 30 %."""
+
+import json
+import pathlib
+import time
+
+import numpy as np
+
+from ..press_record import replacing
+from ..sensor.channels import FULL_SCALE
+from .force import fit_force, ridge
+from .recording import load_recording
+
+__all__ = ["evaluate_recording"]
+
+_BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # steps: at least, at most
+_KL = 1e-4
+_GAIN = 0.05  # of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
+
+
+def evaluate_recording(
+    electrodes, force=None, out="out/evaluate/recording.json", fraction=0.7, seed=0, network=True, progress=True
+) -> dict:
+    """Evaluates one recording; writes `out` (JSON, described in docs/learning.md) and a plot beside it.
+
+    Args:
+      electrodes, force: files, see `load_recording`; without force only the reconstruction is judged.
+      fraction: of the rows, in time, that train; everything is fitted on them alone.
+      seed: of the networks.
+      network: False leaves the networks out (seconds, for tests): PCA and ridge only.
+
+    Returns:
+      what is written.
+    """
+    from tqdm import tqdm
+
+    begun = time.time()
+    recording = load_recording(electrodes, force)
+    if not 0.2 <= fraction <= 0.95:
+        raise ValueError(f"fraction {fraction} leaves too little on one side: take 0.2 to 0.95, as 0.7")
+    n = len(recording.counts)
+    ntrain = int(fraction * n)
+    notes = [
+        f"e{i + 1} reads 0 or 4095 in {100 * share:.1f} % of the rows: its impedance is not known there"
+        for i, share in enumerate(recording.saturated)
+        if share > 0.001
+    ]
+    with tqdm(
+        total=(3 if network else 1) + (66 if recording.force is not None else 0), disable=not progress, desc="evaluate", leave=False
+    ) as bar:
+        reconstruction, traces = _reconstruction(recording.counts, ntrain, seed, network, bar)
+        result = {
+            "schema": "biotac_mj.learning.recording/1",
+            "electrodes": str(electrodes),
+            "force": None if force is None else str(force),
+            "rows": n,
+            "train_rows": ntrain,
+            "seed": seed,
+            "notes": notes,
+            "saturated": recording.saturated.tolist(),
+            "reconstruction": reconstruction,
+        }
+        predicted = None
+        if recording.force is not None:
+            result["force_regression"], predicted = _force(recording, ntrain, seed, network, bar)
+        else:
+            result["notes"].append("no force file: the force regression was left out")
+    result["seconds"] = round(time.time() - begun, 1)
+    out = pathlib.Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    picture = out.with_suffix(".png")
+    _plot(recording, ntrain, traces, predicted, result, picture)
+    result["plot"] = str(picture)
+    with replacing(out) as temporary:
+        pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
+    return result
+
+
+def _rms(error):
+    row = np.sqrt((error**2).mean(1))
+    q25, q50, q75 = np.percentile(row, [25, 50, 75])
+    return {
+        "rms": float(np.sqrt((error**2).mean())),
+        "median_row": float(q50),
+        "quartiles_row": [float(q25), float(q75)],
+        "per_channel": np.sqrt((error**2).mean(0)).tolist(),
+    }
+
+
+def _reconstruction(counts, ntrain, seed, network, bar):
+    mean = counts[:ntrain].mean(0)
+    centred = counts - mean
+    axes = np.linalg.eigh(centred[:ntrain].T @ centred[:ntrain])[1][:, ::-1][:, :8].T
+    rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": centred @ axes.T @ axes + mean}
+    bar.update()
+    if network:
+        for name, linear in (("electrode_vae", None), ("electrode_vae_linear_start", axes)):
+            rows[name] = np.clip(_vae(counts, mean, ntrain, linear, seed), 0, FULL_SCALE)
+            bar.update()
+    table = {name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])} for name, y in rows.items()}
+    # White noise of a channel shows in differences of neighbouring rows; slow rows of a moving press make this an upper bound.
+    noise = np.diff(counts[ntrain:], axis=0)
+    noise = 1.4826 * np.median(np.abs(noise - np.median(noise, axis=0)), axis=0) / np.sqrt(2)
+    best = min((name for name in table if name != "predict_mean"), key=lambda name: table[name]["test"]["rms"])
+    return {"unit": "counts", "code": 8, "models": table, "best": best, "noise_rms": float(np.sqrt((noise**2).mean()))}, rows[best]
+
+
+def _vae(counts, mean, ntrain, linear, seed):
+    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows."""
+    import torch
+
+    from .electrode_vae import ElectrodeVAE
+
+    torch.manual_seed(seed)
+    size = counts[:ntrain].std()  # one scale for all: an error counts alike in every channel
+    x = torch.tensor((counts - mean) / size, dtype=torch.float32)
+    # What a common change of ln Z does to counts: dE = -E (1 - E / 4095) d ln Z.
+    common = torch.tensor(-counts * (1 - counts / FULL_SCALE) / size, dtype=torch.float32)
+    net = ElectrodeVAE(linear=None if linear is None else torch.tensor(linear.copy(), dtype=torch.float32))
+    steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS))
+    optimizer = torch.optim.Adam(net.parameters(), 2e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
+    for _ in range(steps):
+        row = torch.randint(ntrain, (_BATCH,))
+        y = x[row] + _GAIN * torch.randn(_BATCH, 1) * common[row]
+        got, code, log_variance = net(y)
+        divergence = 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
+        loss = ((got - y) ** 2).sum(1).mean() + _KL * divergence
+        optimizer.zero_grad(set_to_none=True), loss.backward(), optimizer.step(), schedule.step()
+    net.eval()
+    with torch.no_grad():
+        return net(x)[0].numpy() * size + mean
+
+
+def _force(recording, ntrain, seed, network, bar):
+    counts, force = recording.counts, recording.force
+    model = fit_force(counts, force, ntrain, seed, network, bar.update)
+    w, b = ridge(counts[:ntrain], force[:ntrain], 1e-4)
+    rows = {
+        "predict_mean": np.broadcast_to(force[:ntrain].mean(0), force.shape),
+        "linear_counts": counts @ w + b,
+        "drift_aware": model.prediction,
+    }
+    truth = force[ntrain:]
+    spread = np.maximum(truth.var(0), 1e-12)
+    table = {}
+    for name, y in rows.items():
+        error = y[ntrain:] - truth
+        table[name] = {"rmse": np.sqrt((error**2).mean(0)).tolist(), "r2": (1 - (error**2).mean(0) / spread).tolist()}
+    details = {"features": dict(zip("xyz", model.chosen)), "network_kept": model.network, "walk_forward": model.trials}
+    return {
+        "unit": "N",
+        "components": ["Fx", "Fy", "Fz"],
+        "models": table,
+        "best": "drift_aware",
+        "shared_gain_of_ln_z_at_end": model.gain,
+        "details": details,
+    }, rows["drift_aware"]
+
+
+def _plot(recording, ntrain, reconstructed, predicted, result, path):
+    import matplotlib
+
+    matplotlib.use("Agg", force=False)
+    from matplotlib.figure import Figure
+
+    counts = recording.counts
+    strong = np.argsort(counts.std(0))[::-1][:2]
+    rows = 2 + (3 if predicted is not None else 0)
+    figure = Figure(figsize=(11, 2.1 * rows), layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=True)
+    t = np.arange(len(counts))
+    best = result["reconstruction"]["best"]
+    for axis, k in zip(axes, strong):
+        axis.plot(t, counts[:, k], lw=0.8, color="0.6", label="measured")
+        axis.plot(t, reconstructed[:, k], lw=0.6, color="C0", label=f"{best}, code of 8")
+        axis.set_ylabel(f"E{k + 1} [counts]")
+    axes[0].set_title(
+        f"last {len(t) - ntrain} rows unseen; reconstruction {result['reconstruction']['models'][best]['test']['rms']:.1f} counts RMS"
+    )
+    if predicted is not None:
+        error = result["force_regression"]["models"]["drift_aware"]["rmse"]
+        for axis, k in zip(axes[2:], range(3)):
+            axis.plot(t, recording.force[:, k], lw=0.8, color="0.6", label="measured")
+            axis.plot(t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, RMSE {error[k]:.3f} N unseen")
+            axis.set_ylabel(f"F{'xyz'[k]} [N]")
+    for axis in axes:
+        axis.axvspan(ntrain, len(t), color="C2", alpha=0.08, lw=0)
+        axis.legend(loc="upper left", fontsize=7, framealpha=0.8)
+    axes[-1].set_xlabel("row")
+    figure.savefig(path, dpi=110)
