@@ -54,8 +54,12 @@ class Placed:
 
     def place(self, pos, mat):
         """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
+        self.geoms.set_pose(*self.pose(pos, mat))
+
+    def pose(self, pos, mat):
+        """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's frame."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
-        self.geoms.set_pose((pos + mat @ self._pos)[:, None], (mat @ self._mat)[:, None])
+        return (pos + mat @ self._pos)[:, None], (mat @ self._mat)[:, None]
 
     def nearest(self, points: wp.array) -> np.ndarray:
         """(nworld,) signed distance to the nearest of points (n,) vec3 [m], at most 2 mm."""
