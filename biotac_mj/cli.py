@@ -45,6 +45,7 @@ def parser() -> argparse.ArgumentParser:
     _add_import_mesh(verbs)
     _add_calibrate(verbs)
     _add_compare(verbs)
+    _add_diagnose(verbs)
     _add_generate(verbs)
     _add_learning(verbs)
     return top
@@ -274,6 +275,28 @@ def _generate(args):
 
     _calm_warp()
     verbs.generate_verb(args)
+
+
+def _add_diagnose(verbs):
+    verb = _verb(verbs, "diagnose", _diagnose, "Name what the simulation misses in measured data; writes report.html and verdict.json.")
+    verb.add_argument("data", nargs="?", metavar="DATA", help="HDF5 of measured trajectories (docs/discrepancy.md)")
+    verb.add_argument("--sensor", metavar="FILE.yaml", help="the simulator that is compared with DATA (default: our own sensor)")
+    verb.add_argument("--electrodes", metavar="FILE", help="plain recording instead: text, 19 columns of raw counts, one row per sample")
+    verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
+    verb.add_argument("--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row")
+    verb.add_argument("--rate", type=float, default=None, metavar="HZ", help="rows per second (default: guessed from repeated rows, else 100)")
+    verb.add_argument("--locked", type=float, default=None, metavar="SHARE",
+                      help="of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)")  # fmt: skip
+    verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
+    verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _diagnose(args):
+    from .discrepancy import verbs
+
+    _calm_warp()
+    verbs.diagnose_verb(args)
 
 
 def _calm_warp():

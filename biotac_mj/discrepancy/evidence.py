@@ -1,0 +1,58 @@
+"""Tests whose unit is the block of time or the trajectory, never the sample."""
+
+import numpy as np
+
+__all__ = ["benjamini_hochberg", "max_t", "sign_flip", "wilson"]
+
+
+def sign_flip(gain, draws=4000, seed=0) -> float:
+    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of them."""
+    gain = np.asarray(gain, float)
+    n = len(gain)
+    if n <= 12:
+        sign = 1 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
+    else:
+        sign = np.random.default_rng(seed).choice([-1, 1], (draws, n))
+        sign[0] = 1  # the data themselves: p is never zero
+    return float(np.mean((sign * gain).mean(1) >= gain.mean() - 1e-15))
+
+
+def max_t(statistic, draws=2000, seed=0):
+    """Family-wise p of many cells by sign flips of whole units (Andreella and Finos 2026; max-T of Westfall and Young).
+
+    Args:
+      statistic: (units, cells), one number for each trajectory or block and cell, symmetric about zero under the null; nan where a unit
+        has nothing to say about a cell.
+
+    Returns:
+      t (cells,), p (cells,) adjusted.
+    """
+    x = np.asarray(statistic, float)
+    known = np.isfinite(x)
+    x = np.where(known, x, 0.0)
+    scale = np.sqrt(np.maximum((x**2).sum(0), 1e-30))
+    t = x.sum(0) / scale
+    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, len(x)))
+    sign[0] = 1
+    largest = np.abs(sign @ x / scale).max(1)
+    return t, np.array([np.mean(largest >= abs(v) - 1e-12) for v in t])
+
+
+def benjamini_hochberg(p):
+    """Adjusted p-values (false discovery rate) of p (n,)."""
+    p = np.asarray(p, float)
+    order = np.argsort(p)
+    ranked = p[order] * len(p) / np.arange(1, len(p) + 1)
+    out = np.empty_like(ranked)
+    out[order] = np.minimum(np.minimum.accumulate(ranked[::-1])[::-1], 1)
+    return out
+
+
+def wilson(hits, total, z=1.96):
+    """95 % interval of a share."""
+    if not total:
+        return 0.0, 1.0
+    p = hits / total
+    centre = (p + z**2 / (2 * total)) / (1 + z**2 / total)
+    half = z * np.sqrt(p * (1 - p) / total + z**2 / (4 * total**2)) / (1 + z**2 / total)
+    return max(0.0, centre - half), min(1.0, centre + half)

@@ -1,0 +1,274 @@
+"""Diagnosis of plain recordings: what the sensor's model misses, found on the first part, checked on the part kept aside.
+
+The model is amended step by step: faults of samples, then noise, then what develops over time, then what lies between force and electrodes;
+each round takes the effect with the most evidence, takes it out of the recording and looks again.
+"""
+
+import dataclasses
+
+import numpy as np
+import tqdm
+
+from .drifts import CountGain, CountOffset, Drift, GainChange, SharedGain, Thermal
+from .faults import Freeze, Quantise, Saturate, Spikes, Stuck, Swap
+from .loads import Hysteresis, Latency, LoadLowPass, Relaxation
+from .noises import CommonNoise, CrossTalk, Hum, LowPass, Noise
+from .recorded_effect import Session
+from .recorded_gap import gap, statistics
+from .recorded_rest import cells, remainder
+from .recording import Recording
+
+__all__ = ["EFFECTS", "RecordingDiagnosis", "diagnose_recording"]
+
+EFFECTS = [Freeze(), Stuck(), Saturate(), Quantise(), Spikes(), Swap(), Hum(), LowPass(), CrossTalk(), CommonNoise(), Noise(), SharedGain(),
+           CountOffset(), CountGain(), Thermal(), Drift(), GainChange(), Latency(), LoadLowPass(), Relaxation(), Hysteresis()]  # fmt: skip
+_COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
+_FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
+_MOVING = [EFFECTS[5], *EFFECTS[11:17]]
+_FORCE = EFFECTS[17:]
+_MOST = 8
+
+
+@dataclasses.dataclass
+class RecordingDiagnosis:
+    """What was found.
+
+    Attributes:
+      recording; locked: share kept aside at the end; verdict: one line; findings: accepted, the strongest first; rejected: those that the
+      part kept aside does not confirm; where: list of cells (channel, from, to, z, p); gap: dict of views with before and after;
+      remainder: dict that describes what is left; notes: what the data cannot tell; session: counts without the effects.
+    """
+
+    recording: Recording
+    locked: float
+    verdict: str
+    findings: list
+    rejected: list
+    where: list
+    gap: dict
+    remainder: dict
+    notes: list
+    session: Session
+
+
+def diagnose_recording(recording: Recording, locked: float | None = None, effects=(), progress: bool = False) -> RecordingDiagnosis:
+    """Finds what the model misses in one recording.
+
+    Args:
+      recording: Recording.
+      locked: share of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
+      effects: further RecordedEffect objects, tried with those that develop over time.
+      progress: whether to show a bar.
+
+    Raises:
+      ValueError: a share that leaves too little on one side.
+    """
+    locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
+    n = len(recording)
+    if not 0.1 <= locked <= 0.6:
+        raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
+    fit = np.arange(n) < round(n * (1 - locked))
+    with tqdm.tqdm(total=6, desc="diagnose", disable=not progress, leave=False) as bar:
+        session = Session(recording, fit)
+        _search(session, effects, bar)
+        late = _late(session, effects)
+        bar.update()
+        rejected = statistics(session)
+        result = RecordingDiagnosis(recording, locked, "", session.findings, rejected, [], {}, {}, [], session)
+        _settle(result, late)
+        result.where = cells(session)
+        result.gap = gap(session, result.findings)
+        result.remainder = remainder(session)
+        result.notes = _notes(result)
+        result.verdict = _verdict(result)
+        bar.update()
+    return result
+
+
+def _search(session, effects, bar):
+    for effect in _FAULTS:
+        for finding in effect.find(session):
+            session.accept(finding)
+    bar.update()
+    swap = _MOVING[0].find(session)
+    for finding in swap:
+        session.accept(finding)
+    for effect in _NOISE:
+        for _ in range(3):
+            found = effect.find(session)
+            for finding in found:
+                session.accept(finding)
+            if not found or not isinstance(effect, Hum):
+                break
+    bar.update()
+    for _ in range(_MOST):
+        candidates = [f for effect in (*_MOVING[1:], *effects) for f in effect.find(session)]
+        chosen = _choose(session, candidates)
+        if chosen is None:
+            break
+        session.accept(chosen)
+    bar.update()
+    for _ in range(4):
+        done = {f.id for f in session.findings}
+        candidates = [f for effect in _FORCE if effect.id not in done for f in effect.find(session)]
+        if not candidates:
+            break
+        session.accept(_choose_force(candidates))
+    bar.update()
+
+
+def _choose(session, candidates):
+    """The strongest; common patterns are told apart by how well they fit, and tied where they fit alike."""
+    if not candidates:
+        return None
+    best = max(candidates, key=lambda f: f.nats)
+    common = [f for f in candidates if f.id in _COMMON]
+    if common and not session.timeline().loaded and max(f.nats for f in common) > 0.3 * best.nats:
+        best = max(common, key=lambda f: f.nats)  # its pattern was checked electrode by electrode
+    # A change of one electrode leaks into the common pattern and the other way round; the matched one has more energy.
+    if best.id in _COMMON:
+        single = [f for f in candidates if f.id == "drift" and f.nats > 0.7 * best.nats]
+        if session.timeline().loaded and single and _energy(session, single[0]) > _energy(session, best):
+            return single[0]
+        patterns = [f for f in common if "misfit" in f.theta]
+        thermal = [f for f in common if f.id == "thermal"]
+        if patterns:
+            order = sorted(patterns, key=lambda f: f.theta["misfit"])
+            loaded = session.timeline().loaded
+            slack = 12.0 if not loaded else 6.0
+            best = order[0]
+            near = [f for f in order if f.theta["misfit"] - order[0].theta["misfit"] < slack]
+            preferred = [f for f in near if f.id == "warmup"]
+            best = preferred[0] if preferred else best
+            best.ties = tuple(f.id for f in near if f is not best)
+        if thermal:
+            if not patterns or thermal[0].nats > best.nats + 3:
+                best = thermal[0]
+            elif thermal[0].nats > best.nats - 3:
+                best.ties = (*best.ties, "thermal")
+    return best
+
+
+def _energy(session, finding):
+    line = session.timeline()
+    pattern = finding.theta["pattern"][line.used]
+    series, sd = line.amplitude(pattern)
+    shape = finding.theta.get("shape")
+    share = shape.explained if shape is not None else 1.0
+    return float(((series - series.mean()) ** 2).sum() * share / sd**2)
+
+
+def _choose_force(candidates):
+    """The effect with the largest gain; those within one standard error of it (paired, over blocks) are ties."""
+    best = max(candidates, key=lambda f: f.theta["gain"].mean())
+    for other in candidates:
+        if other is not best:
+            lead = best.theta["gain"] - other.theta["gain"]
+            if lead.mean() < lead.std(ddof=1) / np.sqrt(len(lead)):
+                best.ties = (*best.ties, other.id)
+    return best
+
+
+def _late(session, effects):
+    """Effects that begin in the part kept aside: searched in the whole record, less what was found."""
+    whole = Session(session.recording, np.ones(len(session.recording), bool))
+    whole.counts, whole.masked, whole.force = session.counts.copy(), session.masked.copy(), session.force
+    begin = session.recording.time[~session.fit][0]
+    late = []
+    for effect in _FAULTS:
+        for finding in effect.find(whole):
+            known = [f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)]
+            if known:  # the same fault goes on: its samples are masked, it is no second finding
+                whole.accept(finding)
+                session.masked |= whole.masked
+                for f in known:
+                    if "mask" in f.theta:
+                        f.theta["mask"] = finding.theta["mask"]
+                    f.end = max(f.end, finding.end)
+            elif finding.start >= begin - 1 or finding.id in ("spikes",):
+                whole.accept(finding)
+                late.append(finding)
+    for _ in range(4):
+        candidates = [f for effect in (*_MOVING, *_NOISE[:1], *effects) for f in effect.find(whole)]
+        known = {(f.id, f.channels) for f in session.findings}
+        candidates = [f for f in candidates if (f.id, f.channels) not in known]  # an extrapolation that is a little off is no new effect
+        if any(f.id in _COMMON for f in session.findings):
+            candidates = [f for f in candidates if f.id not in _COMMON or f.nats > 40]
+        candidates = [f for f in candidates if f.start >= begin - 0.02 * session.recording.time[-1]]
+        chosen = _choose(whole, [f for f in candidates if f.id != "hum"]) or (candidates[0] if candidates else None)
+        if chosen is None:
+            break
+        whole.accept(chosen)
+        late.append(chosen)
+    for finding in late:
+        finding.verified = None
+        finding.note += "; begins in the part kept aside, so nothing is left to confirm it"
+    session.late = late
+    return late
+
+
+def _settle(result, late):
+    session = result.session
+    result.rejected = [f for f in session.findings if f.verified is False]
+    keep = [f for f in session.findings if f.verified is not False] + late
+    session.findings = keep
+    replay = Session(session.recording, session.fit)
+    replay.masked = session.masked
+    for finding in [*keep]:
+        replay._take_out(finding)
+    replay.findings = keep
+    result.session = replay
+    result.findings = sorted(keep, key=lambda f: -f.nats)
+    for finding in result.findings:
+        finding.confidence = _confidence(finding)
+
+
+def _confidence(finding):
+    """Logistic in the evidence, lowered by ties and by what could not be checked; see docs/discrepancy.md for its calibration."""
+    x = 0.6 + 0.9 * np.log1p(max(finding.nats, 0) / 10)
+    x -= 1.0 * (finding.verified is None)
+    p = 1 / (1 + np.exp(-x))
+    return float(p / (1 + len(finding.ties)) if finding.ties else p)
+
+
+def _notes(result):
+    """What the recording cannot tell."""
+    r, session = result.recording, result.session
+    line = session.timeline()
+    notes = [f"rate {r.rate:.1f} Hz ({r.rate_source})"]
+    if r.force is None:
+        notes.append("no force: latency, relaxation and hysteresis against the load cannot be known; give --force to see them")
+    elif result.session.force_view() is None:
+        notes.append("the electrodes do not predict the force (or it does not change): nothing between force and electrodes can be known")
+    if r.tdc is None:
+        notes.append("no TDC: a change with temperature cannot be told from one with time; give --tdc, or switch the heater off and on")
+    if line.loaded:
+        notes.append(
+            "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole record cannot be told from its calibration"
+        )
+        if r.force is not None and not (np.linalg.norm(r.force, axis=1) < 0.1).any():
+            notes.append("no free segment: the rest values cannot be checked; leave the sensor untouched at both ends")
+    else:
+        notes.append("the sensor is not loaded: gains, saturation and cross-talk of signals cannot be known; press it")
+    if r.rest_correlation < 0.5:
+        notes.append(
+            f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published sensors (0.9 among them): check the channels' order"
+        )
+    return notes
+
+
+def _verdict(result):
+    if not result.findings and not result.remainder.get("significant"):
+        return "no significant disagreement"
+    parts = []
+    for f in result.findings:
+        names = {e.id: e.name for e in EFFECTS}
+        tie = f" (or {', '.join(names.get(t, t) for t in f.ties)}: not distinguished)" if f.ties else ""
+        where = "" if len(f.channels) >= 12 else " of " + ", ".join(f"e{k + 1}" for k in f.channels)
+        parts.append(f"{f.effect.name}{where}{tie}")
+    text = "; ".join(parts)
+    if result.remainder.get("significant"):
+        text = f"partly: {text}; remainder unknown" if parts else "unknown"
+        text += f" ({result.remainder['text']})"
+        return text
+    return ("named: " if len(parts) == 1 else "several: ") + text

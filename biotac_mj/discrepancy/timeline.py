@@ -1,0 +1,109 @@
+"""How 19 electrodes move together: time bins, the load's covariance, and the amplitude of a pattern over time.
+
+ln Z of all electrodes moves on few dimensions while the skin is loaded. The covariance S of *fast* changes (within a few seconds) knows
+these and the noise, and hardly any drift. For a pattern p the amplitude a(t) = p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the load
+disturbs least (the minimum-variance filter, Capon, Proc. IEEE 57, 1969). With p = e_k it is the residual of predicting electrode k from the
+other 18, with p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain average: one formula for both.
+"""
+
+import numpy as np
+
+from .recording import Recording, log_impedance
+
+__all__ = ["Timeline", "noise_level"]
+
+_FAST = 4.0  # [s] window within which a change counts as fast
+_BINS = 1200  # at most
+
+
+class Timeline:
+    """Bins of a recording. m bins, c usable electrodes.
+
+    Args:
+      recording: Recording.
+      counts: (n, 19) to use in its place, e.g. corrected for an effect.
+      masked: (n, 19) bool, samples that are no measurement; an electrode masked for more than half of the rows is left out.
+
+    Attributes:
+      width: rows per bin; time: (m,) [s] of the bins' middle; value: (m, c) ln Z; used: (c,) electrode numbers from 0.
+      noise: (c,) standard deviation of a bin's value from white noise of the samples [ln Z].
+      covariance: (c, c) of fast changes; loaded: whether the skin was loaded.
+    """
+
+    def __init__(self, recording: Recording, counts=None, masked=None):
+        counts = recording.electrodes if counts is None else counts
+        n = len(counts)
+        seconds = n / recording.rate
+        self.width = max(1, int(round(max(0.25, seconds / _BINS) * recording.rate)), 1)
+        self.width = min(self.width, max(1, n // 200))
+        m = n // self.width
+        good = np.ones(counts.shape, bool) if masked is None else ~masked
+        self.used = np.flatnonzero(good.mean(0) > 0.5)
+        y = log_impedance(counts)[:, self.used]
+        good = good[:, self.used]
+        self.time = (np.arange(m) + 0.5) * self.width / recording.rate
+        self.period = self.width / recording.rate
+        shape = (m, self.width, len(self.used))
+        y, good = y[: m * self.width].reshape(shape), good[: m * self.width].reshape(shape)
+        weight = good.sum(1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self.value = np.where(weight > 0, (y * good).sum(1) / weight, np.nan)
+        slope = 4095 / (np.clip(counts[:, self.used], 1, 4094) * (4095 - np.clip(counts[:, self.used], 1, 4094)))
+        sample = noise_level(counts[:, self.used], recording.repeated) * np.median(slope, axis=0)
+        effective = max(1.0, self.width * (1 - recording.repeated.mean()))
+        self.noise = np.maximum(sample, 1e-5) / np.sqrt(effective)
+        self._fill()
+        self.covariance = self._fast_covariance()
+        activity = np.sqrt(np.diag(self.covariance)) / self.noise
+        self.loaded = bool(np.median(np.sort(activity)[-6:]) > 5)
+
+    def _fill(self):
+        """Bins without a good sample take the conditional mean given the others, or the electrode's median."""
+        hole = np.isnan(self.value)
+        self.hole = hole
+        if not hole.any():
+            return
+        median = np.nanmedian(self.value, axis=0)
+        filled = np.where(hole, median, self.value)
+        centred = filled - median
+        cov = centred.T @ centred / len(filled) + np.diag(self.noise**2)
+        for row in np.flatnonzero(hole.any(1)):
+            miss = hole[row]
+            if not miss.all():
+                filled[row, miss] = median[miss] + cov[np.ix_(miss, ~miss)] @ np.linalg.solve(
+                    cov[np.ix_(~miss, ~miss)], centred[row, ~miss]
+                )
+        self.value = filled
+
+    def _fast_covariance(self):
+        span = int(np.clip(round(_FAST / self.period), 6, max(6, len(self.time) // 12)))
+        k = len(self.time) // span
+        x = self.value[: k * span].reshape(k, span, -1)
+        basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
+        x = x - basis @ (basis.T @ x)
+        # A step inside one window is a change of the sensor, not the load's: the liveliest windows give way to the next.
+        energy = (x**2).sum((1, 2))
+        x = x[energy <= np.quantile(energy, 0.98)].reshape(-1, x.shape[2])
+        return x.T @ x / len(x) * span / (span - 2) + np.diag(self.noise**2)
+
+    def amplitude(self, pattern):
+        """(m,) of a pattern (c,), about its mean, and the standard deviation that fast changes give it."""
+        q = np.linalg.solve(self.covariance, pattern)
+        scale = pattern @ q
+        return (self.value - self.value.mean(0)) @ q / scale, 1 / np.sqrt(scale)
+
+    def predicted(self, k):
+        """(m,) deviation of electrode `used[k]` from its mean as the others predict it [ln Z]."""
+        unit = np.zeros(len(self.used))
+        unit[k] = 1
+        return self.value[:, k] - self.value[:, k].mean() - self.amplitude(unit)[0]
+
+
+def noise_level(counts, repeated=None):
+    """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the quietest quarter of the record."""
+    x = counts if repeated is None else counts[~repeated]
+    d = np.diff(x, n=2, axis=0) / np.sqrt(6)
+    size = max(20, len(d) // 60)
+    k = max(1, len(d) // size)
+    blocks = (d[: k * size].reshape(k, -1, d.shape[1]) ** 2).mean(1)
+    return np.maximum(np.sqrt(np.quantile(blocks, 0.25, axis=0)), 0.05)
