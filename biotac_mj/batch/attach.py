@@ -1,0 +1,206 @@
+"""`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them into `mujoco_warp.step`."""
+
+import mujoco
+import numpy as np
+
+from ..coupling.attach import _add_slots, _check_place, _model
+from ..coupling.config import Config
+from ..coupling.fem import _choices, _grid, rest_geometry
+from ..coupling.fem import _model as skin_model
+from ..coupling.skins import reference
+from ..coupling.touching import Touching
+from ..plugin.structs import ModelView
+from ..skin.material import Material
+from ..skin.material import material as preset
+from .batch import Batch, Hook
+from .skin import BatchSkin
+
+__all__ = ["add", "attach"]
+
+CHANNELS = ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
+_SPRINGLESS = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+_ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+
+
+def add(spec, site=None, body=None, pos=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0), prefix="biotac_", skin="default", slots=None) -> str:
+    """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
+
+    Args:
+      spec: the MjSpec to change. Add the objects first, as for `biotac_mj.attach`.
+      site, body: name of the site or the body it is fixed to; neither is the world.
+      pos, quat: pose [m] of the BioTac frame there.
+      prefix: of every name it adds.
+      skin: as for `biotac_mj.attach`; give `attach` the same.
+      slots: how many bodies that move may touch it two-way; None counts those with colliding geoms now.
+
+    Returns:
+      prefix.
+
+    Raises:
+      ValueError: unknown site or body; the prefix is taken. FileNotFoundError: no such skin.
+    """
+    _check_place(spec, site, body, prefix)
+    if slots is None:
+        slots = len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
+    child = _model(reference(skin)[1])
+    child.body("core").pos, child.body("core").quat = pos, quat
+    if site is not None:
+        spec.attach(child, site=spec.site(site), prefix=prefix)
+    else:
+        parent = spec.worldbody if body is None else spec.body(body)
+        spec.attach(child, frame=parent.add_frame(), prefix=prefix)
+    _add_slots(spec, spec.body(prefix + "core"), prefix, slots)
+    for i in range(slots):
+        weld = spec.equality(f"{prefix}couple{i}")  # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
+        weld.active, weld.name2 = True, "world"
+    return prefix
+
+
+def attach(
+    mjm,
+    m,
+    d,
+    prefix="biotac_",
+    skin="default",
+    material=None,
+    liquid=None,
+    friction=None,
+    priority=0,
+    coupling="two-way",
+    geoms=None,
+    rounding=None,
+    seed=0,
+    readings=True,
+    options=None,
+) -> Batch:
+    """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on `mjw.step(m, d)` steps them too.
+
+    Args:
+      mjm: the MjModel, made from a spec that `add` changed; m, d: mujoco_warp's Model and Data of it. Make room for six constraint rows
+        per touching body that moves: `mjw.put_data(mjm, mjd, nworld)` after `mj_forward` does, `mjw.make_data` with `njmax`.
+      prefix, skin: as given to `add`.
+      material: name, dict or Material of all worlds, or a sequence of one for each world, all of one law and element.
+      liquid, priority, coupling, geoms, rounding: as for `biotac_mj.attach`.
+      friction: of the skin, one number or (nworld,); None takes the material's choice.
+      seed: of world 0's noise; world w has seed + w. Or (nworld,).
+      readings: False leaves the electrodes and pressure channels out (force and status remain); True or a dict of `PhysicsReadings`'
+        settings: noise, sensor, film_every_step, temperature.
+      options: {"skin": {...}} settings of SkinOptions.
+
+    Raises:
+      ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or (two-way) equality
+        constraints disabled, or has no room for the rows; a number of materials or frictions that is not nworld.
+    """
+    nworld = d.nworld
+    materials = _materials(material, nworld)
+    single = materials[0] if materials else material
+    single = single if isinstance(single, (dict, str, type(None))) else _as_dict(single)
+    chosen = Material(**single) if isinstance(single, dict) else preset(single or "default")
+    mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
+    config = Config(
+        skin=reference(skin)[0], material=single, liquid=chosen.liquid if liquid is None else bool(liquid), coupling=coupling, geoms=geoms,
+        rounding=dict(rounding or {}), friction=float(mu[0]), priority=int(priority), device=str(m_device(d)), options=dict(options or {}),
+    )  # fmt: skip
+    view = ModelView(mjm._address)
+    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
+    if core < 0:
+        names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
+        raise ValueError(f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are {names}")
+    _check_model(mjm, coupling)
+    touching = Touching(view, core, config)
+    slots = _slots(mjm, m, d, touching, prefix) if coupling == "two-way" else {}
+    geometry = reference(skin)[1]
+    fem = skin_model(geometry, *_choices(config), config.device)
+    if fem.options.dynamics != "quasistatic":
+        raise ValueError("a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia")
+    grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
+    skins = BatchSkin(fem, nworld, touching.geoms, grids, _frictions(mjm, touching.geom, mu, priority), materials, bool(slots))
+    film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, config.device)
+    addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
+    batch = Batch(mjm, m, d, touching, slots, skins, film, acquisition, addresses, coupling == "two-way")
+    Hook.of(m).add(batch)
+    return batch
+
+
+def m_device(d):
+    return d.qpos.device
+
+
+def _as_dict(material):
+    import dataclasses
+
+    return dataclasses.asdict(material)
+
+
+def _materials(material, nworld):
+    if material is None or isinstance(material, (str, dict, Material)):
+        return None
+    out = [Material(**x) if isinstance(x, dict) else preset(x) for x in material]
+    if len(out) != nworld:
+        raise ValueError(f"{len(out)} materials for {nworld} worlds: pass one for each, or a single one for all")
+    return out
+
+
+def _per_world(value, nworld, default):
+    out = np.asarray(default if value is None else value, float)
+    if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
+        raise ValueError(f"friction has shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)")
+    return np.broadcast_to(out, nworld)
+
+
+def _frictions(mjm, geom, friction, priority):
+    """(nworld, ngeom) by MuJoCo's rule: the larger one, or that of the higher priority."""
+    other, rank = mjm.geom_friction[geom, 0], mjm.geom_priority[geom]
+    return np.where(rank == priority, np.maximum(other, friction[:, None]), np.where(rank > priority, other, friction[:, None]))
+
+
+def _sensor(mjm, name):
+    return mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SENSOR, name)
+
+
+def _check_model(mjm, coupling):
+    if mjm.opt.integrator in (int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_DISCRETE)):
+        raise ValueError("a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler")
+    if mjm.opt.disableflags & _SPRINGLESS == _SPRINGLESS:
+        raise ValueError("mujoco_warp asks for no passive forces where springs and dampers are both disabled: enable one of the flags")
+    if coupling == "two-way" and mjm.opt.disableflags & _ROWLESS:
+        raise ValueError("two-way coupling needs the flags constraint and equality: enable them, or use coupling='one-way'")
+    if mjm.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
+        raise ValueError("a touched body must not sleep: disable the flag sleep")
+
+
+def _slots(mjm, m, d, touching, prefix):
+    """{body that moves against the BioTac: weld constraint whose rows it gets}; takes their meaning from the welds, in m and d too."""
+    core, tree = touching.core, mjm.body_treeid
+    roots = [int(mjm.body_weldid[b]) if tree[b] >= 0 else 0 for b in touching.body]
+    needed = sorted({root for root in roots if root or tree[core] >= 0})
+    welds = [i for i in range(mjm.neq) if (mjm.eq(i).name or "").startswith(prefix + "couple")]
+    if len(needed) > len(welds):
+        raise ValueError(
+            f"{len(needed)} bodies can touch the BioTac {prefix!r} but it has room for {len(welds)}: add it after the objects, pass "
+            "add(slots=...), or name the geoms that may touch with attach(geoms=[...])"
+        )
+    rows = sum(6 if t == mujoco.mjtEq.mjEQ_WELD else 3 if t == mujoco.mjtEq.mjEQ_CONNECT else 1 for t in mjm.eq_type)
+    if needed and d.njmax < rows + 7:
+        raise ValueError(f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a larger njmax")
+    first, second, active0, active = (a.numpy().copy() for a in (m.eq_obj1id, m.eq_obj2id, m.eq_active0, d.eq_active))
+    for k, weld in enumerate(welds):
+        used = k < len(needed)
+        first[weld], second[weld] = core, needed[k] if used else 0
+        active0[weld], active[:, weld] = used, used
+    for target, value in ((m.eq_obj1id, first), (m.eq_obj2id, second), (m.eq_active0, active0), (d.eq_active, active)):
+        target.assign(value)
+    slot = dict(zip(needed, welds))
+    return {g: slot[root] for g, root in enumerate(roots) if root in slot}
+
+
+def _readings(choice, geometry, nworld, seed, device):
+    if choice is False:
+        return None, None
+    from ..sensor.batch_acquisition import BatchAcquisition
+    from ..sensor.batch_film import BatchFilm
+    from ..sensor.film import FilmConduction
+
+    settings = {} if choice is True else dict(choice)
+    film = BatchFilm(FilmConduction(geometry, sensor=settings.pop("sensor", "1")), nworld, device)
+    return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)

@@ -1,0 +1,344 @@
+"""BioTacs in mujoco_warp against the engine plugin in MuJoCo: one world of the batch is one simulation on the CPU."""
+
+import mujoco
+import numpy as np
+import pytest
+
+mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+
+# ruff: noqa: E402
+import warp as wp
+
+import biotac_mj
+from biotac_mj import batch as batches
+from biotac_mj.geometry import load_skin
+from biotac_mj.sensor import channels
+from biotac_mj.sensor.readings import PhysicsReadings
+from biotac_mj.skin.material import material as preset
+
+DT = 2e-3
+SKIN = "coarse"
+RADIUS = 3.5e-3
+K = 2.8e11  # [Pa/m] one contact stiffness, so that materials differ in nothing but what is said
+
+
+def press_spec():
+    """A sphere that goes where it is told, below the pad."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = DT
+    pin = spec.worldbody.add_body(name="pin", pos=[-0.012, -0.03, 0], mocap=True)
+    pin.add_geom(name="pin", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0])
+    return spec
+
+
+def ball_spec(mass=0.01):
+    """A ball that can move towards the pad; gravity points there."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = DT
+    spec.option.gravity = [0, 9.81, 0]
+    ball = spec.worldbody.add_body(name="ball", pos=[-0.012, -0.0111, 0])
+    ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=mass)
+    return spec
+
+
+def impact_spec():
+    """A free finger and a free ball that will meet it off its centre, without gravity."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = DT
+    spec.option.gravity = [0, 0, 0]
+    finger = spec.worldbody.add_body(name="finger")
+    finger.add_freejoint()
+    finger.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.02, contype=0, conaffinity=0)
+    ball = spec.worldbody.add_body(name="ball", pos=[-0.012, -0.0112, 0.001])
+    ball.add_freejoint()
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.01)
+    return spec
+
+
+def make(spec, nworld, body=None, **settings):
+    """mjm, m, d and the Batch of a spec."""
+    batches.add(spec, body=body, skin=SKIN)
+    if body is not None:  # all mass where the joint is: MuJoCo's own integration of a free body errs without
+        spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=nworld)
+    return mjm, m, d, batches.attach(mjm, m, d, skin=SKIN, **settings)
+
+
+def read(mjm, d, channel):
+    """(nworld, dim) of a channel."""
+    sensor = mjm.sensor(f"biotac_{channel}")
+    return d.sensordata.numpy()[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+
+
+def places(nworld, seed=0):
+    """Random places under the pad where the sphere has not yet met it (nworld, 3) [m]."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-0.4, 0.4, nworld)
+    reach = 7.2e-3 + RADIUS
+    return np.stack([rng.uniform(-13e-3, -4e-3, nworld), -reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+
+
+def move(d, pos):
+    d.mocap_pos.assign(np.asarray(pos, np.float32)[:, None])
+
+
+def press(m, d, start, steps, depth):
+    """Steps while the spheres go along their radius by depth (nworld,) [m]; yields after each step."""
+    inwards = -start * [0, 1, 1] / np.linalg.norm(start[:, 1:], axis=1, keepdims=True)
+    for k in range(1, steps + 1):
+        move(d, start + (k / steps * np.asarray(depth))[:, None] * inwards)
+        mjw.step(m, d)
+        yield k
+
+
+def single(pos, settings):
+    """Force (nstep, 6), electrodes and pdc of one world by the engine plugin over the poses pos (nstep, 3)."""
+    spec = press_spec()
+    handle = biotac_mj.attach(spec, skin=SKIN, **settings)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rows = []
+    for p in pos:
+        data.mocap_pos[0] = p.astype(np.float32)
+        mujoco.mj_step(model, data)
+        rows.append(np.concatenate([handle.read(data, c) for c in ("contact_force", "electrodes", "pdc")]))
+    return np.array(rows)
+
+
+def compare_with_single_worlds(nworld, steps, force_error, counts):
+    rng = np.random.default_rng(1)
+    base = preset("default")
+    materials = [{**_fields(base), "youngs_modulus": e} for e in base.youngs_modulus * rng.uniform(0.6, 1.5, nworld)]
+    friction, depth, start = rng.uniform(0.2, 1.0, nworld), rng.uniform(0.8e-3, 1.6e-3, nworld), places(nworld)
+    options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}}
+    mjm, m, d, _ = make(
+        press_spec(), nworld, material=materials, friction=friction, priority=1, options=options, readings={"noise": False}
+    )  # fmt: skip
+    rows, paths = [], []
+    for _ in press(m, d, start, steps, depth):
+        rows.append(np.concatenate([read(mjm, d, c) for c in ("contact_force", "electrodes", "pdc")], axis=1))
+        paths.append(d.mocap_pos.numpy()[:, 0].astype(float))
+    got, paths = np.stack(rows, axis=1), np.stack(paths, axis=1)
+    assert (read(mjm, d, "status")[:, 0] == 1).all()
+    worst = 0.0
+    for w in range(nworld):
+        settings = {"material": materials[w], "friction": friction[w], "priority": 1}
+        options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}, "readings": {"noise": False}}
+        expected = single(paths[w], settings | {"options": options})
+        scale = np.linalg.norm(expected[:, :3], axis=1).max()
+        assert scale > 0.2
+        np.testing.assert_allclose(got[w, :, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}")
+        np.testing.assert_allclose(got[w, :, 6:], expected[:, 6:], atol=counts, err_msg=f"world {w}")
+        worst = max(worst, np.abs(got[w, :, :3] - expected[:, :3]).max() / scale)
+    return worst
+
+
+def _fields(material):
+    import dataclasses
+
+    return dataclasses.asdict(material)
+
+
+def test_each_world_is_the_single_simulation():
+    compare_with_single_worlds(3, 10, force_error=2e-3, counts=1)
+
+
+@pytest.mark.slow
+def test_64_random_worlds_are_the_single_simulations():
+    print(f"largest force error {compare_with_single_worlds(64, 25, force_error=0.01, counts=3):.1e}")
+
+
+def test_readings_are_those_of_the_single_sensor():
+    nworld = 2
+    mjm, m, d, batch = make(press_spec(), nworld, seed=[5, 7])
+    sensors = [PhysicsReadings(load_skin(SKIN), seed=s) for s in (5, 7)]
+    states = np.zeros((nworld, sensors[0].nstate))
+    for sensor, state in zip(sensors, states):
+        sensor.reset(state)
+    for k in press(m, d, places(nworld), 12, [1.2e-3] * nworld):
+        x, pressure = batch.vert_xpos, batch.skin.pressure.numpy()
+        for w, sensor in enumerate(sensors):
+            sensor.advance(states[w], (k - 1) * DT, DT, x[w], pressure[w])
+            expected = sensor.readings(states[w])
+            for name in ("electrodes", "pdc", "pac", "tac", "tdc"):
+                np.testing.assert_array_equal(read(mjm, d, name)[w], expected[name], err_msg=f"{name}, step {k}")
+    change = read(mjm, d, "electrodes") - channels.REST_COUNTS["1"]
+    assert np.abs(pressure).min() > 1000 and change.min() < -50 and change.max() > 20
+
+
+def run(bad_step=None, bad_pose=None, bad_world=1, nworld=3, steps=8):
+    """Sensordata (nstep, nworld, n) of a press, one world of which may get a wrong pose for a step."""
+    mjm, m, d, _ = make(press_spec(), nworld)
+    start, rows = places(nworld), []
+    inwards = -start * [0, 1, 1] / np.linalg.norm(start[:, 1:], axis=1, keepdims=True)
+    for k in range(steps):
+        pos = start + 1.2e-3 * k / steps * inwards
+        if k == bad_step:
+            pos[bad_world] = bad_pose
+        move(d, pos)
+        mjw.step(m, d)
+        rows.append(d.sensordata.numpy().copy())
+    return mjm, np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("step", "pose"), [(5, [np.nan, 0, 0]), (0, [np.nan, 0, 0]), (5, [-12e-3, -4e-3, 0])], ids=["nan", "nan at once", "in the core"]
+)
+def test_a_world_with_a_bad_pose_is_flagged_and_disturbs_no_other(step, pose):
+    mjm, good = run()
+    _, bad = run(step, pose)
+    others = [0, 2]
+    np.testing.assert_array_equal(bad[:, others], good[:, others])
+    status, force = mjm.sensor("biotac_status").adr[0], mjm.sensor("biotac_contact_force").adr[0]
+    assert (good[:, :, status] == 1).all()
+    assert bad[step, 1, status] == -1 and np.isnan(bad[step, 1, status + 3]) and (bad[step, 1, force : force + 6] == 0).all()
+    assert (np.delete(bad[:, 1, status], step) == 1).all()  # and goes on
+    np.testing.assert_allclose(bad[-1, 1, force : force + 3], good[-1, 1, force : force + 3], atol=0.05 * np.abs(good[-1, 1, force + 1]))
+    assert np.isfinite(np.delete(bad, step, axis=0)).all()
+
+
+def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
+    mjm, m, d, _ = make(ball_spec(), 2, readings=False)
+    for _ in range(150):
+        mjw.step(m, d)
+    weight = 0.01 * 9.81
+    np.testing.assert_allclose(read(mjm, d, "contact_force")[:, 1], weight, rtol=5e-3)
+    assert np.abs(d.qvel.numpy()).max() < 2e-4 and np.abs(d.qfrc_constraint.numpy()).max() < 0.01 * weight
+    spec = ball_spec()
+    handle = biotac_mj.attach(spec, skin=SKIN, readings="none")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(150):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(d.qpos.numpy()[:, 0], data.qpos[0], atol=1e-6)
+    np.testing.assert_allclose(read(mjm, d, "contact_force")[0], handle.read(data, "contact_force"), atol=5e-3 * weight)
+
+
+def test_finger_and_ball_exchange_momentum_and_lose_none():
+    mjm, m, d, _ = make(impact_spec(), 2, body="finger", readings=False)
+    velocity = d.qvel.numpy().copy()
+    velocity[:, 6:9] = [[0.02, 0.08, -0.01], [-0.03, 0.05, 0.02]]
+    velocity[1, 9:12] = [5, -3, 10]
+    d.qvel.assign(velocity)
+    data = mujoco.MjData(mjm)
+
+    def momentum():
+        out = []
+        for w in range(2):
+            data.qpos[:], data.qvel[:] = d.qpos.numpy()[w], d.qvel.numpy()[w]
+            mujoco.mj_forward(mjm, data)
+            mujoco.mj_subtreeVel(mjm, data)
+            out.append(np.concatenate([mjm.body_subtreemass[0] * data.subtree_linvel[0], data.subtree_angmom[0]]))
+        return np.array(out)
+
+    before, force = momentum(), 0.0
+    for _ in range(20):
+        mjw.step(m, d)
+        force = max(force, np.abs(read(mjm, d, "contact_force")).max())
+    after = momentum()
+    assert force > 0.05 and np.abs(d.qvel.numpy()[:, 6:9] - velocity[:, 6:9]).max() > 0.02
+    np.testing.assert_allclose(after[:, :3], before[:, :3], atol=2e-8)  # of 8e-4 N s, in single precision
+    np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=2e-3 * np.abs(before[:, 3:]).max())
+
+
+def test_reset_of_some_worlds():
+    mjm, m, d, batch = make(press_spec(), 3)
+    start = places(3)
+    for _ in press(m, d, start, 6, [1e-3] * 3):
+        pass
+    x = batch.vert_xpos
+    batch.reset([False, True, False])
+    now = batch.vert_xpos
+    np.testing.assert_array_equal(now[[0, 2]], x[[0, 2]])
+    np.testing.assert_array_equal(now[1], load_skin(SKIN).vert)
+    assert np.abs(x[1] - now[1]).max() > 3e-4
+    first = [read(mjm, d, "contact_force")[1].copy() for _ in press(m, d, start, 6, [1e-3] * 3)]
+    _, m, d, _ = make(press_spec(), 3)
+    again = [read(mjm, d, "contact_force")[1].copy() for _ in press(m, d, start, 6, [1e-3] * 3)]
+    np.testing.assert_allclose(first, again, atol=1e-3 * np.abs(again).max())  # the solver's tolerance
+    with pytest.raises(ValueError, match=r"world_mask has shape \(2,\).*\(3,\) of bool"):
+        batch.reset([True, False])
+
+
+def test_an_inactive_batch_changes_nothing():
+    mjm, m, d, batch = make(ball_spec(), 1, readings=False)
+    batch.active = False
+    for _ in range(20):
+        mjw.step(m, d)
+    assert d.qpos.numpy()[0, 0] == pytest.approx(0.5 * 9.81 * (20 * DT) ** 2, rel=0.06)  # free fall, through the pad
+    assert (read(mjm, d, "status") == 0).all()
+
+
+def test_a_callback_that_was_there_is_kept():
+    spec = ball_spec()
+    batches.add(spec, skin=SKIN)
+    mjm = spec.compile()
+    m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1)
+    seen = []
+    m.callback.passive = lambda m, d: seen.append("passive")
+    m.callback.sensor = lambda m, d, stage: seen.append("sensor")
+    batches.attach(mjm, m, d, skin=SKIN, readings=False)
+    mjw.step(m, d)
+    assert seen.count("passive") == 1 and seen.count("sensor") == 3 and read(mjm, d, "status")[0, 0] == 1
+
+
+def attach(mjm, nworld=1, **settings):
+    data = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, data)
+    put = {k: settings.pop(k) for k in ("njmax",) if k in settings}
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, data, nworld=nworld, **put)
+    return batches.attach(mjm, m, d, skin=SKIN, **settings)
+
+
+def test_errors_say_what_to_do():
+    spec = ball_spec()
+    with pytest.raises(
+        ValueError, match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are world, ball"
+    ):
+        attach(spec.compile())
+    batches.add(spec, skin=SKIN)
+    with pytest.raises(ValueError, match="prefix 'biotac_' is taken"):
+        batches.add(spec, skin=SKIN)
+    mjm = spec.compile()
+    with pytest.raises(ValueError, match="2 materials for 3 worlds: pass one for each"):
+        attach(mjm, 3, material=["default"] * 2)
+    with pytest.raises(ValueError, match=r"friction has shape \(2,\)"):
+        attach(mjm, 3, friction=[0.1, 0.2])
+    with pytest.raises(ValueError, match="quasi-static"):
+        attach(mjm, options={"skin": {"dynamics": "implicit"}})
+    with pytest.raises(ValueError, match="larger njmax"):
+        attach(mjm, njmax=12)
+    for flags, text in (("rk4", "integrator implicitfast"), ("spring", "springs and dampers"), ("equality", "coupling='one-way'")):
+        other = ball_spec()
+        if flags == "rk4":
+            other.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        elif flags == "spring":
+            other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+        else:
+            other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+        batches.add(other, skin=SKIN)
+        with pytest.raises(ValueError, match=text):
+            attach(other.compile())
+    crowded = ball_spec()
+    batches.add(crowded, skin=SKIN, slots=0)
+    with pytest.raises(ValueError, match="has room for 0: add it after the objects"):
+        attach(crowded.compile())
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")
+def test_the_step_is_captured_in_a_graph():
+    _, m, d, _ = make(ball_spec(), 4)
+    mjm, m2, d2, _ = make(ball_spec(), 4)
+    mjw.step(m, d)  # compiles
+    mjw.step(m2, d2)
+    with wp.ScopedCapture() as capture:
+        mjw.step(m2, d2)
+    for _ in range(60):
+        mjw.step(m, d)
+        wp.capture_launch(capture.graph)
+    np.testing.assert_allclose(d2.qpos.numpy(), d.qpos.numpy(), atol=1e-7)
+    np.testing.assert_allclose(read(mjm, d2, "electrodes"), read(mjm, d, "electrodes"), atol=1)
