@@ -58,7 +58,7 @@ def _xml(geometry, material, radius, center):
     def text(array):
         return " ".join(f"{v:.9g}" for v in np.ravel(array))
 
-    mass = material.density * np.linalg.det(geometry.vert[geometry.elem[:, 1:]] - geometry.vert[geometry.elem[:, :1]]).sum() / 6
+    mass = material.density * np.linalg.det(geometry.vert[geometry.tets[:, 1:]] - geometry.vert[geometry.tets[:, :1]]).sum() / 6
     friction = f'friction="{material.friction} 0 0"'
     return f"""
 <mujoco>
@@ -68,7 +68,7 @@ def _xml(geometry, material, radius, center):
   <size memory="2G"/>
   <worldbody>
     <body mocap="true" pos="{text(center)}"><geom type="sphere" size="{radius}" {friction} {_CONTACT}/></body>
-    <flexcomp name="skin" type="direct" dim="3" radius="1e-6" mass="{mass}" point="{text(geometry.vert)}" element="{text(geometry.elem)}">
+    <flexcomp name="skin" type="direct" dim="3" radius="1e-6" mass="{mass}" point="{text(geometry.vert)}" element="{text(geometry.tets)}">
       <pin id="{text(geometry.fixed)}"/>
       <elasticity young="{material.youngs_modulus}" poisson="{material.poissons_ratio}"/>
       <contact selfcollide="none" {friction} {_CONTACT}/>

@@ -111,7 +111,7 @@ def write_skin(record: PressRecord, path) -> None:
     pose = np.concatenate([record.indenter_pos, record.indenter_quat], axis=1)
     columns = dict(time=(record.time, "s"), depth=(record.depth, "m"), force=(record.force, "N"), counts=(record.counts, "count"),
                    indenter_pose=(pose, "m, then quaternion w x y z"), nonconverged=(record.nonconverged, "steps"))  # fmt: skip
-    topology = dict(vert=(geometry.vert, "m"), elem=(geometry.elem, "node"), outer_face=(geometry.outer_face, "node"),
+    topology = dict(vert=(geometry.vert, "m"), elem=(geometry.tets, "node"), outer_face=(geometry.outer_face, "node"),
                     inner_face=(geometry.inner_face, "node"), fixed=(geometry.fixed, "node"),
                     indenter_vert=(record.indenter_vert, "m"), indenter_face=(record.indenter_face, "vertex"))  # fmt: skip
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:

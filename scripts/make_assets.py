@@ -8,13 +8,15 @@ stay the same.
 """
 
 import argparse
+import dataclasses
 import importlib.metadata
 import pathlib
 
 import numpy as np
 
-from biotac_mj.geometry.assembly import assemble
+from biotac_mj.geometry.assembly import assemble, held_nodes
 from biotac_mj.geometry.card import write_card
+from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.geometry.importing import read_obj, write_obj
 from biotac_mj.geometry.indenters import INDENTERS, indenter
 from biotac_mj.geometry.meshing import mesh_between
@@ -24,12 +26,13 @@ from biotac_mj.geometry.tet_mesh import TetMesh
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
 
-# edge [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of the box's diagonal (32 mm)
+# edge of the ten-node tetrahedra [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of the box's diagonal (32 mm)
 RESOLUTIONS = {
-    "coarse": {"edge": 1.7, "spacing": 0.5, "epsilon": 4e-3},
-    "default": {"edge": 0.88, "spacing": 0.5, "epsilon": 2e-3},
-    "fine": {"edge": 0.53, "spacing": 0.4, "epsilon": 1.5e-3},
+    "coarse": {"edge": 3.5, "spacing": 0.5, "epsilon": 8e-3},
+    "default": {"edge": 2.4, "spacing": 0.4, "epsilon": 6e-3},
+    "fine": {"edge": 1.2, "spacing": 0.5, "epsilon": 3e-3},
 }
+SIDES = {"outer": "outer", "inner": "cavity"}
 CORE = {"edge": 0.6, "spacing": 0.3, "epsilon": 1e-3}
 
 
@@ -61,13 +64,16 @@ def main():
         if name not in only:
             continue
         if args.keep_tetrahedra:
-            mesh = TetMesh(load_skin(name).vert, load_skin(name).elem)
+            elem = load_skin(name).elem[:, :4]
+            mesh = TetMesh(load_skin(name).vert[: elem.max() + 1], elem)
         else:
             mesh = mesh_between(bodies["outer"], bodies["cavity"], **settings)
             mesh = TetMesh(mesh.vert * 1e-3, mesh.elem)
         skin = assemble(name, mesh, **rigid, electrodes=(position * 1e-3, normal))
+        skin = with_edge_nodes(skin, lambda point, side: 1e-3 * bodies[SIDES[side]].project(1e3 * point))
+        skin = dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held_nodes(skin.vert, rigid.values())))
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
-        made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then biotac_mj.geometry.meshing.improve"
+        made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then `improve` and `with_edge_nodes`"
         print(write_card(path.with_suffix(".md"), skin, made).read_text())
 
 

@@ -5,10 +5,12 @@ import itertools
 import numpy as np
 import trimesh
 
+from biotac_mj.geometry import TetMesh, load_skin
+from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.skin.data import view
 
-__all__ = ["boundary", "box", "faces_on", "nodal_areas", "place", "shell", "skin"]
+__all__ = ["boundary", "box", "faces_on", "four_nodes", "nodal_areas", "place", "shell", "skin"]
 
 
 def box(axes, jitter=0.0, seed=0):
@@ -95,3 +97,12 @@ def place(data, nodes, position):
     """Puts nodes of all worlds at `position` (n, 3) [m]: fixed ones stay there, which is how tests prescribe displacements."""
     for array in (data.x, data.x_last):
         view(array)[nodes] = np.asarray(position)[:, None]
+
+
+def four_nodes(name):
+    """A shipped skin of four-node tetrahedra: the corners of its own."""
+    shipped = load_skin(name)
+    elem = shipped.elem[:, :4]
+    mesh = TetMesh(shipped.vert[: elem.max() + 1], elem)
+    rigid = [(getattr(shipped, f"{part}_vert"), getattr(shipped, f"{part}_face")) for part in ("core", "nail", "clamp")]
+    return assemble(name, mesh, *rigid)

@@ -239,7 +239,7 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
     def cone(vert, face):
         return np.concatenate([np.zeros((len(face), 1, 3)), vert[face]], axis=1)
 
-    add(1050.0, geometry.vert[geometry.elem])
+    add(1050.0, geometry.vert[geometry.tets])
     for part in ("core", "nail", "clamp"):
         add(1200.0, cone(getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")))
     add(1000.0, cone(geometry.vert, geometry.inner_face), -1.0)  # liquid: the cavity, whose face normals point inwards,

@@ -4,8 +4,9 @@ import pathlib
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 
-from biotac_mj.geometry import TetMesh, import_mesh, load_skin
+from biotac_mj.geometry import TetMesh, import_mesh
 from biotac_mj.geometry.assembly import held_nodes, split_surfaces
 from biotac_mj.geometry.importing import read_obj, read_tet_mesh, write_obj
 
@@ -25,7 +26,7 @@ def write_tet(path, vert, elem):
 
 @pytest.fixture(scope="module")
 def coarse():
-    return load_skin("coarse")
+    return four_nodes("coarse")
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
-from ..skin.quadratic import quadratic
+from ..skin.model import solved_geometry
 from .stepper import SkinResult
 
 __all__ = ["FemStepper", "rest_geometry"]
@@ -26,9 +26,7 @@ class FemStepper:
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
         self._material, self._options = _choices(config)
-        self._nodes = geometry.vert  # quadratic elements have more, behind those of the geometry, that only the state knows
-        if (self._options.element or self._material.element) == "quadratic":
-            self._nodes = quadratic(geometry)[0].vert
+        self._nodes = solved_geometry(geometry, self._material, self._options)[0].vert  # maybe with more nodes behind the geometry's
         n, g = len(self._nodes), len(geoms)
         sizes = {
             "started": 1,

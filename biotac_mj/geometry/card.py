@@ -14,12 +14,13 @@ __all__ = ["skin_numbers", "write_card"]
 def skin_numbers(skin: SkinGeometry) -> dict:
     """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the electrodes to the inner skin [mm].
 
+    Ten-node tetrahedra count as the eight four-node ones that they make.
     Thickness is the distance of each inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the
     way from the electrode along its normal to the inner surface.
     """
     import trimesh
 
-    mesh = TetMesh(skin.vert, skin.elem)
+    mesh = TetMesh(skin.vert, skin.tets)
     vert = skin.vert * 1e3  # trimesh drops small triangles of a mesh in metres
     outer = trimesh.Trimesh(vert, skin.outer_face, process=False)
     inner = trimesh.Trimesh(vert, skin.inner_face, process=False)
@@ -28,7 +29,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
     return {
         "nodes": skin.nvert,
-        "tetrahedra": skin.nelem,
+        "tetrahedra": f"{skin.nelem} with {skin.elem.shape[1]} nodes",
         "outer nodes": len(np.unique(skin.outer_face)),
         "inner nodes": len(np.unique(skin.inner_face)),
         "held nodes": len(skin.fixed),
@@ -49,7 +50,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
 
 def _inner_and_linked(skin):
     """Inner nodes, and all nodes that share a tetrahedron with an outer node."""
-    return np.unique(skin.inner_face), np.unique(skin.elem[np.isin(skin.elem, skin.outer_face).any(axis=1)])
+    return np.unique(skin.inner_face), np.unique(skin.tets[np.isin(skin.tets, skin.outer_face).any(axis=1)])
 
 
 def _ray_lengths(surface, origin, direction):
@@ -76,7 +77,7 @@ def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
     unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
     rows = []
     for key, value in n.items():
-        number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
+        number = f"{value}" if isinstance(value, int | str) else f"{value:.3f}"
         rows.append(f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |")
     rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
     rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]

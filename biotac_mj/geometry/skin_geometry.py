@@ -7,8 +7,10 @@ import tempfile
 
 import numpy as np
 
-__all__ = ["SkinGeometry"]
+__all__ = ["PARTS", "SkinGeometry"]
 
+# the eight four-node tetrahedra that ten nodes make: four at the corners, four around the octahedron's diagonal 4-9
+PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3], [4, 9, 5, 6], [4, 9, 8, 5], [4, 9, 7, 8], [4, 9, 6, 7]])
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
 
 
@@ -19,7 +21,7 @@ class SkinGeometry:
     Attributes:
       name: what it is called in cards, data sets and messages.
       vert: (nvert, 3) float64, nodes at rest [m].
-      elem: (nelem, 4) int32, tetrahedra with positive volume.
+      elem: (nelem, 4) or (nelem, 10) int32, tetrahedra with positive volume; ten nodes are corners, then edges (`edge_nodes.EDGES`).
       outer_face: (nouter, 3) int32, the surface that touches the world; normals point out of the skin material.
       inner_face: (ninner, 3) int32, the surface towards the liquid; normals point out of the skin material, towards the core.
       fixed: (nfixed,) int32, sorted nodes held by core, nail plate and clamp.
@@ -50,6 +52,8 @@ class SkinGeometry:
                 continue
             dtype = np.int32 if field.name in _INT_FIELDS else np.float64
             object.__setattr__(self, field.name, np.ascontiguousarray(getattr(self, field.name), dtype=dtype))
+        if self.elem.ndim != 2 or self.elem.shape[1] not in (4, 10):
+            raise ValueError(f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices")
 
     @property
     def nvert(self) -> int:
@@ -58,6 +62,16 @@ class SkinGeometry:
     @property
     def nelem(self) -> int:
         return len(self.elem)
+
+    @property
+    def element(self) -> str:
+        """What the tetrahedra are: "linear" (four nodes) or "quadratic" (ten)."""
+        return "linear" if self.elem.shape[1] == 4 else "quadratic"
+
+    @property
+    def tets(self) -> np.ndarray:
+        """(n, 4) int32 four-node tetrahedra over all nodes: elem, or the eight parts (8 e .. 8 e + 7) of each ten-node tetrahedron e."""
+        return self.elem if self.element == "linear" else self.elem[:, PARTS].reshape(-1, 4)
 
     def save(self, path) -> pathlib.Path:
         """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is bit-equal."""

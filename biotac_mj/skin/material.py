@@ -34,7 +34,7 @@ class Material:
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
       liquid: whether the preset fills the space between skin and core with the liquid.
-      element: what the preset is solved with, "linear" or "quadratic", see `SkinOptions`.
+      element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see `SkinOptions`.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -46,13 +46,13 @@ class Material:
     friction: float = 0.783414394
     density: float = 1000.0
     liquid: bool = True
-    element: str = "linear"
+    element: str | None = None
 
     def __post_init__(self):
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
-        if self.element not in ELEMENTS:
-            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}")
+        if self.element not in (None, *ELEMENTS):
+            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the geometry's")
         for name in ("youngs_modulus", "poissons_ratio", "friction", "density"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
@@ -83,11 +83,11 @@ class Material:
 
 
 # Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on elements that do not lock:
-# nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is squeezed on the core; "rubber": nu 0.45 on linear ones,
-# as the reference solutions).
+# nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is squeezed on the core; "rubber": nu 0.45, as the reference
+# solutions). "paper" keeps to linear tetrahedra: the stiffness of its mesh is in the fitted modulus.
 PRESETS = {
     "default": Material(),
-    "paper": Material(liquid=False),
+    "paper": Material(liquid=False, element="linear"),
     "rubber": Material("neo_hookean", 2.80e5, 0.45, 0.186),
     "ansys": Material("neo_hookean", 2.80e5, 0.499, 0.186, element="quadratic"),
 }

@@ -7,17 +7,18 @@ import math
 import numpy as np
 import warp as wp
 
+from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import contact, elasticity, liquid
 from .factor import DenseFactor, SparseFactor
 from .fill import rest_state
 from .geoms import GeomSet
 from .material import ELEMENTS, LAWS, Material, material
-from .quadratic import QuadraticTetrahedra, quadratic
+from .quadratic import QuadraticTetrahedra
 from .shapes import bake_distance_grid
 from .types import real, vec3
 
-__all__ = ["SkinModel", "SkinOptions", "Surface"]
+__all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +26,9 @@ class SkinOptions:
     """How the skin is solved.
 
     Attributes:
-      element: "linear" (four nodes), "quadratic" (ten nodes: does not lock; every edge gets a node behind the geometry's own, see
-        `quadratic.quadratic`); None takes the material's choice.
+      element: "linear" (four nodes) or "quadratic" (ten nodes: does not lock); None takes the material's choice, and where it has none the
+        geometry's. Ten-node tetrahedra are solved as linear ones by their eight parts; four-node ones as quadratic get a node on every
+        edge, behind the geometry's own (`with_edge_nodes`).
       dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
       liquid: fills the space between skin and core; None takes the material preset's choice.
       bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf keeps its volume.
@@ -88,6 +90,12 @@ class SkinOptions:
             raise ValueError("samples, max_newton and max_cg must be at least 1")
 
 
+def solved_geometry(geometry: SkinGeometry, material: Material, options: SkinOptions) -> tuple[SkinGeometry, str]:
+    """The geometry with all nodes that the solver moves, and its element, see `SkinOptions.element`."""
+    element = options.element or material.element or geometry.element
+    return (with_edge_nodes(geometry) if element == "quadratic" and geometry.element == "linear" else geometry), element
+
+
 @dataclasses.dataclass(frozen=True)
 class Surface:
     """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], node incidence."""
@@ -115,8 +123,8 @@ class Surface:
 class SkinModel:
     """Constants of a skin on one device.
 
-    With quadratic elements `geometry` is the refined one: the nodes of the given geometry come first and keep their numbers, so
-    `vert_xpos[:, :given.nvert]` fits it; a node on each edge follows. `nelem` counts the given tetrahedra.
+    With quadratic elements on a geometry of four-node tetrahedra `geometry` is the refined one: the nodes of the given geometry come first
+    and keep their numbers, so `vert_xpos[:, :given.nvert]` fits it; a node on each edge follows.
 
     Args:
       geometry: the skin.
@@ -149,13 +157,13 @@ class SkinModel:
             raise ValueError(
                 f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh"
             )
-        self.element = self.options.element or self.material.element
-        elem = geometry.elem
         if fixed is not None:
             geometry = dataclasses.replace(geometry, fixed=fixed)
-        if self.element == "quadratic":
-            geometry, elem = quadratic(geometry)
-            core_faces = None if core_faces is None else (4 * np.asarray(core_faces)[:, None] + np.arange(4)).ravel()
+        given = geometry
+        geometry, self.element = solved_geometry(given, self.material, self.options)
+        if core_faces is not None and geometry is not given:
+            core_faces = (4 * np.asarray(core_faces)[:, None] + np.arange(4)).ravel()
+        elem = geometry.elem if self.element == "quadratic" else geometry.tets
         self.geometry, vert = geometry, geometry.vert
         self.nvert, self.nelem, self._elem = len(vert), len(elem), elem
         self.fixed = geometry.fixed.astype(int)

@@ -1,21 +1,25 @@
-"""Quadratic tetrahedra: ten nodes, four Gauss points, selectively averaged dilatation, so that incompressible rubber does not lock.
+"""Quadratic tetrahedra: ten nodes, four integration points, selectively averaged dilatation: incompressible rubber does not lock.
+
+The four points are Gauss's, pulled towards the centroid by `CONTRACTION`. That lowers the energy of a strain's variation inside an element,
+of which a mesh as coarse as the wall has too much, by CONTRACTION^2 and leaves its mean alone: a strain that is constant is still exact
+(the alpha finite element method of Liu, Nguyen-Thoi and Lam 2008 scales strain gradients the same way).
 
 Each element's energy is  sum_q w_q W(F_q; lam_q) + V (lam - lam_q)/2 mean(theta)^2,  lam_q = min(lam, POINTWISE mu),
 with the law's measure of dilatation theta (`material.dilatation`; J - 1 for neo_hookean). What goes beyond lam_q is felt by the
 element's mean dilatation alone (Nagtegaal, Parks and Rice 1974; Simo, Taylor and Pister 1985): volume is kept per element, not at
 every point, which leaves the element free to bend. A mean dilatation for all of lam (POINTWISE = 0) would be too soft under local
 loads, since a pressure that is constant over large elements is crude. What varies inside an element vanishes with its size, so
-POINTWISE changes the error of a mesh, not the limit. Where lam <= POINTWISE mu, integration is full, as in CalculiX's C3D10.
+POINTWISE changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTION = 1 and lam <= POINTWISE mu integration is full,
+as in CalculiX's C3D10.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.edge_nodes import shape_gradients
 from .elasticity import gather, incidence, rest_shape
 from .material import (
     LAWS,
@@ -29,84 +33,17 @@ from .material import (
 )
 from .types import mat33, real, vec3
 
-__all__ = ["EDGES", "QuadraticTetrahedra", "quadratic"]
+__all__ = ["QuadraticTetrahedra"]
 
 wp.set_module_options({"enable_backward": False})
 
-EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])  # of the nodes 4..9, in the order of CalculiX's C3D10
-# the eight linear tetrahedra that the ten nodes make: four at the corners, four around the octahedron's diagonal 4-9
-PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3], [4, 9, 5, 6], [4, 9, 8, 5], [4, 9, 7, 8], [4, 9, 6, 7]])
-
 POINTWISE = wp.constant(5.0)  # of mu; docs/elements.md has the error of other values
 
+CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/elements.md has the error with and without
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric coordinates of the four Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
 mat310 = wp.types.matrix(shape=(3, 10), dtype=wp.float64)
-
-
-def _reference_gradients() -> np.ndarray:
-    """(4, 10, 3) derivatives of the shape functions by the barycentric coordinates 1..3 at the Gauss points."""
-    by_all = np.zeros((4, 10, 4))
-    for point, b in enumerate(_POINTS):
-        for i in range(4):
-            by_all[point, i, i] = 4 * b[i] - 1
-        for node, (i, j) in enumerate(EDGES):
-            by_all[point, 4 + node, i] = 4 * b[j]
-            by_all[point, 4 + node, j] = 4 * b[i]
-    return by_all[:, :, 1:] - by_all[:, :, :1]
-
-
-def quadratic(geometry: SkinGeometry, project=None) -> tuple[SkinGeometry, np.ndarray]:
-    """Puts a node on every edge.
-
-    The nodes of `geometry` come first and keep their numbers, so `vert_xpos[:, :geometry.nvert]` fits the given geometry. Every
-    boundary face f becomes four (4 f .. 4 f + 3), every tetrahedron e eight (8 e .. 8 e + 7). The new node of a boundary edge is fixed
-    where both its ends are.
-
-    Args:
-      geometry: a linear skin.
-      project: None leaves new nodes in the middle of their edges; else a function from points (n, 3) and a name, "outer" or "inner", to the
-        nearest points (n, 3) of that surface [m], applied to the new nodes of faces that hold nothing fixed.
-
-    Returns:
-      The skin of all nodes, and (nelem, 10) nodes of each quadratic tetrahedron: corners, then edges in the order of `EDGES`.
-    """
-    n, elem = geometry.nvert, geometry.elem
-    ends = np.sort(elem[:, EDGES].reshape(-1, 2), axis=1).astype(np.int64)
-    keys, number = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)
-    elem10 = np.hstack([elem, n + number.reshape(-1, 6)]).astype(np.int32)
-    edge = np.stack([keys // n, keys % n], axis=1)
-    middle = geometry.vert[edge].mean(1)
-
-    def split(face):
-        pairs = np.sort(face[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
-        a, b, c = n + np.searchsorted(keys, pairs[..., 0] * n + pairs[..., 1]).T
-        i, j, k = face.T
-        four = np.stack([i, a, c, a, j, b, c, b, k, a, b, c], axis=1)
-        return four.reshape(-1, 3), np.stack([a, b, c], axis=1)
-
-    outer, on_outer = split(geometry.outer_face)
-    inner, on_inner = split(geometry.inner_face)
-    held = np.isin(edge, geometry.fixed).all(1)
-    surface = np.zeros(len(edge), bool)
-    for new in (on_outer, on_inner):
-        surface[new.ravel() - n] = True
-    if project is not None:
-        shared = np.intersect1d(on_outer, on_inner)
-        for name, new in (("outer", on_outer), ("inner", on_inner)):
-            new = np.setdiff1d(new, shared) - n
-            new = new[~held[new]]
-            middle[new] = project(middle[new], name)
-    refined = dataclasses.replace(
-        geometry,
-        vert=np.concatenate([geometry.vert, middle]),
-        elem=elem10[:, PARTS].reshape(-1, 4),
-        outer_face=outer,
-        inner_face=inner,
-        fixed=np.concatenate([geometry.fixed, n + np.flatnonzero(held & surface)]),
-    )
-    return refined, elem10
 
 
 @wp.func
@@ -282,19 +219,20 @@ class QuadraticTetrahedra:
 
     Args:
       vert: (nvert, 3) rest positions [m].
-      elem: (nelem, 10) corners, then the nodes of `EDGES`; edges may be curved.
+      elem: (nelem, 10) corners, then the nodes of `edge_nodes.EDGES`; edges may be curved.
       law: number of the material law, see `material.LAWS`.
       device: Warp device.
+      contraction: of the integration points, see above.
 
     Raises:
       ValueError: a tetrahedron is inverted or degenerate, or a curved edge folds one.
     """
 
-    def __init__(self, vert, elem, law, device):
+    def __init__(self, vert, elem, law, device, contraction=CONTRACTION):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
         self._elem = elem
         rest_shape(vert, elem[:, :4])
-        shape = _reference_gradients()
+        shape = shape_gradients(0.25 + contraction * (_POINTS - 0.25))
         edges = np.einsum("eai,qak->eqik", vert[elem], shape)
         weight = np.linalg.det(edges) / 24
         folded = np.flatnonzero(weight.min(1) <= 0)
