@@ -67,7 +67,7 @@ class BatchPreconditioner:
         """See `Preconditioner.update`; on the device."""
         # the liquid's direction is scaled so that its stiffness is like that of contact: single precision then suffices
         self.kappa = _STIFF
-        self.gradient = None if gradient is None else gradient * (kappa / _STIFF) ** 0.5
+        self.gradient = None if gradient is None else gradient * torch.as_tensor((kappa / _STIFF) ** 0.5, device=self.device)[:, None]
         gradient = self.gradient
         nworld = len(self.scale)
         faces = [self._face(s.surface.face_np) for s in states]

@@ -4,8 +4,6 @@ import copy
 import dataclasses
 import math
 
-import numpy as np
-
 from .geoms import GeomSet
 from .liquid import Rest
 
@@ -42,7 +40,7 @@ def rest_state(model) -> Rest:
         if done + size == 1:
             bare.options = dataclasses.replace(bare.options, tolerance=_ARRIVED)
         if options.rest_pressure:  # liquid at constant pressure
-            liquid.stiffness, liquid.last_pressure = 0.0, np.array([(done + size) * options.rest_pressure])
+            liquid.keep_pressure((done + size) * options.rest_pressure)
         else:
             liquid.fill(volume + (done + size) * options.fill_volume)
         step(bare, data, nothing)
@@ -58,7 +56,7 @@ def rest_state(model) -> Rest:
                     "this rubber does not hold it; take less"
                 )
     pressure, filled = float(liquid.gauge_pressure[0]), float(liquid.volume[0])
-    natural = liquid.natural_volume
+    natural = float(liquid.natural_volume[0])
     if options.rest_pressure:
         natural = filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
     return Rest(data.vert_xpos[0].copy(), pressure, filled, natural)

@@ -12,7 +12,6 @@ faces need no such care: their nodes are held, so it does not matter that pressu
 """
 
 import dataclasses
-import math
 
 import numpy as np
 import warp as wp
@@ -208,43 +207,91 @@ class Rest:
     natural_volume: float
 
 
+class _PerWorld:
+    """An attribute (nworld,) that numpy holds, or a field of `Worlds` on the device."""
+
+    def __init__(self, field):
+        self._field = field
+
+    def __set_name__(self, owner, name):
+        self._name = "_" + name
+
+    def __get__(self, liquid, owner=None):
+        return getattr(liquid, self._name) if liquid.worlds is None else getattr(liquid.worlds, self._field).numpy()
+
+    def __set__(self, liquid, value):
+        value = np.array(np.broadcast_to(np.asarray(value, float), (liquid.nworld,)))
+        if liquid.worlds is None:
+            setattr(liquid, self._name, value)
+        else:
+            getattr(liquid.worlds, self._field).assign(value)
+
+
 class Liquid:
     """The liquid of one SkinData: `evaluate` after the contact forces, then `force`; `product` is its share of the tangent.
 
-    Attributes:
+    Args:
+      worlds: `device_worlds.Worlds` where the state lives on the device, which then also evaluates; else None.
+
+    Attributes (nworld,):
+      bulk_modulus: K [Pa]. extra: liquid beyond the model's fill [m^3].
       natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V [Pa/m^3].
-      offset: (nworld,) pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is incompressible.
-      last_pressure: (nworld,) above the surroundings, of the last step [Pa].
-      gauge_pressure: (nworld,) above the surroundings [Pa], volume: (nworld,) [m^3] at the last evaluation.
+      offset: pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is incompressible.
+      last_pressure: above the surroundings, of the last step [Pa].
+      gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
 
-    def __init__(self, model, nworld):
-        self.m, self.nworld = model, nworld
-        nface = len(model.inner.face)
-        with wp.ScopedDevice(model.device):
-            self._share = wp.zeros((nface, nworld), dtype=real)
-            self._wet = wp.zeros((nface, nworld), dtype=vec3)
-            self._corner = wp.zeros((3 * nface, nworld), dtype=vec3)
-            self._none = wp.zeros((0, nworld), dtype=int), wp.zeros((0, nworld), dtype=vec3)
-            self._no_area = wp.zeros(0, dtype=real)
+    natural_volume = _PerWorld("natural")
+    stiffness = _PerWorld("kappa")
+    last_pressure = _PerWorld("last_pressure")
+    gauge_pressure = _PerWorld("pressure")
+    volume = _PerWorld("volume")
+
+    def __init__(self, model, nworld, worlds=None):
+        self.m, self.nworld, self.worlds = model, nworld, worlds
+        self.bulk_modulus, self.extra = np.full(nworld, model.options.bulk_modulus), np.zeros(nworld)
+        if worlds is None:
+            self._allocate(len(model.inner.face))
         self.reset()
+
+    def _allocate(self, nface):
+        with wp.ScopedDevice(self.m.device):
+            self._share = wp.zeros((nface, self.nworld), dtype=real)
+            self._wet = wp.zeros((nface, self.nworld), dtype=vec3)
+            self._corner = wp.zeros((3 * nface, self.nworld), dtype=vec3)
+            self._none = wp.zeros((0, self.nworld), dtype=int), wp.zeros((0, self.nworld), dtype=vec3)
+            self._no_area = wp.zeros(0, dtype=real)
 
     def reset(self):
         rest = self.m.rest
-        self.fill(rest.natural_volume)
-        self.last_pressure = np.full(self.nworld, rest.pressure)
+        self.fill(rest.natural_volume + self.extra)
+        self.last_pressure = np.where(self.bulk_modulus == 0, 0.0, rest.pressure)
         self.gauge_pressure = self.last_pressure.copy()
-        self.volume = np.full(self.nworld, rest.volume)
+        self.volume = rest.volume
 
     def fill(self, natural_volume):
         """Takes as much liquid as has this volume without pressure [m^3]."""
         # an incompressible liquid: the pressure of the last step is what the next starts from, and this stiffness only finds the change
-        K = self.m.options.bulk_modulus
-        self.natural_volume, self.stiffness = natural_volume, (K if math.isfinite(K) else WATER) / natural_volume
+        K = self.bulk_modulus
+        self.natural_volume = natural_volume
+        self.stiffness = np.where(np.isfinite(K), K, WATER) / natural_volume if self.m.has_liquid else 0.0
+        self._tell_device()
+
+    def keep_pressure(self, pressure):
+        """Takes liquid in and out so that its pressure above the surroundings stays this [Pa]."""
+        self.stiffness, self.last_pressure = 0.0, pressure
+        self._tell_device()
+
+    def _tell_device(self):
+        if self.worlds is not None:
+            self.worlds.holds.assign(self._holds().astype(np.int32))
+
+    def _holds(self):
+        return (self.stiffness == 0) | np.isinf(self.bulk_modulus)
 
     def begin(self):
         """Starts a step."""
-        self.offset = self.last_pressure.copy() if self.stiffness == 0 or math.isinf(self.m.options.bulk_modulus) else 0.0
+        self.offset = np.where(self._holds(), self.last_pressure, 0.0)
         reference = np.maximum(np.abs(self.last_pressure), _REFERENCE)
         self._reference = wp.array(reference, dtype=real, device=self.m.device)
 

@@ -30,7 +30,7 @@ class Preconditioner:
           states: ContactState of each surface that can touch, just evaluated.
           residual: (nvert, nworld, 3), zero at fixed nodes [N].
           gradient: (nvert, nworld, 3) of the liquid's volume, zero at fixed nodes [m^2], or None.
-          kappa: K / V0 [Pa/m^3].
+          kappa: (nworld,) K / V0 [Pa/m^3].
         """
         self.gradient, self.kappa = gradient, kappa
         if gradient is None:
@@ -64,7 +64,7 @@ class Preconditioner:
         compliance = np.zeros((size, size))
         compliance[:m, :m] = W / self.scale[w]
         if self.gradient is not None:
-            D[m, m] = self.kappa
+            D[m, m] = self.kappa[w]
             along = self.along[:, w] / self.scale[w]
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
             compliance[m, m] = np.vdot(self.gradient[:, w], along)

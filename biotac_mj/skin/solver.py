@@ -11,7 +11,7 @@ from .model import SkinModel
 from .preconditioner import Preconditioner
 from .types import vec3
 
-__all__ = ["step"]
+__all__ = ["preconditioner", "step"]
 
 # matrices of a few hundred rows: more threads of BLAS only wait for each other
 _threads = ThreadpoolController()
@@ -39,9 +39,30 @@ def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = No
     """
     if geoms.nworld != data.nworld:
         raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
+    if data.resident:
+        _step_on_device(model, data, geoms, dt, core_pos, core_mat)
+        return
     _refuse_core(model, geoms)
     with _threads.limit(limits=1, user_api="blas"):
         _Step(model, data, geoms, dt, core_pos, core_mat).run()
+
+
+def _step_on_device(model, data, geoms, dt, core_pos, core_mat):
+    from .device_step import prepare_device
+    from .device_worlds import INSIDE_CORE
+
+    if model.options.dynamics == "implicit":
+        if dt is None or not dt > 0:
+            raise ValueError("implicit dynamics needs the time step: pass dt > 0")
+        data.dt.fill_(dt)
+        for array, last, value in ((data.frame_pos, data.frame_pos_last, core_pos), (data.frame_mat, data.frame_mat_last, core_mat)):
+            if value is None:
+                wp.copy(array, last)
+            else:
+                array.assign(np.asarray(value, float))
+    prepare_device(model, data, geoms).run()
+    if model.has_core and geoms.count and (data.worlds.reason.numpy() == INSIDE_CORE).any():
+        _refuse_core(model, geoms)
 
 
 def _refuse_core(model, geoms):
@@ -66,11 +87,11 @@ class _Step:
         self.force = view(data.force)
         self.mask = view(model.free_mask)[:, None, None]
         self.gradient = view(data.gradient)
-        self.kappa = data.liquid.stiffness if model.has_liquid else 0.0
+        self.kappa = data.liquid.stiffness if model.has_liquid else np.zeros(data.nworld)
         if data.liquid:
             data.liquid.begin()
         if not hasattr(data, "preconditioner"):
-            data.preconditioner = _preconditioner(model)(model, data.stiffness_scale)
+            data.preconditioner = preconditioner(model)(model, data.stiffness_scale)
         self.M = data.preconditioner
         self.inertia = None
         if model.options.dynamics == "implicit":
@@ -266,7 +287,7 @@ class _Step:
             launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
             launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
         if m.has_liquid:
-            q += self.kappa * (self.gradient * p).sum((0, 2))[:, None] * self.gradient
+            q += (self.kappa * (self.gradient * p).sum((0, 2)))[:, None] * self.gradient
             bend = d.liquid.gradient_derivative(d.x, d.direction)
             launch(elasticity.gather, (m.nvert, d.nworld), [m.inner.start, m.inner.slot, bend, 1.0, 0], [d.bending])
             q -= _like(self.x, d.liquid.gauge_pressure)[:, None] * view(d.bending)
@@ -353,7 +374,8 @@ class _Step:
             d.core_pos, d.core_mat = pos.copy(), mat.copy()
 
 
-def _preconditioner(model):
+def preconditioner(model):
+    """The class of the preconditioner for the model's device."""
     if not model.device.is_cuda:
         return Preconditioner
     from .batch_preconditioner import BatchPreconditioner  # torch is for CUDA only

@@ -1,0 +1,334 @@
+"""Contact and liquid of all worlds on the device: far faces are left out, near ones evaluated by the same law as on the host."""
+
+import warp as wp
+
+from .contact import Geoms, touch_face
+from .liquid import contact_pressure
+from .shapes import distance_bound
+from .types import mat33, real, vec3
+
+__all__ = [
+    "commit_contacts",
+    "contact_inside_core",
+    "cull_faces",
+    "near_contact",
+    "partial_wrench",
+    "release_pressure",
+    "settle_pressure",
+    "sum_wrench",
+    "wet_faces",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def cull_faces(
+    # In:
+    still: int,
+    nsample: int,
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # In and out:
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
+    touching: wp.array2d(dtype=int),
+    # Out:
+    near_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+):
+    """Which faces may touch: by one distance of their centre. Where the geoms are still, a face that has moved less than its clearance,
+    since that was last seen, needs not even that; what was said of it holds."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = face[f]
+    x0 = x[t[0], w]
+    x1 = x[t[1], w]
+    x2 = x[t[2], w]
+    if still == 1:
+        a = wp.length_sq(x0 - seen[3 * f, w])
+        b = wp.length_sq(x1 - seen[3 * f + 1, w])
+        c = wp.length_sq(x2 - seen[3 * f + 2, w])
+        if wp.sqrt(wp.max(a, wp.max(b, c))) < clearance[f, w]:
+            near_out[f, w] = 0
+            return
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+    near = int(0)
+    free = real(1.0)
+    for g in range(geoms.count):
+        y = wp.transpose(geoms.mat[g, w]) * (center - geoms.pos[g, w])
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        free = wp.min(free, bound - radius)
+        if bound < radius:
+            near = 1
+    near_out[f, w] = near
+    if near == 0:
+        if touching[f, w] == 1:
+            touching[f, w] = 0
+            for s in range(nsample):
+                geom_out[f * nsample + s, w] = -1
+        if still == 1:
+            clearance[f, w] = free
+            seen[3 * f, w] = x0
+            seen[3 * f + 1, w] = x1
+            seen[3 * f + 2, w] = x2
+
+
+@wp.kernel
+def near_contact(
+    # In:
+    still: int,
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    near: wp.array2d(dtype=int),
+    # In and out:
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    force_out: wp.array2d(dtype=vec3),
+):
+    """Contact of the near faces."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    if near[f, w] == 0:
+        return
+    free = touch_face(
+        f, w, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
+        anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
+    )  # fmt: skip
+    if still == 1:
+        clearance[f, w] = free
+        for c in range(3):
+            seen[3 * f + c, w] = x[face[f][c], w]
+
+
+@wp.kernel
+def wet_faces(
+    # In:
+    chunk: int,
+    face: wp.array(dtype=wp.vec3i),
+    slot: wp.array(dtype=int),
+    sample: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
+    stiffness: real,
+    reference: wp.array(dtype=real),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    volume_out: wp.array2d(dtype=real),
+    wet_out: wp.array2d(dtype=vec3),
+    corner_out: wp.array2d(dtype=vec3),
+):
+    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient (see `liquid.wetting`)."""
+    c, w = wp.tid()
+    if on[w] == 0:
+        return
+    third = real(1.0) / real(3.0)
+    total = real(0.0)
+    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        total -= wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
+        wet = vec3(third, third, third)
+        normal = wp.cross(x1 - x0, x2 - x0)
+        k = slot[f]
+        if k >= 0:
+            if touching[k, w] == 1:
+                nsample = sample.shape[0]
+                share = real(1.0) / real(nsample)
+                full = real(2.0) * reference[w]
+                overlap = real(0.0)
+                for s in range(nsample):
+                    pressure = contact_pressure(k * nsample + s, w, geom, force, area[k] * share)
+                    dry = real(1.0)
+                    if pressure < full:
+                        dry = pressure / full
+                        overlap += share * dry * pressure / (real(2.0) * stiffness)
+                    else:
+                        overlap += share * (pressure - reference[w]) / stiffness
+                    wet -= share * dry * sample[s]
+                total += overlap * wp.length(normal) / real(2.0)
+        wet_out[f, w] = wet
+        g = real(-0.5) * normal
+        for a in range(3):
+            corner_out[3 * f + a, w] = wet[a] * g
+    volume_out[c, w] = total
+
+
+@wp.kernel
+def settle_pressure(
+    # In:
+    enclosed: real,
+    share: wp.array2d(dtype=real),
+    offset: wp.array(dtype=real),
+    kappa: wp.array(dtype=real),
+    natural: wp.array(dtype=real),
+    on: wp.array(dtype=int),
+    # Out:
+    volume_out: wp.array(dtype=real),
+    pressure_out: wp.array(dtype=real),
+):
+    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's volume."""
+    w = wp.tid()
+    if on[w] == 0:
+        return
+    volume = enclosed
+    for c in range(share.shape[0]):
+        volume += share[c, w]
+    volume_out[w] = volume
+    pressure_out[w] = offset[w] - kappa[w] * (volume - natural[w])
+
+
+@wp.kernel
+def release_pressure(
+    # In:
+    sample: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
+    stiffness: real,
+    reference: wp.array(dtype=real),
+    pressure: wp.array(dtype=real),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    near: wp.array2d(dtype=int),
+    on: wp.array(dtype=int),
+    # In, out:
+    block: wp.array2d(dtype=mat33),
+):
+    """See `liquid.soften_contact`; only where the tangent was made anew."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    p = pressure[w]
+    if near[f, w] == 1 and touching[f, w] == 1 and p > real(0.0):
+        nsample = sample.shape[0]
+        share = area[f] / real(nsample)
+        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness * share
+        for s in range(nsample):
+            i = f * nsample + s
+            c = contact_pressure(i, w, geom, force, share)
+            if c > real(0.0) and c < real(2.0) * reference[w]:
+                n = wp.normalize(force[i, w])
+                K = factor * wp.outer(n, n)
+                b = sample[s]
+                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
+                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
+                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
+                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
+                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
+                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+
+
+@wp.kernel
+def partial_wrench(
+    # In:
+    chunk: int,
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    part_out: wp.array3d(dtype=vec3),
+    touched_by: wp.array2d(dtype=int),
+):
+    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world]; marks geoms that touch."""
+    c, w = wp.tid()
+    for k in range(part_out.shape[0]):
+        part_out[k, c, w] = vec3()
+    nsample = sample.shape[0]
+    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
+        if touching[f, w] == 1:
+            t = face[f]
+            for s in range(nsample):
+                i = f * nsample + s
+                g = geom[i, w]
+                if g >= 0:
+                    b = sample[s]
+                    p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+                    k = 2 * geoms.group[g]
+                    part_out[k, c, w] = part_out[k, c, w] - force[i, w]
+                    part_out[k + 1, c, w] = part_out[k + 1, c, w] - wp.cross(p, force[i, w])
+                    touched_by[g, w] = 1
+
+
+@wp.kernel
+def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
+    """Wrench on each group of geoms [group, world, 6]."""
+    k, w = wp.tid()
+    total = vec3()
+    for c in range(part.shape[1]):
+        total += part[k, c, w]
+    for a in range(3):
+        wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]
+
+
+@wp.kernel
+def commit_contacts(
+    # In:
+    nsample: int,
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # In and out:
+    kept: wp.array2d(dtype=int),
+    # Out:
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+):
+    """Anchors of the faces that touch, and that touched when the last step ended, become those that the next step starts from."""
+    f, w = wp.tid()
+    if touching[f, w] == 0 and kept[f, w] == 0:
+        return
+    kept[f, w] = touching[f, w]
+    for s in range(nsample):
+        i = f * nsample + s
+        geom_out[i, w] = -1
+        if touching[f, w] == 1:
+            geom_out[i, w] = geom[i, w]
+            anchor_out[i, w] = anchor[i, w]
+
+
+@wp.kernel
+def contact_inside_core(
+    # In:
+    chunk: int,
+    limit: real,
+    core_vert: wp.array(dtype=vec3),
+    geoms: Geoms,
+    # Out:
+    deep_out: wp.array(dtype=int),
+):
+    """Marks worlds in which a geom reaches deeper into the rigid core than the limit."""
+    g, c, w = wp.tid()
+    R = geoms.mat[g, w]
+    for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0])):
+        y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
+        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < -limit:
+            deep_out[w] = 1

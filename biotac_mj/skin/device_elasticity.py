@@ -1,0 +1,232 @@
+"""Elements as the device step evaluates them: positions in double precision, forces of corners and tangents in single.
+
+A force keeps the strain's digits, not the position's: deformation gradients come from double-precision edges, and what is rounded to
+single precision is the force of one corner, to 6e-8 of itself. Tangents only steer Newton's method, so they are single throughout.
+Nothing is kept between `force` and `product`: reading back costs more than computing the rotation again.
+"""
+
+import numpy as np
+import warp as wp
+
+from .elasticity import LinearTetrahedra, edge_matrix, incidence
+from .material import axial, stress, stress_derivative
+from .types import mat33, real, vec3
+
+__all__ = ["DeviceElements", "device_elements"]
+
+wp.set_module_options({"enable_backward": False})
+
+_INVERTED = 0.02  # det F below which a step of the line search is refused where the law cannot recover from inversion
+
+
+@wp.func
+def polar_single(F: wp.mat33):
+    """Rotation of the polar decomposition in single precision (Newton's iteration; by SVD where F is inverted or nearly flat)."""
+    if wp.determinant(F) < 1.0e-3:
+        U = wp.mat33()
+        s = wp.vec3()
+        V = wp.mat33()
+        wp.svd3(F, U, s, V)
+        R = U * wp.transpose(V)
+        if wp.determinant(R) < 0.0:
+            c = wp.vec3(U[0, 2], U[1, 2], U[2, 2])
+            d = wp.vec3(V[0, 2], V[1, 2], V[2, 2])
+            R = R - 2.0 * wp.outer(c, d)
+        return R
+    X = F
+    for _ in range(12):
+        Y = 0.5 * (X + wp.transpose(wp.inverse(X)))
+        change = wp.ddot(Y - X, Y - X)
+        X = Y
+        if change < 1.0e-8:  # the next error is the square of this one
+            break
+    return X
+
+
+@wp.func
+def widen(A: wp.mat33):
+    return mat33(
+        real(A[0, 0]), real(A[0, 1]), real(A[0, 2]),
+        real(A[1, 0]), real(A[1, 1]), real(A[1, 2]),
+        real(A[2, 0]), real(A[2, 1]), real(A[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def narrow(A: mat33):
+    return wp.mat33(
+        float(A[0, 0]), float(A[0, 1]), float(A[0, 2]),
+        float(A[1, 0]), float(A[1, 1]), float(A[1, 2]),
+        float(A[2, 0]), float(A[2, 1]), float(A[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def polar_mixed(F: mat33):
+    """The same to double precision: the single-precision rotation, made orthogonal, then turned by what is left (error squared)."""
+    R = widen(polar_single(narrow(F)))
+    eye = wp.identity(n=3, dtype=real)
+    R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
+    S = wp.transpose(R) * F
+    turn = R * wp.skew(wp.inverse(wp.trace(S) * eye - S) * axial(S))
+    R = R + turn
+    return R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
+
+
+@wp.func
+def edges_single(p: wp.array2d(dtype=wp.vec3), t: wp.vec4i, w: int):
+    p0 = p[t[0], w]
+    return wp.matrix_from_cols(p[t[1], w] - p0, p[t[2], w] - p0, p[t[3], w] - p0)
+
+
+@wp.func
+def write_single(H: wp.mat33, e: int, w: int, corner_out: wp.array2d(dtype=wp.vec3)):
+    f1 = wp.vec3(H[0, 0], H[1, 0], H[2, 0])
+    f2 = wp.vec3(H[0, 1], H[1, 1], H[2, 1])
+    f3 = wp.vec3(H[0, 2], H[1, 2], H[2, 2])
+    corner_out[4 * e, w] = -f1 - f2 - f3
+    corner_out[4 * e + 1, w] = f1
+    corner_out[4 * e + 2, w] = f2
+    corner_out[4 * e + 3, w] = f3
+
+
+@wp.kernel
+def linear_force(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    corner_out: wp.array2d(dtype=wp.vec3),
+    inverted_out: wp.array(dtype=int),
+):
+    e, w = wp.tid()
+    if on[w] == 0:
+        return
+    B = inverse_edges[e]
+    F = edge_matrix(x, elem[e], w) * B
+    R = mat33()
+    if law == 0:
+        R = polar_mixed(F)
+    elif law == 2:
+        if not (wp.determinant(F) > real(_INVERTED)):
+            inverted_out[w] = 1
+    H = -volume[e] * stress(law, mu[w], lam[w], F, R) * wp.transpose(B)
+    write_single(narrow(H), e, w, corner_out)
+
+
+@wp.kernel
+def linear_product(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    p: wp.array2d(dtype=wp.vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    corner_out: wp.array2d(dtype=wp.vec3),
+):
+    e, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = elem[e]
+    B = narrow(inverse_edges[e])
+    F = narrow(edge_matrix(x, t, w) * inverse_edges[e])
+    dF = edges_single(p, t, w) * B
+    dP = wp.mat33()
+    if law == 0:
+        m = float(mu[w])
+        l = float(lam[w])
+        R = polar_single(F)
+        Rt = wp.transpose(R)
+        S = Rt * F
+        A = Rt * dF
+        trace_s = wp.trace(S)
+        turn = wp.vec3(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+        dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=float) - S) * turn)
+        dP = 2.0 * m * (dF - dR) + l * (wp.trace(A) * R + (trace_s - 3.0) * dR)
+    else:
+        dP = narrow(stress_derivative(law, mu[w], lam[w], widen(F), mat33(), widen(dF)))
+    write_single(float(volume[e]) * dP * wp.transpose(B), e, w, corner_out)
+
+
+@wp.kernel
+def double_vector(p: wp.array2d(dtype=wp.vec3), on: wp.array(dtype=int), p_out: wp.array2d(dtype=vec3)):
+    i, w = wp.tid()
+    if on[w] == 1:
+        p_out[i, w] = vec3(real(p[i, w][0]), real(p[i, w][1]), real(p[i, w][2]))
+
+
+@wp.kernel
+def flag_inverted(law: int, jacobian: wp.array2d(dtype=real), on: wp.array(dtype=int), inverted_out: wp.array(dtype=int)):
+    e, w = wp.tid()
+    if on[w] == 1 and law == 2 and not (jacobian[e, w] > real(_INVERTED)):
+        inverted_out[w] = 1
+
+
+class _Linear:
+    """Linear tetrahedra in an order in which neighbours in the list are neighbours in space, so that caches serve nodes to all of them."""
+
+    def __init__(self, elements: LinearTetrahedra, nworld):
+        elem, inverse, volume = elements._elem, elements._inverse_edges, elements._volume
+        order = np.argsort(elem.min(1), kind="stable")
+        start, slot = incidence(elements.nvert, elem[order])
+        self.law, self.device = elements.law, elements.device
+        with wp.ScopedDevice(self.device):
+            self._mesh = [
+                wp.array(elem[order], dtype=wp.vec4i),
+                wp.array(inverse[order], dtype=mat33),
+                wp.array(volume[order], dtype=real),
+            ]
+            self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
+            self.corner = wp.zeros((4 * len(elem), nworld), dtype=wp.vec3)
+        self._dim = (len(elem), nworld)
+
+    def force(self, mu, lam, x, on, inverted):
+        wp.launch(linear_force, self._dim, [self.law, mu, lam, *self._mesh, x, on], [self.corner, inverted], device=self.device)
+
+    def product(self, mu, lam, x, p, on):
+        wp.launch(linear_product, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device)
+
+
+class DeviceElements:
+    """Any other element formulation, in double precision and for all worlds, through its own `force` and `product`.
+
+    Attributes:
+      start, slot: CSR lists of the corners of each node. corner: what `force` or `product` wrote last [slot, world] [N].
+    """
+
+    def __init__(self, elements, nworld):
+        self._elements = elements
+        self.law, self.device = elements.law, elements.device
+        self.start, self.slot = elements.start, elements.slot
+        self._scratch = elements.allocate(nworld)
+        self.corner = self._scratch.corner
+        with wp.ScopedDevice(self.device):
+            self._p = wp.zeros((elements.nvert, nworld), dtype=vec3)
+            self._unused = wp.zeros((elements.nvert, nworld), dtype=vec3)
+
+    def force(self, mu, lam, x, on, inverted):
+        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot bear the deformation."""
+        self._elements.force(self._scratch, mu, lam, x, self._unused)
+        jacobian = self._scratch.jacobian
+        wp.launch(flag_inverted, jacobian.shape, [self.law, jacobian, on], [inverted], device=self.device)
+
+    def product(self, mu, lam, x, p, on):
+        """Tangent at x, where `force` was evaluated last, times p, by corners."""
+        wp.launch(double_vector, p.shape, [p, on], [self._p], device=self.device)
+        self._elements.product(self._scratch, mu, lam, x, self._p, self._unused)
+
+
+def device_elements(elements, nworld):
+    """The formulation as the device step needs it."""
+    return (_Linear if type(elements) is LinearTetrahedra else DeviceElements)(elements, nworld)
