@@ -9,7 +9,7 @@ from ..skin.shapes import distance
 from ..skin.types import real, vec3
 from .objects import grid_of, make_object
 
-__all__ = ["Placed", "first_touch", "surface_samples"]
+__all__ = ["Placed", "first_touch", "rotation_matrices", "surface_samples"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,7 +50,7 @@ class Placed:
         self.geoms = GeomSet([shape.type], [shape.size], friction=[friction], rounding=[shape.rounding],
                              grids=[] if grid is None else [grid], nworld=nworld, device=device)  # fmt: skip
         self._pos = np.zeros(3) if grid is not None else np.asarray(shape.pos)
-        self._mat = np.eye(3) if grid is not None else _matrix(shape.quat)
+        self._mat = np.eye(3) if grid is not None else rotation_matrices(shape.quat)
 
     def place(self, pos, mat):
         """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
@@ -94,7 +94,8 @@ def first_touch(placed: Placed, points: wp.array, start, mat, direction, reach: 
     return np.where(begun & (travel < reach) & (gap < 1e-5), travel, np.nan)
 
 
-def _matrix(quat):
+def rotation_matrices(quat) -> np.ndarray:
+    """(..., 3, 3) of unit quaternions (..., 4), w x y z."""
     w, x, y, z = np.moveaxis(np.asarray(quat, float), -1, 0)
     return np.stack(
         [

@@ -41,6 +41,7 @@ class LiquidConduction:
 
     def __init__(self, geometry, excitation, conductivity=0.4, residual_film=4e-5):
         self.geometry, self.conductivity, self.residual_film = geometry, conductivity, residual_film
+        self._layers = _LAYERS
         core = CoreSurface(geometry.core_vert, geometry.core_face)
         x, angle = np.asarray(excitation, float).T
         seed = np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], 1)
@@ -60,7 +61,8 @@ class LiquidConduction:
         if missing:
             raise ValueError(f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move the electrode")
         self._pair = self._near(np.arange(len(keep)))
-        self.elem = column_tetrahedra(self.triangle, len(keep), len(_LAYERS) - 1)
+        self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
+        self._elem = np.ascontiguousarray(self.elem.T)
         self._set_unknowns(disc)
 
     def impedance(self, vert_xpos) -> np.ndarray:
@@ -85,13 +87,13 @@ class LiquidConduction:
         import skfem
         from skfem.models.poisson import laplace
 
-        mesh = skfem.MeshTet(1e3 * nodes.T, self.elem.T, validate=False, sort_t=False)
+        mesh = skfem.MeshTet(np.ascontiguousarray(1e3 * nodes.T), self._elem, validate=False, sort_t=False)
         return 1e-3 * laplace.assemble(skfem.Basis(mesh, skfem.ElementTetP1(), intorder=1))
 
     def nodes(self, gap):
         """(4 n, 3) nodes of the columns [m] for thicknesses gap (n,) [m]."""
         film = np.maximum(gap, self.residual_film)
-        return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in _LAYERS])
+        return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
 
     def gap(self, vert_xpos, rest=False) -> np.ndarray:
         """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets no skin takes its nearest
@@ -134,12 +136,12 @@ class LiquidConduction:
     def _set_unknowns(self, disc):
         """Nodes of one disc share an unknown, 0..18 for e1..e19; those of X1..X4 have none."""
         n = len(disc)
-        self._unknown = np.full(len(_LAYERS) * n, -1)
+        self._unknown = np.full(len(self._layers) * n, -1)
         bottom = np.where((disc >= 0) & (disc < 19), disc, -1)
         free = np.flatnonzero(disc < 0)
         bottom[free] = 19 + np.arange(len(free))
         self._unknown[:n] = bottom
-        above = (len(_LAYERS) - 1) * n
+        above = (len(self._layers) - 1) * n
         self._unknown[n:] = 19 + len(free) + np.arange(above)
         self._size = 19 + len(free) + above
 

@@ -3,10 +3,12 @@
 import dataclasses
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..approach import nearest_point
 from ..geometry.skin_geometry import SkinGeometry
-from .clearance import Placed, first_touch, surface_samples
+from ..sensor.core_surface import CoreSurface
+from .clearance import Placed, first_touch, rotation_matrices, surface_samples
 
 __all__ = ["Motion", "plan_motions", "sensing_faces"]
 
@@ -19,6 +21,7 @@ _TWIST = np.radians((10.0, 35.0))
 _BACK = 0.05  # [m] the objects come from there
 _LEAD = 5e-6  # [m] before first touch: where row 0 is
 _CLEAR = 0.8e-3  # [m] never nearer to the core: the skin is 1.5 mm thick there
+_FILM = 0.1e-3  # [m] less liquid under the skin is none
 _SHALLOW = 0.1e-3  # [m] less is no contact worth keeping
 
 
@@ -38,10 +41,13 @@ class Motion:
 
 
 def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
-    """(k,) outer faces over the electrodes: in front of the clamp (x < 2 mm), below the nail (y < 2 mm), free to move."""
+    """(k,) outer faces over liquid: in front of the clamp (x < 3 mm), below the nail (y < 0.5 mm), more than 0.1 mm of film beneath."""
     centre = geometry.vert[geometry.outer_face].mean(1)
-    free = ~np.isin(geometry.outer_face, geometry.fixed).any(1)
-    return np.flatnonzero((centre[:, 0] < 2e-3) & (centre[:, 1] < 2e-3) & free)
+    inner = np.unique(geometry.inner_face)
+    gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inner])[0]
+    wet = (gap > _FILM) & ~np.isin(inner, geometry.fixed)
+    beneath = cKDTree(geometry.vert[inner]).query(centre)[1]
+    return np.flatnonzero((centre[:, 0] < 3e-3) & (centre[:, 1] < 0.5e-3) & wet[beneath])
 
 
 def plan_motions(geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KINDS, device="cpu", progress=None) -> list[Motion]:
@@ -124,7 +130,7 @@ class _Planner:
         side = np.cos(round_) * first + np.sin(round_) * second
         direction = -np.cos(tilt) * normal + np.sin(tilt) * side
         spin = rng.uniform(0, 2 * np.pi)
-        mat = _rotation(direction, spin) @ _of_quat(_rotation_from_y(direction))
+        mat = _rotation(direction, spin) @ rotation_matrices(_rotation_from_y(direction))
         heading = rng.uniform(0, 2 * np.pi)
         slide = np.cos(heading) * first + np.sin(heading) * second
         return dict(
@@ -180,9 +186,3 @@ def _rotation(axis, angle):
     """(3, 3) rotation about a unit vector (Rodrigues)."""
     k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
-
-
-def _of_quat(quat):
-    from .clearance import _matrix
-
-    return _matrix(quat)

@@ -1,6 +1,6 @@
 """What `biotac generate`, `biotac import-data` and `biotac export-data` do with their arguments."""
 
-__all__ = ["generate_verb"]
+__all__ = ["export_verb", "generate_verb", "import_verb"]
 
 
 def generate_verb(args) -> None:
@@ -30,3 +30,32 @@ def generate_verb(args) -> None:
     print(f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not converged")
     print(f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.device}")
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
+
+
+def import_verb(args) -> None:
+    """`biotac import-data`; raises ValueError or FileNotFoundError for what cannot be."""
+    from .importers import import_recordings
+    from .store import TactileSet
+
+    given = {"force": args.force, "rate": args.rate, "block": args.block, "object": args.object, "objects": args.objects}
+    options = {name: value for name, value in given.items() if value is not None}
+    try:
+        count = import_recordings(args.files, args.out, args.format, args.seed, **options)
+    except TypeError as error:
+        raise ValueError(f"an option does not go with this format ({error}): see `biotac import-data --help`") from error
+    with TactileSet(args.out) as data:
+        objects = ", ".join(sorted(set(data.object.tolist())))
+        print(f"{count} interactions, {data.nstep} time steps, objects {objects}; in {args.out}")
+
+
+def export_verb(args) -> None:
+    """`biotac export-data`; raises ValueError or FileNotFoundError for what cannot be."""
+    from .lerobot import VERSION, export_lerobot
+    from .store import TactileSet
+
+    with TactileSet(args.set) as data:
+        try:
+            out = export_lerobot(data, args.out, "measured_counts" if args.measured else "counts", not args.quiet)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
+    print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")

@@ -1,0 +1,233 @@
+"""Export to the directory layout of LeRobotDataset v3.0 (Parquet and JSON), written with pyarrow alone; the skin's nodes stay in HDF5.
+
+An interaction is an episode. Layout as `lerobot` 0.4 reads it: meta/info.json, meta/stats.json, meta/tasks.parquet,
+meta/episodes/chunk-000/file-000.parquet and data/chunk-000/file-000.parquet.
+"""
+
+import json
+import pathlib
+import shutil
+import tempfile
+
+import numpy as np
+import tqdm
+
+from ..sensor.channels import CHANNELS
+
+__all__ = ["VERSION", "export_lerobot"]
+
+VERSION = "v3.0"
+_FILE_MB = 100  # of one data file, lerobot's default
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+_INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
+
+
+def export_lerobot(data, out, counts: str = "counts", progress: bool = True) -> pathlib.Path:
+    """Writes the folder `out` (built under another name, then renamed).
+
+    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc, .pac, .tdc, .tac (1 each)
+    [counts], observation.force (6, of the skin on the object) and action (7), the pose at the next time step. The task says what is done
+    with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that (episode_index, frame_index) leads to
+    the nodes in the HDF5 shards.
+
+    Args:
+      data: TactileSet with poses.
+      counts: "counts" for simulated readings of all interactions, "measured_counts" for those that have measured ones.
+
+    Raises:
+      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, or a folder that is there.
+      ImportError: no pyarrow; the text says how to get it.
+    """
+    _pyarrow()
+    out = pathlib.Path(out)
+    if out.exists():
+        raise ValueError(f"{out} is there already: choose another folder, or delete it")
+    if counts not in ("counts", "measured_counts"):
+        raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
+    for name in (counts, "indenter_pos", "indenter_quat", "wrench"):
+        data[name]  # says what is missing
+    chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
+    if not len(chosen):
+        raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    building = pathlib.Path(tempfile.mkdtemp(dir=out.parent, prefix=".lerobot-"))
+    try:
+        _Export(data, building, counts, chosen).write(progress)
+        building.chmod(0o755)
+        building.rename(out)
+    except BaseException:
+        shutil.rmtree(building)
+        raise
+    return out
+
+
+def _pyarrow():
+    try:
+        import pyarrow
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise ImportError("the LeRobot export needs pyarrow: pip install 'biotac-mj[lerobot]'") from None
+    return pyarrow
+
+
+class _Export:
+    def __init__(self, data, folder, counts, chosen):
+        self.data, self.folder, self.counts, self.chosen = data, folder, counts, chosen
+        self.fps = self._rate()
+        self.features = {
+            "observation.state": _feature(_POSE),
+            "observation.force": _feature(_WRENCH),
+            "observation.tactile.electrodes": _feature(CHANNELS[:19]),
+            **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[19:]},
+            "action": _feature(_POSE),
+        }
+        index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}
+        self.all_features = {**self.features, "timestamp": {"dtype": "float32", "shape": [1], "names": None}, **index}
+        tasks = [f"{kind} with {name}" for kind, name in zip(data.kind[chosen], data.object[chosen])]
+        self.tasks = sorted(set(tasks))
+        self.task = [self.tasks.index(task) for task in tasks]
+
+    def _rate(self):
+        steps = [np.diff(self.data["time"][self.data.start[i] : self.data.stop[i]]) for i in self.chosen[:50]]
+        step = np.concatenate(steps)
+        if not len(step) or np.ptp(step) > 1e-4:
+            raise ValueError("the time steps of the set are not even: LeRobot's layout has one frame rate; resample the recordings first")
+        rate = 1 / step.mean()
+        return int(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)
+
+    def write(self, progress):
+        pa, rows, episodes, moments = _pyarrow(), [], [], []
+        first, file_index, size = 0, 0, 0
+        for number, i in enumerate(tqdm.tqdm(self.chosen, desc="export", unit="interaction", disable=not progress, leave=False)):
+            columns = self._episode(number, int(i), first)
+            n = len(columns["index"])
+            rows.append(columns)
+            size += sum(value.nbytes for value in columns.values())
+            statistics = {name: _statistics(value) for name, value in columns.items()}
+            moments.append(statistics)
+            episodes.append(self._row(number, n, first, file_index, statistics))
+            first += n
+            if size > _FILE_MB * 2**20 or number == len(self.chosen) - 1:
+                self._parquet(f"data/{_chunk(file_index)}", self._table(pa, rows))
+                rows, size, file_index = [], 0, file_index + 1
+        self._parquet(f"meta/episodes/{_chunk(0)}", pa.Table.from_pylist(episodes))
+        self._tasks(pa)
+        self._json("meta/stats.json", {name: _merge([m[name] for m in moments]) for name in self.all_features})
+        self._json("meta/info.json", self._info(len(episodes), first))
+        source = {"set": self.data.path.name, "interaction": self.data.id[self.chosen].tolist(), "counts": self.counts}
+        synthetic = bool((self.data.kind[self.chosen] != "recorded").any())
+        self._json("source.json", source | {"synthetic": synthetic, "versions": self.data.versions})
+
+    def _episode(self, number, i, first):
+        """Columns of one episode: name -> (n, k) or (n,)."""
+        data = self.data
+        rows = slice(data.start[i], data.stop[i])
+        n = int(data.stop[i] - data.start[i])
+        pose = np.concatenate([data["indenter_pos"][rows], data["indenter_quat"][rows]], axis=1).astype(np.float32)
+        counts = data[self.counts][rows].astype(np.float32)
+        out = {
+            "observation.state": pose,
+            "observation.force": data["wrench"][rows].astype(np.float32),
+            "observation.tactile.electrodes": counts[:, :19],
+            **{f"observation.tactile.{name}": counts[:, 19 + k] for k, name in enumerate(CHANNELS[19:])},
+            "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
+            "timestamp": (np.arange(n) / self.fps).astype(np.float32),
+            "frame_index": np.arange(n),
+            "episode_index": np.full(n, number),
+            "index": first + np.arange(n),
+            "task_index": np.full(n, self.task[number]),
+        }
+        return out
+
+    def _row(self, number, n, first, file_index, statistics):
+        row = {
+            "episode_index": number,
+            "tasks": [self.tasks[self.task[number]]],
+            "length": n,
+            "data/chunk_index": file_index // 1000,
+            "data/file_index": file_index % 1000,
+            "dataset_from_index": first,
+            "dataset_to_index": first + n,
+        }
+        row |= {f"stats/{name}/{key}": statistics[name][key].tolist() for name in statistics for key in _STATS}
+        return row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+
+    def _table(self, pa, rows):
+        arrays = []
+        for name, feature in self.all_features.items():
+            kind, width = pa.type_for_alias(feature["dtype"]), feature["shape"][0]
+            flat = pa.array(np.concatenate([r[name] for r in rows]).ravel(), kind)
+            arrays.append(flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width))
+        return pa.Table.from_arrays(arrays, names=list(self.all_features))
+
+    def _tasks(self, pa):
+        """The tasks' texts are the index of a pandas frame: its metadata says so."""
+        table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), "task": self.tasks})
+        column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+        text = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        header = {"field_name": None, "name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": {"encoding": "UTF-8"}}
+        pandas = {"index_columns": ["task"], "column_indexes": [header], "columns": [column, text], "pandas_version": "2.0.0"}
+        self._parquet("meta/tasks", table.replace_schema_metadata({"pandas": json.dumps(pandas)}))
+
+    def _info(self, episodes, frames):
+        return {
+            "codebase_version": VERSION,
+            "robot_type": "biotac_mj",
+            "total_episodes": episodes,
+            "total_frames": frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": 1000,
+            "data_files_size_in_mb": _FILE_MB,
+            "video_files_size_in_mb": 200,
+            "fps": self.fps,
+            "splits": {"train": f"0:{episodes}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": None,
+            "features": self.all_features,
+        }
+
+    def _parquet(self, name, table):
+        import pyarrow.parquet as parquet
+
+        path = self.folder / f"{name}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(table, path, compression="snappy")
+
+    def _json(self, name, value):
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(value, indent=4) + "\n")
+
+
+def _chunk(number):
+    return f"chunk-{number // 1000:03d}/file-{number % 1000:03d}"
+
+
+def _feature(names):
+    return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+
+
+def _statistics(value):
+    """Of a column (n, k) or (n,): each (k,) or (1,)."""
+    value = np.asarray(value, float).reshape(len(value), -1)
+    quantile = np.quantile(value, (0.01, 0.10, 0.50, 0.90, 0.99), axis=0)
+    return {"min": value.min(0), "max": value.max(0), "mean": value.mean(0), "std": value.std(0), "count": np.array([len(value)]),
+            **dict(zip(_STATS[5:], quantile))}  # fmt: skip
+
+
+def _merge(parts):
+    """Statistics of all episodes; mean and standard deviation are exact, quantiles are means of the episodes' (as in lerobot)."""
+    count = np.array([p["count"][0] for p in parts], float)[:, None]
+    mean = np.array([p["mean"] for p in parts])
+    total = (count * mean).sum(0) / count.sum()
+    variance = (count * (np.array([p["std"] for p in parts]) ** 2 + (mean - total) ** 2)).sum(0) / count.sum()
+    out = {
+        "min": np.min([p["min"] for p in parts], 0),
+        "max": np.max([p["max"] for p in parts], 0),
+        "mean": total,
+        "std": np.sqrt(variance),
+    }
+    out |= {key: (count * np.array([p[key] for p in parts])).sum(0) / count.sum() for key in _STATS[5:]}
+    return {key: value.tolist() for key, value in out.items()} | {"count": [int(count.sum())]}

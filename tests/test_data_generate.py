@@ -1,0 +1,256 @@
+"""Generation: where objects touch, how they move, and that a set is what its seed says, however often it was interrupted."""
+
+import dataclasses
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from biotac_mj import approach, cli, press_indenter
+from biotac_mj.data import TactileSet, nodes_of
+from biotac_mj.data.clearance import Placed, first_touch, surface_samples
+from biotac_mj.data.generate import GenerateOptions, batches, generate
+from biotac_mj.data.objects import OBJECTS, make_object
+from biotac_mj.data.plan import plan_motions, sensing_faces
+from biotac_mj.data.readings import sample
+from biotac_mj.geometry import INDENTERS, load_skin
+from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressure
+from biotac_mj.sensor.film import FilmConduction
+
+SMALL = GenerateOptions(count=4, labelled=1, steps=8, seed=5, objects=("sphere_7mm", "table_edge"), kinds=("press", "twist"), skin="coarse",
+                        measured_skin="coarse", batch=2)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return load_skin("coarse")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    out = tmp_path_factory.mktemp("small")
+    return out, generate(out, SMALL, workers=0, progress=False)
+
+
+def test_names_are_those_of_the_help():
+    assert tuple(cli.OBJECTS) == OBJECTS and len(OBJECTS) == 17 and OBJECTS[:8] == INDENTERS
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_objects_are_closed_and_point_ahead(name):
+    shape = make_object(name)
+    mesh = trimesh.Trimesh(shape.vert, shape.face)
+    assert mesh.is_watertight and mesh.volume > 0
+    # the drawn table has sharp edges, the shape that touches is rounded by 0.5 mm
+    sharp = 0.5e-3 * {"table_edge": np.sqrt(2) - 1, "table_corner": np.sqrt(3) - 1}.get(name, 0)
+    assert abs(shape.vert[:, 1].max() - sharp) < 1e-6
+    placed = Placed(name, 1)
+    placed.place(np.zeros((1, 3)), np.eye(3)[None])
+    for at, expected in ((1e-4, 1e-4), (-1e-4, -1e-4)):
+        if name == "ring_7mm" and expected:
+            continue  # its front is a circle, not a point
+        point = wp.array(np.array([[0.0, at, 0.0]]), dtype=wp.vec3d)
+        assert abs(placed.nearest(point)[0] - expected) < 2e-6
+
+
+def test_distances_are_those_of_the_mesh():
+    # a hexagonal peg and the ring against trimesh's exact distance to their triangles
+    for name in ("ring_7mm", "peg_hexagon_8mm"):
+        shape = make_object(name)
+        mesh = trimesh.Trimesh(1e3 * shape.vert, shape.face)
+        rng = np.random.default_rng(0)
+        point = mesh.triangles_center[rng.integers(0, len(shape.face), 20)] + rng.normal(0, 0.3, (20, 3))
+        exact = -trimesh.proximity.signed_distance(mesh, point)
+        placed = Placed(name, 1)
+        placed.place(np.zeros((1, 3)), np.eye(3)[None])
+        got = [placed.nearest(wp.array(p[None] * 1e-3, dtype=wp.vec3d))[0] for p in point]
+        np.testing.assert_allclose(1e3 * np.array(got), np.minimum(exact, 2.0), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["sphere_3-5mm", "ring_7mm", "cube_14mm"])
+def test_first_touch_is_where_rays_find_it(skin, name):
+    point, normal = approach.surface_point(skin, -0.011, 0.4)
+    direction = -normal
+    points = surface_samples(skin.vert, skin.outer_face, "cpu", order=6)
+    from biotac_mj.data.clearance import rotation_matrices
+    from biotac_mj.press import _rotation_from_y
+
+    quat = _rotation_from_y(direction)
+    got = first_touch(Placed(name, 1), points, (point - 0.05 * direction)[None], rotation_matrices(quat)[None], direction[None])[0]
+    spec = mujoco.MjSpec()
+    shape = press_indenter.make_indenter(name)
+    press_indenter.add_indenter(spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    assert abs(got - approach.first_touch(skin, model, data, direction)) < 1.5e-5  # samples 0.1 mm apart on a face
+
+
+def test_motions_cover_the_surface_and_keep_off_the_core(skin):
+    motions = plan_motions(skin, "sphere_7mm", [[1, i] for i in range(60)], 12)
+    start = np.array([m.parameters["start"] for m in motions])
+    assert {m.kind for m in motions} == {"press", "slide", "twist", "tap"}
+    assert start[:, 0].min() < -17e-3 and start[:, 0].max() > -2e-3  # from the tip to the clamp
+    assert start[:, 2].min() < -5e-3 and start[:, 2].max() > 5e-3  # both sides
+    core = trimesh.Trimesh(1e3 * skin.core_vert, skin.core_face)
+    outer = trimesh.Trimesh(1e3 * skin.vert, skin.outer_face)
+    for motion in motions[:12]:
+        centre = 1e3 * (motion.pos + motion.mat @ [0, -3.5e-3, 0])  # of the ball, 3.5 mm from its tip
+        assert -trimesh.proximity.signed_distance(core, centre).max() - 3.5 > 0.8 - 0.03
+        depth = trimesh.proximity.signed_distance(outer, centre) + 3.5
+        assert depth[0] < 0.01 and 0.05 < depth.max() < 2.5  # [mm] touch is found at samples 0.2 mm apart
+    tapping = next(m for m in motions if m.kind == "tap")
+    ahead = tapping.pos @ tapping.parameters["direction"]
+    assert (np.diff(np.sign(np.diff(ahead))) != 0).sum() >= 3  # down and up, at least twice
+
+
+def test_sensing_faces_lie_over_liquid(skin):
+    face = skin.outer_face[sensing_faces(skin)]
+    centre = skin.vert[face].mean(1)
+    assert centre[:, 1].max() < 0.5e-3 and centre[:, 0].max() < 3e-3
+    inner = skin.vert[np.unique(skin.inner_face)]
+    core = trimesh.Trimesh(1e3 * skin.core_vert, skin.core_face)
+    near = inner[[np.linalg.norm(inner - c, axis=1).argmin() for c in centre[::20]]]
+    assert (trimesh.proximity.signed_distance(core, 1e3 * near) < -0.09).all()
+
+
+def test_a_seed_is_a_motion(skin):
+    a = plan_motions(skin, "cube_14mm", [[3, 0], [3, 1], [3, 2]], 10)
+    b = plan_motions(skin, "cube_14mm", [[3, 2]], 10)
+    np.testing.assert_array_equal(a[2].pos, b[0].pos)
+    np.testing.assert_array_equal(a[2].mat, b[0].mat)
+    assert np.abs(a[0].pos - a[1].pos).max() > 1e-4
+    np.testing.assert_allclose(np.swapaxes(a[0].mat, 1, 2) @ a[0].mat, np.tile(np.eye(3), (10, 1, 1)), atol=1e-12)
+
+
+def test_a_small_set_is_physics(small, skin):
+    out, report = small
+    assert report.interactions == 4 and report.steps == 32 and report.nonconverged == 0
+    assert json.loads((out / "generate.json").read_text())["seconds"]["all"] > 0
+    with TactileSet(out) as data:
+        assert sorted(data.id) == ["000000", "000001", "000002", "000003"] and data.labelled.sum() == 1
+        outer, film = nodes_of(data.geometry), FilmConduction(data.geometry)
+        for i in range(len(data)):
+            one = data.interaction(i)
+            force = one.wrench[:, :3]
+            assert np.abs(force[0]).max() == 0 and np.abs(force).max() > 0.02
+            # the wrench is the reaction to the nodes' forces, torque included
+            np.testing.assert_allclose(one.contact_force.sum(1), -force, atol=1e-5)
+            x = data.vert_xpos(slice(data.start[i], data.stop[i])).astype(float)
+            torque = np.cross(x[:, outer], one.contact_force.astype(float)).sum(1)
+            np.testing.assert_allclose(torque, -one.wrench[:, 3:], atol=3e-3 * np.abs(one.wrench[:, 3:]).max() + 1e-7)
+            # stored impedances are the film's of the stored nodes, counts their noisy 12-bit image
+            k = int(np.abs(force).sum(1).argmax())
+            np.testing.assert_allclose(film.impedance(x[k]), one.impedance[k], rtol=1e-4)
+            still = counts_from_impedance(one.impedance)
+            moved = 0.2 * np.abs(np.diff(still, axis=0, prepend=still[:1]))  # in a frame of 10 ms, a fifth of a time step
+            assert (np.abs(one.counts[:, :19] - still) < moved + 33).all()  # five times the noise
+            assert np.abs(one.counts[:, 19] - counts_from_pressure(one.pressure)).max() < 8
+            assert (one.counts == np.rint(one.counts)).all()
+            assert (one.measured_counts is not None) == one.labelled == bool(data.labelled[i])
+
+
+def test_same_seed_same_file_and_an_interrupted_run_goes_on(small, tmp_path):
+    out, _ = small
+    names = sorted(p.name for p in out.glob("shard-*.h5"))
+    assert len(names) == 3
+    for name in names[:-1]:
+        (tmp_path / name).write_bytes((out / name).read_bytes())
+    report = generate(tmp_path, SMALL, workers=0, progress=False)
+    assert report.made == 1 and report.interactions == 4
+    assert (tmp_path / names[-1]).read_bytes() == (out / names[-1]).read_bytes()
+    assert (tmp_path / names[-1]).read_bytes() != (tmp_path / names[-2]).read_bytes()
+    assert generate(tmp_path, SMALL, workers=0, progress=False).made == 0
+    with pytest.raises(ValueError, match=r"other options \(steps 8 there, 9 now\): use another --out"):
+        generate(tmp_path, dataclasses.replace(SMALL, steps=9), workers=0, progress=False)
+
+
+@pytest.mark.slow
+def test_worker_processes_give_the_same_whole_set(small, tmp_path):
+    out, _ = small
+    generate(tmp_path, SMALL, workers=2, progress=False)
+    for path in out.glob("shard-*.h5"):
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+def test_same_seed_same_file_on_cuda(tmp_path):
+    options = dataclasses.replace(SMALL, count=24, labelled=8, batch=8, device="cuda:0")
+    for name in ("a", "b"):
+        generate(tmp_path / name, options, workers=0, progress=False)
+    for path in (tmp_path / "a").glob("shard-*.h5"):
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+
+
+def test_condensed_tier(tmp_path):
+    options = dataclasses.replace(SMALL, count=1, labelled=0, objects=("sphere_7mm",), tier="condensed", kinds=("press",))
+    report = generate(tmp_path, options, workers=0, progress=False)
+    full = generate(tmp_path / "full", dataclasses.replace(options, tier="full"), workers=0, progress=False)
+    assert report.steps == full.steps == 8
+    with TactileSet(tmp_path) as fast, TactileSet(tmp_path / "full") as exact:
+        assert "contact_force" not in fast.columns and fast.attributes["tier"] == "condensed"
+        np.testing.assert_array_equal(fast["indenter_pos"][:], exact["indenter_pos"][:])
+        force = exact["wrench"][:][:, :3]
+        assert np.abs(fast["wrench"][:][:, :3] - force).max() < 0.1 * np.abs(force).max()
+
+
+def test_all_objects_take_turns():
+    options = GenerateOptions(count=100, labelled=20, batch=3)
+    parts = batches(options)
+    assert sorted(i for part in parts for i in part.members) == list(range(100))
+    assert {part.name for part in parts if part.labelled} == set(INDENTERS)
+    assert {part.name for part in parts if not part.labelled} == set(OBJECTS)
+    assert max(len(part.members) for part in parts) <= 3 and [part.number for part in parts] == list(range(len(parts)))
+
+
+def test_readings_follow_a_ramp():
+    time = np.arange(6) * 0.05
+    impedance, pressure = np.outer(5e3 * (1 + 20 * time), np.ones(19)), 2e4 * time
+    counts = sample(time, impedance, pressure, seed=3)
+    # what stands there was sampled within the last frame of 10 ms; five standard deviations of noise
+    earliest = counts_from_impedance(np.outer(5e3 * (1 + 20 * (time - 0.0101)), np.ones(19)))
+    assert (counts[1:, :19] < earliest[1:] + 33).all() and (counts[1:, :19] > counts_from_impedance(impedance)[1:] - 33).all()
+    assert np.abs(counts[1:, 19] - counts_from_pressure(pressure - 100)[1:]).max() < 3 + 5
+    np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3), counts)
+    assert (sample(time, impedance, pressure, seed=4) != counts).any()
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        (dict(count=0), "count is 0"),
+        (dict(labelled=9), "labelled is 9: it must lie between 0 and the count, 4"),
+        (dict(rate=0.0), "rate is 0.0 Hz"),
+        (dict(seed=-1), "seed is -1"),
+        (dict(tier="fast"), "unknown tier 'fast': choose full or condensed"),
+        (dict(objects=("spoon",)), "unknown object 'spoon': choose from sphere_3-5mm"),
+        (dict(objects=()), "list: it is empty"),
+        (dict(objects=("table_edge",)), "labelled interactions are made with the eight indenters"),
+    ],
+)
+def test_bad_options_are_named(changes, text):
+    with pytest.raises(ValueError, match=text):
+        dataclasses.replace(SMALL, **changes)
+
+
+def test_bad_plans_are_named(skin):
+    with pytest.raises(ValueError, match="unknown kind of interaction 'poke': choose from press"):
+        plan_motions(skin, "sphere_7mm", [[0]], 12, kinds=("poke",))
+    with pytest.raises(ValueError, match="5 steps are too few"):
+        plan_motions(skin, "sphere_7mm", [[0]], 5)
+    with pytest.raises(ValueError, match="unknown object 'spoon'"):
+        make_object("spoon")
+
+
+def test_the_command_reports_what_it_made(tmp_path, capsys):
+    arguments = ["generate", "--count", "1", "--steps", "8", "--labelled", "0", "--skin", "coarse", "--tier", "condensed",
+                 "--objects", "sphere_7mm", "--kinds", "tap", "--workers", "0", "--quiet", "--out", str(tmp_path / "set")]  # fmt: skip
+    assert cli.main(arguments) == 0
+    text = capsys.readouterr().out
+    assert "1 interactions, 8 time steps, 0 of them not converged" in text and "1 shards made" in text
+    assert cli.main([*arguments, "--count", "-3"]) == 2
+    assert "count is -3" in capsys.readouterr().err
