@@ -18,9 +18,11 @@ from biotac_mj.press_record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_step, step
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
+from biotac_mj.skin.condensed_correction import correction
 from biotac_mj.skin.contact import face_samples
+from biotac_mj.skin.rest_tangent import rest_tangent
 from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
 
 RADIUS = 3.5e-3
@@ -123,8 +125,7 @@ def test_film_and_counts_are_those_of_the_full_fem(both):
         assert np.abs(change[1] - change[0]).max() < 0.12 * np.abs(change[0]).max()
 
 
-def test_without_softening_and_liquid_it_is_the_linear_skin(monkeypatch):
-    monkeypatch.setattr(condensed_step, "_SOFTENING", (1.0, 1e-12))
+def test_without_liquid_it_is_the_linear_skin():
     model = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="linear"), SkinOptions(liquid=False))
     full, condensed = press_both(model, np.arange(1, 10) * 2e-4)
     for (wrench, xpos, _), c in zip(full, condensed):
@@ -142,6 +143,57 @@ def test_liquid_keeps_its_volume(both):
     assert np.abs(volumes / model.liquid_volume - 1).max() < 5e-4
     pressures = np.array([c.memory.pressure for c in condensed])
     assert (np.diff(pressures[:6]) > 0).all() and pressures[0] > 100
+
+
+def test_a_filled_skin_is_that_of_the_full_fem():
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=3e3))
+    start, direction = touch(dataclasses.replace(model.geometry, vert=model.rest.vert))
+    depths = np.array([3e-4, 6e-4, 9e-4])
+    skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
+    away = skin.solve(Memory.rest(1), (start - 1e-3 * direction)[None], EYE)
+    assert away.memory.pressure == 0 and away.volume == model.rest.volume and (away.vert_xpos == model.rest.vert).all()
+    assert model.rest.pressure == pytest.approx(3e3, rel=1e-2) and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5
+    for c, depth in zip(walk(skin, start + np.outer(depths, direction)), depths):
+        geoms.set_pose((start + depth * direction)[None])
+        step(model, data, geoms)
+        assert data.converged.all()
+        assert np.linalg.norm(c.wrench[0, :3] - data.wrench[0, 0, :3]) < 0.06 * np.linalg.norm(data.wrench[0, 0, :3])
+        assert abs(c.memory.pressure - data.pressure[0]) < 0.06 * data.pressure[0]
+        assert abs(c.volume - model.rest.volume) < 5e-4 * model.rest.volume
+
+
+def test_stiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=3e3))
+    K = rest_tangent(model)
+    rng, eps = np.random.default_rng(0), 1e-8
+    p = np.zeros((model.nvert, 3))
+    p[model.free] = rng.standard_normal((len(model.free), 3))
+
+    def force(x):
+        data = SkinData(model)
+        data.x.numpy()[:, 0] = x
+        model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.product)
+        out = data.product.numpy()[:, 0].copy()
+        a, b, c = (x[model.geometry.inner_face[:, i]] for i in range(3))
+        area = -np.cross(b - a, c - a) / 6  # a third of each face, towards the skin
+        for i in range(3):
+            np.add.at(out, model.geometry.inner_face[:, i], model.rest.pressure * area)
+        return out[model.free].ravel()
+
+    x = model.rest.vert
+    slope = -(force(x + eps * p) - force(x - eps * p)) / (2 * eps)
+    assert np.abs(K @ p[model.free].ravel() - slope).max() < 1e-5 * np.abs(slope).max()
+
+
+def test_it_says_where_its_error_was_not_measured(both):
+    _, _, _, condensed = both
+    assert all(c.measured for c in condensed[:8])
+    start, direction = touch(both[0].geometry)
+    deep = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="svk"))
+    out = CondensedSkin(deep, sphere(), cache=False).solve(Memory.rest(1), (start + 2e-4 * direction)[None], EYE)
+    assert not out.measured
+    assert not correction("neo_hookean").measured(0.45, 0.6) and correction("neo_hookean").measured(0.499, 0.3)
+    assert not correction("corotational").measured(0.45, 0.1)
 
 
 # --- mechanics
@@ -254,7 +306,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
     outer = np.setdiff1d(np.unique(geometry.outer_face), coarse.fixed)[::40]
     inner = np.setdiff1d(np.unique(geometry.inner_face), coarse.fixed)[::40]
     direction = np.tile([0.6, 0.0, 0.8], (len(inner), 1))
-    fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
+    fresh = SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction, cache=False)
     chosen = [4, 3 * len(outer) + 2]
     for coordinate, force in zip(chosen, ((outer[1], [0, 1, 0]), (inner[2], [0.6, 0, 0.8]))):
         unit = np.zeros((coarse.nvert, 3))
@@ -265,13 +317,13 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
         stiff = coarse._stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
     for _ in range(2):  # written, then read
-        kept = SurfaceCompliance(coarse, outer, inner, direction)
+        kept = SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction)
         assert all((a == b).all() for a, b in zip(kept.row(chosen), fresh.row(chosen)))
     (file,) = cache_folder().glob("compliance-*.npy")
     assert file.parent == tmp_path
     np.save(file, np.zeros((3, 3), np.float16))
     with pytest.raises(ValueError, match="does not hold the compliance of this skin: delete it"):
-        SurfaceCompliance(coarse, outer, inner, direction)
+        SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction)
 
 
 # --- in MuJoCo
@@ -332,8 +384,8 @@ def test_what_it_cannot_do_is_refused():
     model = SkinModel(load_skin("coarse"), options=SkinOptions(dynamics="implicit"))
     with pytest.raises(ValueError, match="no inertia: choose dynamics='quasistatic' or the full tier"):
         CondensedSkin(model, sphere(), cache=False)
-    model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=1e3))
-    with pytest.raises(ValueError, match="leave fill_volume and rest_pressure out, or use the full tier"):
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(fill_volume=-1e-9))
+    with pytest.raises(ValueError, match="take fill_volume and rest_pressure >= 0, or the full tier"):
         CondensedSkin(model, sphere(), cache=False)
 
 

@@ -44,7 +44,7 @@ class Handle:
     def read(self, data, channel) -> np.ndarray:
         """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m] on the BioTac in its frame;
         status is (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier:
-        0 full, 1 condensed)."""
+        0 full, 1 condensed, -1 condensed where its error has not been measured)."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
     def vert_xpos(self, model, data) -> np.ndarray:

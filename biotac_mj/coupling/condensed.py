@@ -16,15 +16,15 @@ _MAX_FORCES, _MAX_CONTACTS = 1024, 2048
 class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
 
-    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening, poses and motion of the geoms, contact
-    forces (how many, then coordinates, forces and their last changes) and sticking contacts (how many, then sample, geom and anchor).
+    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening and swelling, poses and motion of the geoms,
+    contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then sample, geom and anchor).
     """
 
     def __init__(self, config, geometry, geoms):
         super().__init__(config, geometry, geoms)
         g = len(geoms)
         sizes = {
-            "head": 5,
+            "head": 6,
             "geom_pos": 3 * g,
             "geom_mat": 9 * g,
             "motion": 3 * g,
@@ -45,7 +45,7 @@ class CondensedStepper(FemStepper):
 
     def vert_xpos(self, state):
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
-        return self._geometry.vert + self._skin.displacement(self._read(state))[:n]
+        return (self._skin.rest + self._skin.displacement(self._read(state)))[:n]
 
     def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
         """See `SkinStepper`.
@@ -65,10 +65,11 @@ class CondensedStepper(FemStepper):
             converged=out.converged,
             iterations=out.iterations,
             residual=out.error,
+            measured=out.measured,
         )
 
     def _read(self, state) -> Memory:
-        started, pressure, bulge, growth, softening = self._part(state, "head").tolist()
+        started, pressure, bulge, growth, softening, swelling = self._part(state, "head").tolist()
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         n, k = int(forces[0]), int(contacts[0])
         return Memory(
@@ -80,6 +81,7 @@ class CondensedStepper(FemStepper):
             bulge=bulge,
             growth=growth,
             softening=softening,
+            swelling=swelling,
             geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
             geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
             motion=self._part(state, "motion").reshape(-1, 3),
@@ -93,7 +95,8 @@ class CondensedStepper(FemStepper):
                 f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and {_MAX_FORCES}: "
                 "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
             )
-        self._part(state, "head")[:] = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening
+        head = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening, memory.swelling
+        self._part(state, "head")[:] = head
         self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
         self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
         self._part(state, "motion")[:] = memory.motion.ravel()

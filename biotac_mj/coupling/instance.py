@@ -222,7 +222,8 @@ class Instance:
             out[self.sensor["contact_force"]] = -result.wrench.sum(axis=0)
         if "status" in self.sensor:
             failed = self.state[_FAILED] + (not result.converged)
-            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual, self._tier)
+            tier = self._tier if result.measured else -self._tier
+            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual, tier)
 
     def failed(self):
         """After an exception: the step's skin is unknown; the status sensor says -1."""

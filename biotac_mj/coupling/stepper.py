@@ -54,6 +54,7 @@ class SkinResult:
       vert_xpos: (nvert, 3) deformed nodes [m].
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
+      measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
     state: np.ndarray
@@ -64,6 +65,7 @@ class SkinResult:
     converged: bool = True
     iterations: int = 0
     residual: float = 0.0
+    measured: bool = True
 
 
 class SkinStepper(Protocol):

@@ -1,27 +1,30 @@
 """The real-time tier: a skin that is linear but for its contact, solved over the nodes that touch.
 
-Displacements are u = s C (f + p g): C the inverse of the rest stiffness, f the contact forces of outer nodes (Coulomb friction) and of
-inner nodes against the core (normal only), p the liquid's pressure, g the gradient of its volume at rest, s >= 1 the softening below.
-The liquid's pressure follows in closed form from p = -K (g.u + q) / V0, with q what the exact volume of the deformed cavity adds to its
-linear part. What is left is the contact law f = F(u) over the candidates, tens of coordinates, solved by Newton's method with a search
-along the step (a semi-smooth Newton method; the contact law is that of the full skin, `contact.contact_force`).
+Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f the contact forces of outer nodes (Coulomb friction) and of
+inner nodes against the core (normal only), p the liquid's pressure above that at rest, g the gradient of its volume at rest, s >= 1 and
+c <= 1 corrections. The liquid's pressure follows in closed form from p = -K (g.u + q) / V0, with q what the exact volume of the deformed
+cavity adds to its linear part. What is left is the contact law f = F(u) over the candidates, tens of coordinates, solved by Newton's method
+with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin, `contact.touch_face`).
 
-A linear skin is too stiff at depth: real skin rolls around the indenter. The softening s = 1 + 1 / (h / d + 1 / s_max) of the largest
-displacement d of a touching node is that effect fitted to the full FEM (docs/condensed.md).
+What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed_correction`).
 """
 
 import math
+import weakref
 
 import numpy as np
 import warp as wp
 from scipy.linalg.blas import saxpy
+from scipy.spatial import cKDTree
 
 from . import liquid
+from .condensed_correction import correction
 from .condensed_faces import CandidateFaces
 from .condensed_step import Memory, Outcome, Step
 from .contact import Geoms
 from .core_contact import CoreContact
 from .geoms import GeomSet
+from .rest_tangent import rest_tangent
 from .shapes import distance_bound
 from .surface_compliance import SurfaceCompliance
 from .types import real, vec3
@@ -95,8 +98,23 @@ def _core_clearance(
     clearance_out[g] = least
 
 
+_compliances = weakref.WeakKeyDictionary()
+
+
+def _compliance(model, outer, inner, direction, cache):
+    """The rows of a model, shared by all its skins."""
+    if cache not in _compliances.get(model, {}):
+        factor, stiffness = model.factor, model._stiffness
+        if model.rest.pressure:
+            stiffness = rest_tangent(model)
+            factor = model._invert(stiffness)
+        made = SurfaceCompliance(model, factor, stiffness, outer, inner, direction, cache)
+        _compliances.setdefault(model, {})[cache] = made
+    return _compliances[model][cache]
+
+
 def _key(memory):
-    return memory.coordinate.tobytes(), memory.force.tobytes(), memory.pressure, memory.softening
+    return memory.coordinate.tobytes(), memory.force.tobytes(), memory.pressure, memory.softening, memory.swelling
 
 
 class CondensedSkin:
@@ -108,7 +126,7 @@ class CondensedSkin:
       cache: whether to keep the compliance on disk (see `surface_compliance`).
 
     Raises:
-      ValueError: a model on another device, with implicit dynamics, or filled beyond its unstressed volume.
+      ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the unstressed skin holds.
     """
 
     def __init__(self, model, geoms: GeomSet, cache: bool = True):
@@ -116,11 +134,13 @@ class CondensedSkin:
             raise ValueError("the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA")
         if model.options.dynamics != "quasistatic":
             raise ValueError("the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier")
-        if model.has_liquid and (model.options.fill_volume or model.options.rest_pressure):
+        filled = model.has_liquid and (model.options.fill_volume or model.options.rest_pressure)
+        if filled and (model.options.fill_volume < 0 or model.options.rest_pressure < 0):
             raise ValueError(
-                "the condensed tier is linear about the unstressed skin: leave fill_volume and rest_pressure out, or use the full tier"
+                "the condensed tier needs a skin clear of its core at rest: take fill_volume and rest_pressure >= 0, or the full tier"
             )
         self.model, self.geoms = model, geoms
+        self.correction = correction(model.material.law)
         g = model.geometry
         free = np.zeros(model.nvert, bool)
         free[model.free] = True
@@ -130,20 +150,24 @@ class CondensedSkin:
         self._outer = self._outer[free[self._outer]]
         self._number = np.full(model.nvert, -1)
         self._number[self._outer] = np.arange(len(self._outer))
-        self._rest = g.vert.astype(float)
+        self.rest = model.rest.vert.astype(float)
         self._prepare_search()
         self.faces = CandidateFaces(model, geoms, self._x_wp, self._last_wp, self._slot_wp)
-        self._core = CoreContact(model, self._x_wp, self._x) if model.has_core else None
+        self._core = CoreContact(model, self.rest, self._x_wp, self._x) if model.has_core else None
         if self._core and geoms.count:
             clearance = wp.zeros(geoms.count, dtype=real, device="cpu")
             self._clearance = clearance.numpy()
             self._clearances = self._record(_core_clearance, [model.core_vert, geoms.struct], [clearance], geoms.count)
         self._inner = self._core.node if self._core else np.zeros(0, int)
         self._away = self._core.direction if self._core else np.zeros((0, 3))
-        self.compliance = SurfaceCompliance(model, self._outer, self._inner, self._away, cache)
+        self.compliance = _compliance(model, self._outer, self._inner, self._away, cache)
         self._prepare_liquid()
         self._systems, self._fields, self._last_system = {}, {}, None
         self._away32 = self._away.astype(np.float32)
+        # what is across the wall from each outer node
+        inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(model.fixed, g.outer_face)
+        self.opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
+        self.wall = self.rest[self._outer] - self.rest[self.opposite]
 
     # --- preparation -------------------------------------------------------------------------------------------------------------
 
@@ -161,7 +185,7 @@ class CondensedSkin:
         number, self._asked = zeros(len(self._face), int)
         count, self._count = zeros(2, int)
         reach, self._reach = zeros(1, real)
-        self._x[:, 0] = self._last[:, 0] = self._rest
+        self._x[:, 0] = self._last[:, 0] = self.rest
         self._detect = self._record(_near, [count, number, m.outer.face, m.sample, self.geoms.struct, self._x_wp, reach], [near])
         self._region = None
 
@@ -177,6 +201,8 @@ class CondensedSkin:
         share = wp.zeros((len(m.inner.face), 1), dtype=real, device="cpu")
         self._share = share.numpy()
         self._volume = self._record(liquid.cavity_volume, [m.inner.face, self._x_wp], [share], share.shape)
+        self._volume()
+        self._cavity = float(self._share.sum())
         if not m.has_liquid:
             return
         corner = wp.zeros((3 * len(m.inner.face), 1), dtype=vec3, device="cpu")
@@ -209,12 +235,12 @@ class CondensedSkin:
             struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = geom_pos, geom_mat
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         if not len(memory.force):  # at rest: what no sample touches changes nothing
-            self._x[:, 0] = self._rest
+            self._x[:, 0] = self.rest
             if not len(self.faces_near(0.0, 0.0, (geom_pos, geom_mat))):
                 return self._at_rest(geom_pos, geom_mat, geom_pos - last[0])
         self._refuse_core(self._travel(geom_pos, geom_mat))
         u = self.displacement(memory)
-        self._last[:, 0] = self._x[:, 0] = self._rest + u
+        self._last[:, 0] = self._x[:, 0] = self.rest + u
         step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
         for _ in range(4):
             step.run()
@@ -228,7 +254,8 @@ class CondensedSkin:
         memory = Memory.rest(self.geoms.count)
         memory.started, memory.geom_pos, memory.geom_mat, memory.motion = True, np.array(pos), np.array(mat), motion
         n = self.geoms.ngroup
-        return Outcome(memory, np.zeros((n, 6)), np.zeros((n, 6, 6)), self._rest.copy(), self.model.liquid_volume, True, 0, 0.0)
+        still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
+        return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0)
 
     def _refuse_core(self, travel):
         """Raises ValueError for a geom deep inside the core; `travel` is how far geoms have moved since the region was chosen."""
@@ -265,7 +292,7 @@ class CondensedSkin:
         if self._region is None or moved + reach + travel > self._region[4]:
             self._asked[:] = np.arange(len(self._face))
             here = self._x.copy()
-            self._x[:, 0] = self._rest
+            self._x[:, 0] = self.rest
             width = moved + reach + _REGION
             faces = self._look(len(self._face), width)
             self._x[:] = here
@@ -288,7 +315,7 @@ class CondensedSkin:
         """(nvert, 3) of a memory [m]."""
         key = _key(memory)
         if key not in self._fields:
-            self._keep(memory, self._recover(memory.coordinate, memory.force, memory.pressure, memory.softening))
+            self._keep(memory, self._recover(memory.coordinate, memory.force, memory.pressure, memory.softening, memory.swelling))
         return self._fields[key]
 
     def _keep(self, memory, u):
@@ -296,8 +323,8 @@ class CondensedSkin:
             self._fields.clear()
         self._fields[_key(memory)] = u
 
-    def _recover(self, coordinate, force, pressure, softening):
-        u = pressure * self._give
+    def _recover(self, coordinate, force, pressure, softening, swelling):
+        u = (pressure * swelling / softening) * self._give
         if len(coordinate):
             sums = np.zeros(self.compliance.size, np.float32)
             for row, f in zip(self.compliance.row(coordinate.tolist()), force.tolist()):

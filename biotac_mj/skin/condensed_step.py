@@ -9,7 +9,6 @@ from .condensed_linear import Compliance, Lumped, Springs, solve
 
 __all__ = ["Memory", "Outcome", "Step"]
 
-_SOFTENING = (6.5e-3, 0.30)  # h [m], s_max: fitted to the full FEM
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 30, 4
@@ -24,8 +23,9 @@ class Memory:
       started: whether a step was made.
       coordinate: (n,) contact coordinates with a force, ascending.
       force, change: (n,) forces and by how much they changed in the last step [N].
-      pressure: [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it grew in the last step.
-      softening: s.
+      pressure: of the liquid above that at rest [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it
+        grew in the last step.
+      softening: s. swelling: c.
       geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how far they moved in it [m].
       contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
     """
@@ -38,6 +38,7 @@ class Memory:
     bulge: float
     growth: float
     softening: float
+    swelling: float
     geom_pos: np.ndarray
     geom_mat: np.ndarray
     motion: np.ndarray
@@ -47,18 +48,20 @@ class Memory:
     def rest(cls, ngeom):
         none = np.zeros(0)
         pos, mat = np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3))
-        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, pos, mat, pos, np.zeros((0, 5)))
+        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, 1.0, pos, mat, pos, np.zeros((0, 5)))
 
 
 @dataclasses.dataclass
 class Outcome:
-    """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6, 6), nodes (nvert, 3)."""
+    """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6, 6), nodes
+    (nvert, 3), volume of the liquid, whether the error of such a step has been measured."""
 
     memory: Memory
     wrench: np.ndarray
     tangent: np.ndarray
     vert_xpos: np.ndarray
     volume: float
+    measured: bool
     converged: bool
     iterations: int
     error: float
@@ -82,7 +85,7 @@ class Step:
         self.bulge, self.pressure = memory.bulge + self.repeat * memory.growth, memory.pressure
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
-        self.softening = self._soften()
+        self.softening, self.swelling = self._soften(), self._swell()
         self._choose()
 
     def _choose(self):
@@ -121,15 +124,15 @@ class Step:
         self.a = s._give_at[self.c] if s.model.has_liquid else None
 
     def _scaled(self):
-        """Softened compliance with the liquid, and the displacement that q alone makes: u = W f + shift; p = -share (a.f c + q)."""
+        """Softened compliance with the liquid, and the displacement that q alone makes: u = W f + shift; p = -share (a.f + q)."""
         s = self.skin
         scale = self.softening / s.model.material.youngs_modulus
         if self.a is None:
             return Compliance(self.rest_W, scale), 0.0
-        m = s.model
-        self.share = 1 / (m.liquid_volume / m.options.bulk_modulus + scale * s._liquid_give)
+        swell = self.swelling / s.model.material.youngs_modulus
+        self.share = 1 / (s.model.rest.natural_volume / s.model.options.bulk_modulus + swell * s._liquid_give)
         self.along = scale * self.a
-        return Compliance(self.rest_W, scale, self.share, self.along), -self.share * self.bulge * self.along
+        return Compliance(self.rest_W, scale, self.share * swell / scale, self.along), -self.share * self.bulge * swell * self.a
 
     def _evaluate(self, u):
         """Contact forces (n,) at displacements u (n,) of the contact coordinates."""
@@ -137,7 +140,7 @@ class Step:
         f = np.zeros(len(u))
         self.closed = None
         if m:
-            s._x[self.outer, 0] = s._rest[self.outer] + u[:m].reshape(-1, 3)
+            s._x[self.outer, 0] = s.rest[self.outer] + u[:m].reshape(-1, 3)
             s.faces.evaluate()
             f[:m] = s.faces.force.ravel()
         if len(self.inner):
@@ -149,13 +152,27 @@ class Step:
         return Springs(self.skin.faces, self.closed, len(self.inner))
 
     def _soften(self):
-        """s of the nodes that touched and their displacements."""
+        """s of the nodes that touched, from their displacements and how far their forces are spread."""
         s = self.skin
-        touched = self.coordinate[self.coordinate < 3 * len(s._outer)]
-        v = self.u[s._outer[touched // 3]]
-        depth = np.sqrt((v * v).sum(1).max(initial=0.0))
-        h, most = _SOFTENING
-        return 1 + depth * most / (depth + h * most)
+        outer = self.coordinate < 3 * len(s._outer)
+        touched = self.coordinate[outer] // 3
+        self.squeezed = 0.0
+        if not len(touched):
+            return 1.0
+        node, across = s._outer[touched], s.wall[touched]
+        moved, weight = self.u[node], self.force[outer] ** 2
+        weight /= weight.sum()
+        x = s.rest[node]
+        x = x - weight @ x
+        now = across + moved - self.u[s.opposite[touched]]
+        thinned = 1 - np.sqrt(np.einsum("ij,ij->i", now, now) / np.einsum("ij,ij->i", across, across))
+        self.squeezed = max(float(weight @ thinned), 0.0)
+        depth = math.sqrt(float(np.einsum("ij,ij->i", moved, moved).max()))
+        return s.correction.softening(depth, float(weight @ np.einsum("ij,ij->i", x, x)), self.squeezed)
+
+    def _swell(self):
+        """c at the liquid's pressure."""
+        return self.skin.correction.swelling(self.pressure, self.skin.model.material.youngs_modulus)
 
     def run(self):
         """Newton's method, repeated until the cavity's exact volume agrees."""
@@ -177,17 +194,17 @@ class Step:
             order = order[f[order] != 0]
             self.coordinate, self.force = self.c[order], f[order]
             self.pressure = -self.share * float(self.along @ f + self.bulge) if self.a is not None else 0.0
-            self._place(s._recover(self.coordinate, self.force, self.pressure, self.softening))
+            self._place(s._recover(self.coordinate, self.force, self.pressure, self.softening, self.swelling))
             s._measure_volume()
-            softening = self._soften()
-            settled = abs(softening - self.softening) < _SETTLED * softening
+            softening, swelling = self._soften(), self._swell()
+            settled = abs(softening - self.softening) < _SETTLED * softening and abs(swelling - self.swelling) < _SETTLED
             if self.a is not None:
-                bulge = float(s._share.sum()) - s.model.rest_volume - float(np.vdot(s._gradient, self.u))
+                bulge = float(s._share.sum()) - s._cavity - float(np.vdot(s._gradient, self.u))
                 settled &= self.share * abs(bulge - self.bulge) < _SETTLED * abs(self.pressure) + 1.0
                 self.bulge = bulge
             if settled or number == _PASSES - 1:
                 break
-            self.softening = softening
+            self.softening, self.swelling = softening, swelling
 
     def _at_candidates(self, force):
         """Values (n,) of self.coordinate at the candidates; zero elsewhere."""
@@ -201,7 +218,7 @@ class Step:
     def _place(self, u):
         s = self.skin
         self.u = u
-        s._x[:, 0] = s._rest + u
+        s._x[:, 0] = s.rest + u
 
     def _newton(self, f):
         """Balanced forces, from forces f."""
@@ -266,14 +283,16 @@ class Step:
             self.bulge,
             self.bulge - self.memory.bulge if len(self.force) else 0.0,
             self.softening,
+            self.swelling,
             np.array(pos),
             np.array(mat),
             self.motion,
             contacts,
         )
         memory = Memory(True, *now)
-        volume = float(s._share.sum()) - s.model.rest_volume + s.model.liquid_volume if s.model.inner is not None else 0.0
-        return Outcome(memory, wrench, tangent, s._rest + self.u, volume, self.converged, self.iterations, self.error)
+        volume = float(s._share.sum()) - s._cavity + s.model.rest.volume if s.model.inner is not None else 0.0
+        measured = s.correction.measured(s.model.material.poissons_ratio, self.squeezed)
+        return Outcome(memory, wrench, tangent, s.rest + self.u, volume, measured, self.converged, self.iterations, self.error)
 
     def _change(self):
         """Of the forces since the step began."""

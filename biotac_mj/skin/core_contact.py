@@ -128,14 +128,14 @@ class CoreContact:
 
     Args:
       model: SkinModel with a core.
+      rest: (nvert, 3) nodes at rest [m].
       x_wp, x: (nvert, 1) present positions of the nodes, as Warp array and as its view; at rest now.
 
     Attributes:
       node: (nnode,) free nodes. direction: (nnode, 3) away from the core.
     """
 
-    def __init__(self, model, x_wp, x):
-        self._rest = model.geometry.vert
+    def __init__(self, model, rest, x_wp, x):
         free = np.zeros(model.nvert, bool)
         free[model.free] = True
         self._face = model.core_surface.face_np
@@ -157,7 +157,7 @@ class CoreContact:
             for sign in (1, -1):
                 x[:, 0, axis] += sign * _PROBE
                 gradient[:, axis] += sign * self._measured(everything).mean(1)
-                x[:, 0] = self._rest
+                x[:, 0] = rest
         nodal = np.zeros((model.nvert, 3))
         np.add.at(nodal, self._face, np.repeat(gradient[:, None], 3, 1))
         self.direction = nodal[self.node] / np.linalg.norm(nodal[self.node], axis=1, keepdims=True)
@@ -172,10 +172,10 @@ class CoreContact:
         start = np.searchsorted(self._corner.ravel()[order], np.arange(len(self.node) + 1))
         constants = [(self.node, int), (node_gap[:-1], real), (start, int), (order // 3, int), (rest_gap, real)]
         constants = [wp.array(array, dtype=dtype, device="cpu") for array, dtype in constants]
-        rest = wp.array(self._rest[:, None], dtype=vec3, device="cpu")
+        still = wp.array(rest[:, None], dtype=vec3, device="cpu")
         share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
         self._share, self._seen = share.numpy(), seen.numpy()
-        self._search = self._record(_meet, [*constants, *surface, rest, x_wp, share], [seen, gap])
+        self._search = self._record(_meet, [*constants, *surface, still, x_wp, share], [seen, gap])
 
     def _record(self, kernel, inputs, outputs):
         return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch

@@ -36,7 +36,7 @@ class SurfaceCompliance:
     """Rows of the inverse rest stiffness for contact coordinates.
 
     Args:
-      model: SkinModel on the CPU.
+      model: SkinModel on the CPU. factor, stiffness: operator and sparse matrix over its free nodes, at rest.
       outer: (nouter,) free outer nodes; node i has the coordinates 3 i .. 3 i + 2.
       inner: (ninner,) free inner nodes; node j has the coordinate 3 nouter + j.
       direction: (ninner, 3) of the inner nodes' forces, unit vectors.
@@ -47,7 +47,8 @@ class SurfaceCompliance:
       count: contact coordinates.
     """
 
-    def __init__(self, model, outer, inner, direction, cache=True):
+    def __init__(self, model, factor, stiffness, outer, inner, direction, cache=True):
+        self._factor, self._stiffness = factor, stiffness
         self._model, self._outer, self._inner, self._direction = model, outer, inner, direction
         self.size, self.count = 3 * len(model.free), 3 * len(outer) + len(inner)
         self._position = np.full(model.nvert, -1)
@@ -82,7 +83,7 @@ class SurfaceCompliance:
 
     def vector(self, field) -> np.ndarray:
         """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E."""
-        return self._model.factor.solve(field[:, None])[self._model.free, 0].ravel() / self._scale
+        return self._factor.solve(field[:, None])[self._model.free, 0].ravel() / self._scale
 
     def _compute(self, coordinates):
         n = len(self._outer)
@@ -92,7 +93,7 @@ class SurfaceCompliance:
         force[self._outer[coordinates[outer] // 3], column[outer], coordinates[outer] % 3] = 1
         j = coordinates[~outer] - 3 * n
         force[self._inner[j], column[~outer]] = self._direction[j]
-        rows = self._model.factor.solve(force)[self._model.free] / self._scale
+        rows = self._factor.solve(force)[self._model.free] / self._scale
         rows = np.ascontiguousarray(np.moveaxis(rows, 1, 0)).reshape(len(coordinates), self.size)
         largest = np.abs(rows).max(1).astype(np.float32)
         return (rows / largest[:, None]).astype(np.float16), largest
@@ -137,7 +138,7 @@ class SurfaceCompliance:
         return True
 
     def _digest(self):
-        stiffness = self._model._stiffness
+        stiffness = self._stiffness
         # rounded, so that the modulus divided out leaves no trace in the last digits
         content = [(stiffness.data * self._scale).astype(np.float32), stiffness.indices, stiffness.indptr, self._model.free]
         content += [self._outer, self._inner, self._direction.astype(np.float32)]

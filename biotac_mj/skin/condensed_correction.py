@@ -1,0 +1,57 @@
+"""What a skin does differently from a linear one, in three numbers: fitted to the full FEM (`benchmarks/condensed.py --fit`).
+
+softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q e^2),  H = h (1 + (r / b)^2): contact forces move the skin by s times as much.
+           Skin rolls around what is pressed into it by d, the more so the less its forces are spread (by r, their radius of gyration);
+           squeezed between geom and core by the share e of its thickness, rubber stiffens (q > 0).
+swelling   c = 1 / (1 + p / (k E)): pressure moves the skin by c times as much. It is stretched.
+"""
+
+import dataclasses
+import math
+
+__all__ = ["Correction", "correction"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """Constants of one material law.
+
+    Attributes:
+      depth: h [m]. most: s_max. width: b [m]. stretch: k. squeeze: q.
+      poissons_ratio: least and largest Poisson's ratio that was compared with the full FEM.
+      squeezed: up to which share of its thickness the skin may be squeezed until the error exceeds what the docs state.
+    """
+
+    depth: float
+    most: float
+    width: float
+    stretch: float
+    squeeze: float
+    poissons_ratio: tuple = (0.0, 0.0)
+    squeezed: float = 0.0
+
+    def softening(self, depth, spread, squeezed):
+        """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed share."""
+        h = self.depth * (1 + spread / self.width**2)
+        return (1 + depth * self.most / (depth + h * self.most)) / (1 + self.squeeze * squeezed**2)
+
+    def swelling(self, pressure, youngs_modulus):
+        """c at a pressure above that at rest [Pa]."""
+        return 1 / (1 + max(pressure, 0.0) / (self.stretch * youngs_modulus))
+
+    def measured(self, poissons_ratio, squeezed) -> bool:
+        """Whether the error has been measured there."""
+        low, high = self.poissons_ratio
+        return low <= poissons_ratio <= high and squeezed <= self.squeezed
+
+
+_FITTED = {
+    "corotational": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 0.0, (0.25, 0.4), 0.5),
+    "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 6.0, (0.4, 0.4999), 0.45),
+    "linear": Correction(math.inf, 1.0, 1.0, math.inf, 0.0, (0.0, 0.4), 1.0),
+}
+
+
+def correction(law: str) -> Correction:
+    """Of a material law; those that were not fitted have that of the corotational one and count as not measured."""
+    return _FITTED.get(law) or dataclasses.replace(_FITTED["corotational"], poissons_ratio=(0.0, 0.0), squeezed=0.0)
