@@ -47,6 +47,7 @@ def parser() -> argparse.ArgumentParser:
     _add_compare(verbs)
     _add_diagnose(verbs)
     _add_generate(verbs)
+    _add_data(verbs)
     _add_learning(verbs)
     return top
 
@@ -284,7 +285,9 @@ def _add_diagnose(verbs):
     verb.add_argument("--electrodes", metavar="FILE", help="plain recording instead: text, 19 columns of raw counts, one row per sample")
     verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
     verb.add_argument("--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row")
-    verb.add_argument("--rate", type=float, default=None, metavar="HZ", help="rows per second (default: guessed from repeated rows, else 100)")
+    verb.add_argument(
+        "--rate", type=float, default=None, metavar="HZ", help="rows per second (default: guessed from repeated rows, else 100)"
+    )
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE",
                       help="of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)")  # fmt: skip
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
@@ -297,6 +300,38 @@ def _diagnose(args):
 
     _calm_warp()
     verbs.diagnose_verb(args)
+
+
+def _add_data(verbs):
+    verb = _verb(verbs, "import-data", _import_data, "Read recordings of real sensors into a set: NVIDIA's HDF5, Ruppel's CSV, plain text.")
+    verb.add_argument("files", nargs="+", metavar="FILE", help="of one format")
+    verb.add_argument("--format", choices=("nvidia", "ruppel", "text"), help="(default: by the ending: .hdf5, .csv, others text)")
+    verb.add_argument("--force", metavar="FILE", help="text: forces beside it, 3 columns [N]")
+    verb.add_argument("--rate", type=float, metavar="HZ", help="nvidia, text: of the samples (default: 100)")
+    verb.add_argument("--block", type=float, metavar="S", help="text: cut the log into interactions of this length")
+    verb.add_argument("--object", metavar="NAME", help="ruppel, text: what touched")
+    verb.add_argument("--objects", nargs="+", metavar="NAME", help="nvidia: names of indenter types 0, 1, ...")
+    verb.add_argument("--seed", type=int, default=0, help="of the split by interaction")
+    verb.add_argument("--out", required=True, metavar="DIR", help="folder of the set")
+    verb = _verb(verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0.")
+    verb.add_argument("set", metavar="SET", help="folder of shards")
+    verb.add_argument(
+        "--measured", action="store_true", help="measured counts, of interactions that have them, not simulated ones"
+    )
+    verb.add_argument("--out", required=True, metavar="DIR", help="folder to make")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _import_data(args):
+    from .data import verbs
+
+    verbs.import_verb(args)
+
+
+def _export_data(args):
+    from .data import verbs
+
+    verbs.export_verb(args)
 
 
 def _calm_warp():

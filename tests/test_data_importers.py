@@ -1,0 +1,179 @@
+"""Importers, each on a small file written to the published layout; bad files are named."""
+
+import csv
+
+import h5py
+import numpy as np
+import pytest
+
+from biotac_mj import cli
+from biotac_mj.data import TactileSet, split_by_interaction
+from biotac_mj.data.importers import RUPPEL_COLUMNS, import_recordings, read_nvidia, read_ruppel, read_text
+from biotac_mj.sensor.channels import CHANNELS
+
+
+def nvidia(path, lengths=(6, 4, 5, 7), seed=0, flat=False, **changes):
+    """Trajectories of 0.1 mm steps at places some millimetres apart; indenter types 0, 0, 2, 5."""
+    rng = np.random.default_rng(seed)
+    location = np.concatenate(
+        [rng.uniform(-5e-3, 5e-3, 3) + 5e-3 * k + 1e-4 * np.arange(n)[:, None] * [0, 1, 0] for k, n in enumerate(lengths)]
+    )
+    n = len(location)
+    kind = np.repeat([0, 0, 2, 5], lengths)
+    data = dict(electrode_vals=rng.integers(1500, 3500, (n, 19)).astype(float), contact_loc=location, force_vec=rng.normal(size=(n, 3)),
+                indenter_type=kind if flat else kind[:, None])  # fmt: skip
+    with h5py.File(path, "w") as file:
+        for name, value in (data | changes).items():
+            if value is not None:
+                file[f"{name}/data"] = value
+    return data
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_nvidia(tmp_path, flat):
+    data = nvidia(tmp_path / "biotac1.hdf5", flat=flat)
+    ones = read_nvidia(tmp_path / "biotac1.hdf5")
+    assert [len(one.time) for one in ones] == [6, 4, 5, 7]
+    assert [one.object for one in ones] == ["indenter_0", "indenter_0", "indenter_2", "indenter_5"]
+    np.testing.assert_allclose(np.concatenate([one.measured_counts[:, :19] for one in ones]), data["electrode_vals"])
+    np.testing.assert_allclose(np.concatenate([one.measured_wrench[:, :3] for one in ones]), data["force_vec"], rtol=1e-6)
+    np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), data["contact_loc"])
+    assert all(np.isnan(one.measured_wrench[:, 3:]).all() and np.isnan(one.measured_counts[:, 19:]).all() for one in ones)
+    assert ones[2].parameters["rows"] == [10, 15] and ones[0].kind == "recorded" and ones[0].labelled
+    names = [f"thing{k}" for k in range(6)]
+    assert read_nvidia(tmp_path / "biotac1.hdf5", objects=names)[3].object == "thing5"
+
+
+def test_nvidia_trajectories_end_at_half_a_millimetre(tmp_path):
+    location = np.array([0, 0.4e-3, 0.89e-3, 1.38e-3, 1.89e-3, 2.0e-3])[:, None] * [1, 0, 0]
+    nvidia(
+        tmp_path / "b.hdf5", contact_loc=location, electrode_vals=np.full((6, 19), 2000.0), force_vec=np.zeros((6, 3)), indenter_type=None
+    )
+    assert [len(one.time) for one in read_nvidia(tmp_path / "b.hdf5")] == [4, 2]
+
+
+def test_nvidia_set_splits_by_trajectory(tmp_path):
+    paths = []
+    for k in (1, 2, 3):
+        paths.append(tmp_path / f"biotac{k}.hdf5")
+        nvidia(paths[-1], seed=k)
+    assert import_recordings(paths, tmp_path / "set") == 12
+    with TactileSet(tmp_path / "set") as data:
+        assert len(data) == 12 and data.labelled.all() and data.nstep == 3 * 22
+        assert set(data.split) == {"train", "validation", "test"}
+        split = split_by_interaction(data, fractions=(0.5, 0.25, 0.25))
+        assert len(split.test) == 3
+        assert data.parameters(5)["source"] == "biotac2.hdf5"
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        (dict(electrode_vals=None), "has no electrode_vals/data: it is not one of NVIDIA's"),
+        (dict(force_vec=np.zeros((22, 6))), r"force_vec/data of .* has shape \(22, 6\): \(22, 3\) is needed"),
+        (dict(indenter_type=np.zeros(7)), "indenter_type/data .* has 7 entries for 22 samples"),
+        (dict(electrode_vals=np.full((22, 19), -3.5)), "e1 of row 0 is -3.5: raw counts between 0 and 4095"),
+    ],
+)
+def test_bad_nvidia_files_are_named(tmp_path, changes, text):
+    nvidia(tmp_path / "b.hdf5", **changes)
+    with pytest.raises(ValueError, match=text):
+        read_nvidia(tmp_path / "b.hdf5")
+
+
+def test_missing_and_foreign_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no recording at .*a.hdf5"):
+        read_nvidia(tmp_path / "a.hdf5")
+    (tmp_path / "a.hdf5").write_text("no")
+    with pytest.raises(ValueError, match="it is no HDF5 file"):
+        read_nvidia(tmp_path / "a.hdf5")
+    nvidia(tmp_path / "b.hdf5")
+    with pytest.raises(ValueError, match="has indenter type 2, but 2 object names were given"):
+        read_nvidia(tmp_path / "b.hdf5", objects=["a", "b"])
+
+
+def ruppel(path, header=True, order=None, n=30):
+    """30 rows at 10 ms with a gap of two seconds after 12 of them."""
+    rng = np.random.default_rng(3)
+    time = 100.0 + 0.01 * np.arange(n) + 2.0 * (np.arange(n) >= 12)
+    value = np.column_stack([time, rng.normal(0, 5e-3, (n, 3)), rng.normal(size=(n, 3)), rng.integers(1900, 2200, (n, 2)),
+                             rng.integers(1000, 3000, (n, 3)), rng.integers(1500, 3500, (n, 19))])  # fmt: skip
+    order = list(range(len(RUPPEL_COLUMNS))) if order is None else order
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        if header:
+            writer.writerow([RUPPEL_COLUMNS[i] for i in order])
+        writer.writerows([[f"{row[i]:.9g}" for i in order] for row in value])
+    return value
+
+
+@pytest.mark.parametrize("header, order", [(True, None), (False, None), (True, list(range(31))[::-1])])
+def test_ruppel(tmp_path, header, order):
+    value = ruppel(tmp_path / "data.csv", header, order)
+    ones = read_ruppel(tmp_path / "data.csv")
+    assert [len(one.time) for one in ones] == [12, 18] and ones[0].object == "sphere_4mm"
+    counts = np.concatenate([one.measured_counts for one in ones])
+    np.testing.assert_allclose(counts[:, :19], value[:, 12:])
+    for name, column in (("pac", 8), ("pdc", 9), ("tac", 10), ("tdc", 11)):
+        np.testing.assert_allclose(counts[:, CHANNELS.index(name)], value[:, column])
+    np.testing.assert_allclose(np.concatenate([one.measured_wrench[:, :3] for one in ones]), value[:, 4:7], rtol=1e-6)
+    np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), value[:, 1:4], rtol=1e-8)
+    np.testing.assert_allclose(np.concatenate([one.time for one in ones]), value[:, 0])
+
+
+def test_bad_csv_is_named(tmp_path):
+    path = tmp_path / "data.csv"
+    path.write_text("time,px,py\n0,1,2\n")
+    with pytest.raises(ValueError, match="has no column pz, fx"):
+        read_ruppel(path)
+    path.write_text("")
+    with pytest.raises(ValueError, match="is empty: it needs 31 columns"):
+        read_ruppel(path)
+    ruppel(path)
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].replace(lines[4].split(",")[9], "many", 1)
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="line 5 of .*: pdc is 'many', not a finite number"):
+        read_ruppel(path)
+
+
+def test_text_with_forces(tmp_path):
+    rng = np.random.default_rng(0)
+    counts, force = rng.integers(1500, 3500, (50, 19)), rng.normal(size=(50, 3)).round(6)
+    np.savetxt(tmp_path / "e.txt", counts, fmt="%d", newline=" \n")
+    np.savetxt(tmp_path / "f.txt", force, fmt="%.6f", delimiter=",")
+    (one,) = read_text(tmp_path / "e.txt", tmp_path / "f.txt", rate=100.0)
+    np.testing.assert_array_equal(one.measured_counts[:, :19], counts)
+    np.testing.assert_allclose(one.measured_wrench[:, :3], force, rtol=1e-6)
+    assert one.time[-1] == pytest.approx(0.49)
+    blocks = read_text(tmp_path / "e.txt", tmp_path / "f.txt", block=0.2)
+    assert [len(b.time) for b in blocks] == [20, 20, 10] and blocks[1].time[0] == pytest.approx(0.2)
+    (tmp_path / "g.txt").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match="e.txt has 50 rows and .*g.txt has 1"):
+        read_text(tmp_path / "e.txt", tmp_path / "g.txt")
+    (tmp_path / "g.txt").write_text("1 2 3 4\n")
+    with pytest.raises(ValueError, match="line 1 of .*g.txt has 4 columns: 19 are needed, e1..e19"):
+        read_text(tmp_path / "g.txt")
+    with pytest.raises(ValueError, match="rate is 0 Hz"):
+        read_text(tmp_path / "e.txt", rate=0)
+
+
+def test_the_command(tmp_path, capsys):
+    nvidia(tmp_path / "biotac1.hdf5")
+    out = str(tmp_path / "set")
+    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0
+    assert "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in capsys.readouterr().out
+    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
+    assert "holds a set already" in capsys.readouterr().err
+    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--force", "x", "--out", out + "2"]) == 2
+    assert "an option does not go with this format" in capsys.readouterr().err
+
+
+def test_real_flat_press_in_place(shared, tmp_path):
+    folder = shared / "data" / "epfl_flat_press"
+    assert import_recordings([folder / "SynImpF1.txt"], tmp_path / "set", force=folder / "ForceData.txt", rate=100.0, block=10.0) == 23
+    with TactileSet(tmp_path / "set") as data:
+        assert data.nstep == 22508
+        force = data["measured_wrench"][:][:, :3]
+        np.testing.assert_allclose(force, np.loadtxt(folder / "ForceData.txt"), rtol=1e-6)
+        np.testing.assert_array_equal(data["measured_counts"][:][:, :19], np.loadtxt(folder / "SynImpF1.txt"))
