@@ -1,8 +1,11 @@
 """BioTacs in mujoco_warp against the engine plugin in MuJoCo: one world of the batch is one simulation on the CPU."""
 
+import functools
+
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 
@@ -11,15 +14,37 @@ import warp as wp
 
 import biotac_mj
 from biotac_mj import batch as batches
-from biotac_mj.geometry import load_skin
+from biotac_mj.geometry import SkinGeometry
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
 from biotac_mj.skin.material import material as preset
 
 DT = 2e-3
-SKIN = "coarse"
 RADIUS = 3.5e-3
 K = 2.8e11  # [Pa/m] one contact stiffness, so that materials differ in nothing but what is said
+
+
+@functools.cache
+def shell():
+    """A closed shell of a finger's size of 324 nodes, one layer, with 19 electrodes: every path of the code, but no real sensor."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
+    outer, inner, core = (
+        ball.vertices * size + center for size in ([13e-3, 7e-3, 7e-3], [11.5e-3, 5.5e-3, 5.5e-3], [10e-3, 4.5e-3, 4.5e-3])
+    )
+    f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
+    elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
+                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)])  # fmt: skip
+    vert = np.concatenate([outer, inner])
+    turned = np.linalg.det(vert[elem[:, 1:]] - vert[elem[:, :1]]) < 0
+    elem[turned] = elem[turned][:, [0, 1, 3, 2]]
+    angle = np.linspace(-1.0, 1.0, 19)
+    normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
+    electrode = np.stack([np.linspace(-14e-3, -2e-3, 19), 0 * angle, 0 * angle], 1) + 4.5e-3 * normal
+    empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
+    return SkinGeometry("synthetic", vert, elem, ball.faces, ball.faces[:, ::-1] + n, np.flatnonzero(vert[:, 0] > 2e-3),
+                        core, ball.faces, empty, no_face, empty, no_face, electrode, normal)  # fmt: skip
 
 
 def press_spec():
@@ -50,22 +75,23 @@ def impact_spec():
     finger = spec.worldbody.add_body(name="finger")
     finger.add_freejoint()
     finger.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.02, contype=0, conaffinity=0)
-    ball = spec.worldbody.add_body(name="ball", pos=[-0.012, -0.0112, 0.001])
+    ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.0107, 0.001])
     ball.add_freejoint()
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.01)
     return spec
 
 
-def make(spec, nworld, body=None, **settings):
+def make(spec, nworld, body=None, skin=None, **settings):
     """mjm, m, d and the Batch of a spec."""
-    batches.add(spec, body=body, skin=SKIN)
+    skin = skin or shell()
+    batches.add(spec, body=body, skin=skin)
     if body is not None:  # all mass where the joint is: MuJoCo's own integration of a free body errs without
         spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
     mjm = spec.compile()
     mjd = mujoco.MjData(mjm)
     mujoco.mj_forward(mjm, mjd)
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=nworld)
-    return mjm, m, d, batches.attach(mjm, m, d, skin=SKIN, **settings)
+    return mjm, m, d, batches.attach(mjm, m, d, skin=skin, **settings)
 
 
 def read(mjm, d, channel):
@@ -95,10 +121,10 @@ def press(m, d, start, steps, depth):
         yield k
 
 
-def single(pos, settings):
+def single(pos, skin, settings):
     """Force (nstep, 6), electrodes and pdc of one world by the engine plugin over the poses pos (nstep, 3)."""
     spec = press_spec()
-    handle = biotac_mj.attach(spec, skin=SKIN, **settings)
+    handle = biotac_mj.attach(spec, skin=skin, **settings)
     model = spec.compile()
     data = mujoco.MjData(model)
     rows = []
@@ -109,14 +135,14 @@ def single(pos, settings):
     return np.array(rows)
 
 
-def compare_with_single_worlds(nworld, steps, force_error, counts):
+def compare_with_single_worlds(skin, nworld, steps, force_error, counts):
     rng = np.random.default_rng(1)
     base = preset("default")
     materials = [{**_fields(base), "youngs_modulus": e} for e in base.youngs_modulus * rng.uniform(0.6, 1.5, nworld)]
     friction, depth, start = rng.uniform(0.2, 1.0, nworld), rng.uniform(0.8e-3, 1.6e-3, nworld), places(nworld)
     options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}}
     mjm, m, d, _ = make(
-        press_spec(), nworld, material=materials, friction=friction, priority=1, options=options, readings={"noise": False}
+        press_spec(), nworld, skin=skin, material=materials, friction=friction, priority=1, options=options, readings={"noise": False}
     )  # fmt: skip
     rows, paths = [], []
     for _ in press(m, d, start, steps, depth):
@@ -128,7 +154,7 @@ def compare_with_single_worlds(nworld, steps, force_error, counts):
     for w in range(nworld):
         settings = {"material": materials[w], "friction": friction[w], "priority": 1}
         options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}, "readings": {"noise": False}}
-        expected = single(paths[w], settings | {"options": options})
+        expected = single(paths[w], skin, settings | {"options": options})
         scale = np.linalg.norm(expected[:, :3], axis=1).max()
         assert scale > 0.2
         np.testing.assert_allclose(got[w, :, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}")
@@ -144,18 +170,18 @@ def _fields(material):
 
 
 def test_each_world_is_the_single_simulation():
-    compare_with_single_worlds(3, 10, force_error=2e-3, counts=1)
+    compare_with_single_worlds(shell(), 3, 10, force_error=2e-3, counts=1)
 
 
 @pytest.mark.slow
 def test_64_random_worlds_are_the_single_simulations():
-    print(f"largest force error {compare_with_single_worlds(64, 25, force_error=0.01, counts=3):.1e}")
+    print(f"largest force error {compare_with_single_worlds('coarse', 64, 25, force_error=0.01, counts=3):.1e}")
 
 
 def test_readings_are_those_of_the_single_sensor():
     nworld = 2
     mjm, m, d, batch = make(press_spec(), nworld, seed=[5, 7])
-    sensors = [PhysicsReadings(load_skin(SKIN), seed=s) for s in (5, 7)]
+    sensors = [PhysicsReadings(shell(), seed=s) for s in (5, 7)]
     states = np.zeros((nworld, sensors[0].nstate))
     for sensor, state in zip(sensors, states):
         sensor.reset(state)
@@ -167,7 +193,7 @@ def test_readings_are_those_of_the_single_sensor():
             for name in ("electrodes", "pdc", "pac", "tac", "tdc"):
                 np.testing.assert_array_equal(read(mjm, d, name)[w], expected[name], err_msg=f"{name}, step {k}")
     change = read(mjm, d, "electrodes") - channels.REST_COUNTS["1"]
-    assert np.abs(pressure).min() > 1000 and change.min() < -50 and change.max() > 20
+    assert np.abs(pressure).min() > 200 and np.abs(change).max() > 50
 
 
 def run(bad_step=None, bad_pose=None, bad_world=1, nworld=3, steps=8):
@@ -209,13 +235,25 @@ def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
     np.testing.assert_allclose(read(mjm, d, "contact_force")[:, 1], weight, rtol=5e-3)
     assert np.abs(d.qvel.numpy()).max() < 2e-4 and np.abs(d.qfrc_constraint.numpy()).max() < 0.01 * weight
     spec = ball_spec()
-    handle = biotac_mj.attach(spec, skin=SKIN, readings="none")
+    handle = biotac_mj.attach(spec, skin=shell(), readings="none")
     model = spec.compile()
     data = mujoco.MjData(model)
     for _ in range(150):
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(d.qpos.numpy()[:, 0], data.qpos[0], atol=1e-6)
     np.testing.assert_allclose(read(mjm, d, "contact_force")[0], handle.read(data, "contact_force"), atol=5e-3 * weight)
+
+
+def test_tangent_is_that_of_the_single_world():
+    _, m, d, batch = make(ball_spec(mass=0.3), 2, readings=False)
+    for _ in range(20):
+        mjw.step(m, d)
+    got = np.swapaxes(batch.skin.tangent.numpy(), 0, 1)
+    expected = batch.skin.data.tangent(batch.skin.geoms)
+    assert got.shape == (2, 1, 6, 6) and expected[0, 0, 1, 1] > 100
+    lever = np.array([1, 1, 1, 0.01, 0.01, 0.01])  # compares torques with forces
+    scale = lever[:, None] * lever
+    np.testing.assert_allclose(got / scale, expected / scale, atol=5e-3 * np.abs(expected / scale).max())
 
 
 def test_finger_and_ball_exchange_momentum_and_lose_none():
@@ -254,7 +292,7 @@ def test_reset_of_some_worlds():
     batch.reset([False, True, False])
     now = batch.vert_xpos
     np.testing.assert_array_equal(now[[0, 2]], x[[0, 2]])
-    np.testing.assert_array_equal(now[1], load_skin(SKIN).vert)
+    np.testing.assert_array_equal(now[1], shell().vert)
     assert np.abs(x[1] - now[1]).max() > 3e-4
     first = [read(mjm, d, "contact_force")[1].copy() for _ in press(m, d, start, 6, [1e-3] * 3)]
     _, m, d, _ = make(press_spec(), 3)
@@ -275,13 +313,13 @@ def test_an_inactive_batch_changes_nothing():
 
 def test_a_callback_that_was_there_is_kept():
     spec = ball_spec()
-    batches.add(spec, skin=SKIN)
+    batches.add(spec, skin=shell())
     mjm = spec.compile()
     m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1)
     seen = []
     m.callback.passive = lambda m, d: seen.append("passive")
     m.callback.sensor = lambda m, d, stage: seen.append("sensor")
-    batches.attach(mjm, m, d, skin=SKIN, readings=False)
+    batches.attach(mjm, m, d, skin=shell(), readings=False)
     mjw.step(m, d)
     assert seen.count("passive") == 1 and seen.count("sensor") == 3 and read(mjm, d, "status")[0, 0] == 1
 
@@ -291,7 +329,7 @@ def attach(mjm, nworld=1, **settings):
     mujoco.mj_forward(mjm, data)
     put = {k: settings.pop(k) for k in ("njmax",) if k in settings}
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, data, nworld=nworld, **put)
-    return batches.attach(mjm, m, d, skin=SKIN, **settings)
+    return batches.attach(mjm, m, d, skin=shell(), **settings)
 
 
 def test_errors_say_what_to_do():
@@ -300,9 +338,9 @@ def test_errors_say_what_to_do():
         ValueError, match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are world, ball"
     ):
         attach(spec.compile())
-    batches.add(spec, skin=SKIN)
+    batches.add(spec, skin=shell())
     with pytest.raises(ValueError, match="prefix 'biotac_' is taken"):
-        batches.add(spec, skin=SKIN)
+        batches.add(spec, skin=shell())
     mjm = spec.compile()
     with pytest.raises(ValueError, match="2 materials for 3 worlds: pass one for each"):
         attach(mjm, 3, material=["default"] * 2)
@@ -320,11 +358,11 @@ def test_errors_say_what_to_do():
             other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
         else:
             other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
-        batches.add(other, skin=SKIN)
+        batches.add(other, skin=shell())
         with pytest.raises(ValueError, match=text):
             attach(other.compile())
     crowded = ball_spec()
-    batches.add(crowded, skin=SKIN, slots=0)
+    batches.add(crowded, skin=shell(), slots=0)
     with pytest.raises(ValueError, match="has room for 0: add it after the objects"):
         attach(crowded.compile())
 

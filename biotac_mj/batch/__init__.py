@@ -1,6 +1,7 @@
 """Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step` (docs/batch.md)."""
 
-from .attach import add, attach
+from .attach import add, attach, make
 from .batch import Batch
+from .skins import PoseBatch
 
-__all__ = ["Batch", "add", "attach"]
+__all__ = ["Batch", "PoseBatch", "add", "attach", "make"]

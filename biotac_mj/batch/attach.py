@@ -1,7 +1,10 @@
 """`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them into `mujoco_warp.step`."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
+import warp as wp
 
 from ..coupling.attach import _add_slots, _check_place, _model
 from ..coupling.config import Config
@@ -14,10 +17,10 @@ from ..skin.material import Material
 from ..skin.material import material as preset
 from .batch import Batch, Hook
 from .skin import BatchSkin
+from .skins import CHANNELS, PoseBatch
 
-__all__ = ["add", "attach"]
+__all__ = ["add", "attach", "make"]
 
-CHANNELS = ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
 _SPRINGLESS = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
@@ -91,45 +94,70 @@ def attach(
       ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or (two-way) equality
         constraints disabled, or has no room for the rows; a number of materials or frictions that is not nworld.
     """
-    nworld = d.nworld
-    materials = _materials(material, nworld)
-    single = materials[0] if materials else material
-    single = single if isinstance(single, (dict, str, type(None))) else _as_dict(single)
-    chosen = Material(**single) if isinstance(single, dict) else preset(single or "default")
-    mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
-    config = Config(
-        skin=reference(skin)[0], material=single, liquid=chosen.liquid if liquid is None else bool(liquid), coupling=coupling, geoms=geoms,
-        rounding=dict(rounding or {}), friction=float(mu[0]), priority=int(priority), device=str(m_device(d)), options=dict(options or {}),
-    )  # fmt: skip
-    view = ModelView(mjm._address)
-    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
-    if core < 0:
-        names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
-        raise ValueError(f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are {names}")
+    device = str(d.qpos.device)
     _check_model(mjm, coupling)
-    touching = Touching(view, core, config)
+    settings = dict(material=material, liquid=liquid, friction=friction, priority=priority, geoms=geoms, rounding=rounding, options=options)
+    touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
     slots = _slots(mjm, m, d, touching, prefix) if coupling == "two-way" else {}
-    geometry = reference(skin)[1]
-    fem = skin_model(geometry, *_choices(config), config.device)
-    if fem.options.dynamics != "quasistatic":
-        raise ValueError("a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia")
-    grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
-    skins = BatchSkin(fem, nworld, touching.geoms, grids, _frictions(mjm, touching.geom, mu, priority), materials, bool(slots))
-    film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, config.device)
+    film, acquisition = _readings(readings, rest_geometry(config, geometry), d.nworld, seed, device)
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
-    batch = Batch(mjm, m, d, touching, slots, skins, film, acquisition, addresses, coupling == "two-way")
+    batch = Batch(mjm, touching, slots, skin_of(bool(slots)), film, acquisition, addresses, coupling == "two-way")
     Hook.of(m).add(batch)
     return batch
 
 
-def m_device(d):
-    return d.qpos.device
+def make(
+    mjm, nworld, device=None, prefix="biotac_", skin="default", material=None, liquid=None, friction=None, priority=0, geoms=None,
+    rounding=None, seed=0, readings=True, options=None,
+) -> PoseBatch:  # fmt: skip
+    """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step, such as mjx.
+
+    Args:
+      mjm: an MjModel made from a spec that `add` changed with slots=0; its time step is that of the sensors.
+      nworld: number of worlds.
+      device: Warp device; None takes Warp's default.
+      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options: as for `attach`.
+
+    Raises:
+      ValueError: see `attach`.
+    """
+    device = str(wp.get_device(device))
+    settings = dict(material=material, liquid=liquid, friction=friction, priority=priority, geoms=geoms, rounding=rounding, options=options)
+    touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
+    film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, device)
+    return PoseBatch(mjm, touching, skin_of(False), film, acquisition)
 
 
-def _as_dict(material):
-    import dataclasses
+def _skins(mjm, prefix, skin, nworld, device, settings):
+    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one BioTac."""
+    material, friction, priority = settings["material"], settings["friction"], int(settings["priority"])
+    materials = _materials(material, nworld)
+    single = dataclasses.asdict(materials[0]) if materials else material
+    chosen = Material(**single) if isinstance(single, dict) else preset(single or "default")
+    if isinstance(single, Material):
+        single = dataclasses.asdict(single)
+    mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
+    config = Config(
+        skin=reference(skin)[0], material=single, liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
+        geoms=settings["geoms"], rounding=dict(settings["rounding"] or {}), friction=float(mu[0]), priority=priority, device=device,
+        options=dict(settings["options"] or {}),
+    )  # fmt: skip
+    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
+    if core < 0:
+        names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
+        raise ValueError(f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are {names}")
+    touching = Touching(ModelView(mjm._address), core, config)
+    geometry = reference(skin)[1]
+    fem = skin_model(geometry, *_choices(config), device)
+    if fem.options.dynamics != "quasistatic":
+        raise ValueError("a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia")
+    grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
+    frictions = _frictions(mjm, touching.geom, mu, priority)
 
-    return dataclasses.asdict(material)
+    def build(tangents):
+        return BatchSkin(fem, nworld, touching.geoms, grids, frictions, materials, tangents)
+
+    return touching, build, geometry, config
 
 
 def _materials(material, nworld):

@@ -10,163 +10,66 @@ The readings are written when it asks for the velocity sensors.
 import numpy as np
 import warp as wp
 
-from . import kernels
+from . import dynamics
+from .skins import Skins
 
 __all__ = ["Batch", "Hook"]
 
-real = wp.float64
 
-
-class Batch:
+class Batch(Skins):
     """One BioTac in every world of a mujoco_warp Data; made by `biotac_mj.batch.attach`.
 
-    Attributes:
-      nworld: number of worlds.
-      skin: the `BatchSkin`, with its arrays on the device.
-      film, acquisition: `BatchFilm`, `BatchAcquisition`, or None.
-      failed: (nworld,) wp.array int, steps that did not converge since the reset; bad: (nworld,) whether the last pose was refused.
+    Attributes besides those of `Skins`:
       active: False leaves the skins out of `mjw.step` and `mjw.forward`: nothing is solved, nothing acts.
-      wrench0, tangent0: (ngroup, nworld) linear models in force, of the skin ON each touching body in the BioTac frame.
     """
 
-    def __init__(self, mjm, m, d, touching, slots, skin, film, acquisition, addresses, two_way):
-        self.nworld, self.skin, self.film, self.acquisition = d.nworld, skin, film, acquisition
+    def __init__(self, mjm, touching, slots, skin, film, acquisition, addresses, two_way):
+        super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, addresses)
         self.active = True
         self.moving = two_way and mjm.nv > 0  # whether forces change where anything goes
-        self._dt = float(mjm.opt.timestep)
-        self._core = int(touching.core)
-        self.device = skin.model.device
-        ngroup, nworld = skin.ngroup, d.nworld
         weld = sorted(set(slots.values()))
+        group_slot = [weld.index(slots[g]) if g in slots else -1 for g in range(skin.ngroup)]
         with wp.ScopedDevice(self.device):
-            self._body = wp.array(touching.body.astype(np.int32), dtype=int)
-            self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
-            self._group = wp.array(touching.group.astype(np.int32), dtype=int)
             self._slot = wp.array(np.array(weld, np.int32), dtype=int)
-            self._group_slot = wp.array(np.array([weld.index(slots[g]) if g in slots else -1 for g in range(ngroup)], np.int32), dtype=int)
-            self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
-            self._row = wp.full((len(weld), nworld), -1, dtype=int)
-            self._jacobian = wp.zeros((ngroup, nworld, mjm.nv), dtype=wp.spatial_vectord)
-            self._start_pos, self._pos, self.pos0 = (wp.zeros((ngroup, nworld), dtype=wp.vec3d) for _ in range(3))
-            self._start_mat, self._mat, self.mat0 = (wp.zeros((ngroup, nworld), dtype=wp.mat33d) for _ in range(3))
-            self._wrench = wp.zeros((ngroup, nworld), dtype=wp.spatial_vectord)
-            self.wrench0 = wp.zeros((ngroup, nworld), dtype=wp.spatial_vectord)
-            self.tangent0 = wp.zeros((ngroup, nworld), dtype=wp.spatial_matrixd)
-            self._started, self.failed, self.bad = (wp.zeros(nworld, dtype=int) for _ in range(3))
-            self._valid = film.valid if film else wp.ones(nworld, dtype=int)
-            self._no_state = wp.zeros((nworld, 69), dtype=real)
-            self._all = wp.full(nworld, True, dtype=bool)
-        if acquisition is None:
-            self._addresses.assign(np.array([*[-1] * 5, *addresses[5:]], np.int32))
-        self.reset()
-
-    def reset(self, world_mask=None):
-        """Puts skins, sensors and their clocks of some worlds back to rest, as mjw.reset_data does with the rest of the world.
-
-        Args:
-          world_mask: (nworld,) of bool, a wp.array or on the host; None resets all.
-
-        Raises:
-          ValueError: another shape.
-        """
-        mask = self._all
-        if world_mask is not None:
-            mask = (
-                world_mask if isinstance(world_mask, wp.array) else wp.array(np.asarray(world_mask, bool), dtype=bool, device=self.device)
-            )
-            if mask.shape != (self.nworld,) or mask.dtype is not wp.bool:
-                raise ValueError(f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, True resets")
-        self.skin.reset(mask)
-        self._launch(
-            kernels.reset_models,
-            self.nworld,
-            [mask],
-            [self.wrench0, self.tangent0, self.pos0, self.mat0, self._started, self.failed, self.bad],
-        )
-        if self.acquisition:
-            self.acquisition.reset(mask)
-
-    @property
-    def vert_xpos(self):
-        """(nworld, nvert, 3) nodes of the skins in the BioTac frame [m], a copy on the host."""
-        return np.swapaxes(self.skin.x.numpy(), 0, 1).copy()
-
-    @property
-    def wrench(self):
-        """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a copy on the host."""
-        return np.swapaxes(self.wrench0.numpy(), 0, 1).copy()
+            self._group_slot = wp.array(np.array(group_slot, np.int32), dtype=int)
+            self._row = wp.full((len(weld), self.nworld), -1, dtype=int)
+            self._jacobian = wp.zeros((*self.groups, mjm.nv), dtype=wp.spatial_vectord)
+            self._start_pos, self._start_mat = wp.zeros(self.groups, dtype=wp.vec3d), wp.zeros(self.groups, dtype=wp.mat33d)
+            self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
 
     def predict(self, m, d):
         """Where the bodies go without acceleration, and their Jacobians; finds this step's rows."""
         arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof]
         self._launch(
-            kernels.advance_groups,
-            self._body_dim,
-            [self._core, self._body, self._dt, *arrays],
+            dynamics.advance_groups,
+            self.groups,
+            [self._core, self._body, self.dt, *arrays],
             [self._start_pos, self._start_mat, self._jacobian],
         )
         if self.moving:
-            self._launch(kernels.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row])
+            self._launch(dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row])
 
     def act(self, m, d):
         """Puts the linear models into the forces and the rows."""
         model = [self.wrench0, self.tangent0, self.pos0, self.mat0]
-        self._launch(kernels.linear_models, self._body_dim, [self._start_pos, self._start_mat, *model], [self._wrench])
-        self._launch(kernels.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive])
+        self._launch(dynamics.linear_models, self.groups, [self._start_pos, self._start_mat, *model], [self._wrench])
+        self._launch(dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive])
         efc = d.efc
         self._launch(
-            kernels.write_rows,
+            dynamics.write_rows,
             self._row.shape,
-            [self._dt**2, self._group_slot, self._row, self._jacobian, self.tangent0]
+            [self.dt**2, self._group_slot, self._row, self._jacobian, self.tangent0]
             + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
     def solve(self, m, d, accelerated):
         """Solves the skins where the bodies go, with d.qacc or without acceleration."""
-        skin, pos, mat = self.skin, self._start_pos, self._start_mat
+        pos, mat = self._start_pos, self._start_mat
         if accelerated:
-            self._launch(kernels.follow, self._body_dim, [self._dt**2, self._jacobian, d.qacc, pos, mat], [self._pos, self._mat])
+            self._launch(dynamics.follow, self.groups, [self.dt**2, self._jacobian, d.qacc, pos, mat], [self._pos, self._mat])
             pos, mat = self._pos, self._mat
-        poses = [m.geom_pos, m.geom_quat, pos, mat]
-        self._launch(kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat])
-        skin.find_depth()
-        self._launch(
-            kernels.check_poses,
-            self.nworld,
-            [skin.depth, skin.model.options.max_core_depth, self._started, skin.pos, skin.mat, skin.pos_last, skin.mat_last],
-            [self.bad],
-        )
-        skin.step(self._dt)
-        self._launch(
-            kernels.accept_models,
-            self._body_dim,
-            [self.bad, skin.converged, skin.wrench, skin.tangent, pos, mat]
-            + [self.wrench0, self.tangent0, self.pos0, self.mat0, self._started, self.failed],
-            [],
-        )
-
-    def sense(self, d):
-        """Film and acquisition of the step, then all readings into d.sensordata."""
-        state = self._no_state
-        if self.acquisition:
-            self.film.solve(self.skin.x, self.acquisition.find_due(self._dt))
-            self.acquisition.advance(self._dt, self.film.impedance, self.film.valid, self.skin.pressure)
-            state = self.acquisition.state
-        skin = self.skin
-        self._launch(
-            kernels.write_sensors,
-            self.nworld,
-            [self._addresses, state, self.wrench0, self.bad, self._valid, skin.converged, self.failed, skin.iterations, skin.error],
-            [d.sensordata],
-        )
-
-    @property
-    def _body_dim(self):
-        return self.wrench0.shape
-
-    def _launch(self, kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
 
 
 class Hook:
@@ -216,7 +119,7 @@ class Hook:
         if stage == Stage.VEL:
             for batch in self.batches:
                 if batch.active:
-                    batch.sense(d)
+                    batch.sense(d.sensordata)
 
 
 def _accelerate(m, d):

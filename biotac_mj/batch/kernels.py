@@ -1,24 +1,14 @@
-"""Poses from mujoco_warp, the skin's linear model back into it: the equations of `coupling/` (docs/coupling.md) for all worlds at once.
+"""Poses in, linear models kept, forces and readings out: kernels of `skins.py`.
 
-Arrays of mujoco_warp lead with the world and are single precision; ours are [item, world] and double. A wrench or a small motion has its
-linear part first. Everything is in the BioTac frame, about its origin.
+Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A wrench or a small motion has its
+linear part first. Everything is in the BioTac frame, about its origin, where nothing else is said.
 """
 
 import warp as wp
 
-__all__ = [
-    "accept_models",
-    "add_forces",
-    "advance_groups",
-    "check_poses",
-    "find_rows",
-    "follow",
-    "geom_poses",
-    "linear_models",
-    "reset_models",
-    "write_rows",
-    "write_sensors",
-]
+from ..skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+
+__all__ = ["accept_models", "body_forces", "geom_poses", "matrix", "relative_poses", "reset_models", "vector", "write_sensors"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,18 +18,14 @@ mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
-_EQUALITY = wp.constant(0)  # mjCNSTR_EQUALITY
-_NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
-_PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
-
 
 @wp.func
-def _vector(v: wp.vec3):
+def vector(v: wp.vec3):
     return vec3(real(v[0]), real(v[1]), real(v[2]))
 
 
 @wp.func
-def _matrix(m: wp.mat33):
+def matrix(m: wp.mat33):
     return mat33(
         real(m[0, 0]), real(m[0, 1]), real(m[0, 2]),
         real(m[1, 0]), real(m[1, 1]), real(m[1, 2]),
@@ -47,118 +33,22 @@ def _matrix(m: wp.mat33):
     )  # fmt: skip
 
 
-@wp.func
-def _rotation(v: vec3):
-    """Rotation matrix of a rotation vector (Rodrigues)."""
-    angle2 = wp.dot(v, v)
-    angle = wp.sqrt(angle2)
-    a = real(1.0) - angle2 / real(6.0)
-    b = real(0.5) - angle2 / real(24.0)
-    if angle > real(1.0e-4):
-        a = wp.sin(angle) / angle
-        b = (real(1.0) - wp.cos(angle)) / angle2
-    k = wp.skew(v)
-    return wp.identity(n=3, dtype=real) + a * k + b * (k * k)
-
-
-@wp.func
-def _motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
-    """Small motion (translation of the origin's point, rotation vector) from pose 0 to the other."""
-    turn = mat * wp.transpose(mat0)
-    v = real(0.5) * vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
-    sine = wp.length(v)
-    if sine > real(1.0e-9):
-        v = wp.atan2(sine, real(0.5) * (wp.trace(turn) - real(1.0))) / sine * v
-    t = pos - pos0 - wp.cross(v, pos0)
-    return vec6(t[0], t[1], t[2], v[0], v[1], v[2])
-
-
-@wp.func
-def _finite(pos: vec3, mat: mat33):
-    total = real(0.0)
-    for i in range(3):
-        total += wp.abs(pos[i])
-        for j in range(3):
-            total += wp.abs(mat[i, j])
-    return total < real(1.0e6)  # false for nan, too
-
-
-@wp.func
-def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=wp.vec3),
-               com: wp.array2d(dtype=wp.vec3), cvel: wp.array2d(dtype=wp.spatial_vector)):  # fmt: skip
-    """Where a body is after h at its present velocity."""
-    spin = _vector(wp.spatial_top(cvel[w, b]))
-    pos = _vector(xpos[w, b])
-    return pos + h * (_vector(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, pos - _vector(com[w, rootid[b]])))
-
-
-@wp.func
-def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=wp.mat33), cvel: wp.array2d(dtype=wp.spatial_vector)):
-    return _rotation(h * _vector(wp.spatial_top(cvel[w, b]))) * _matrix(xmat[w, b])
-
-
 @wp.kernel
-def advance_groups(
+def relative_poses(
     # In:
     core: int,
     body: wp.array(dtype=int),
-    h: real,
-    rootid: wp.array(dtype=int),
-    isdofancestor: wp.array2d(dtype=int),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
-    com: wp.array2d(dtype=wp.vec3),
-    cvel: wp.array2d(dtype=wp.spatial_vector),
-    cdof: wp.array2d(dtype=wp.spatial_vector),
-    # Out:
-    pos_out: wp.array2d(dtype=vec3),
-    mat_out: wp.array2d(dtype=mat33),
-    jacobian_out: wp.array3d(dtype=vec6),
-):
-    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative to the BioTac."""
-    g, w = wp.tid()
-    b = body[g]
-    frame = _ahead_mat(core, w, h, xmat, cvel)
-    origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
-    pos = wp.transpose(frame) * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
-    mat = wp.transpose(frame) * _ahead_mat(b, w, h, xmat, cvel)
-    pos_out[g, w] = pos
-    mat_out[g, w] = mat
-    finite = _finite(pos, mat)  # what is lost takes no part in the dynamics
-    turn = wp.transpose(_matrix(xmat[w, core]))
-    here = _vector(xpos[w, core])
-    for i in range(jacobian_out.shape[2]):
-        share = real(isdofancestor[b, i] - isdofancestor[core, i])  # the bodies' own columns differ in sign alone: both are about `here`
-        j = vec6()
-        if finite and share != real(0.0):
-            spin = _vector(wp.spatial_top(cdof[w, i]))
-            arm = here - _vector(com[w, rootid[wp.where(share > real(0.0), b, core)]])
-            linear = share * (turn * (_vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
-            angular = share * (turn * spin)
-            j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
-        jacobian_out[g, w, i] = j
-
-
-@wp.kernel
-def follow(
-    # In:
-    h2: real,
-    jacobian: wp.array3d(dtype=vec6),
-    qacc: wp.array2d(dtype=float),
-    pos: wp.array2d(dtype=vec3),
-    mat: wp.array2d(dtype=mat33),
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
-    """Poses at the end of the step: those without acceleration, moved by h^2 J a."""
+    """Poses of the touching bodies now [group, world]."""
     g, w = wp.tid()
-    m = vec6()
-    for i in range(jacobian.shape[2]):
-        m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
-    turn = _rotation(vec3(m[3], m[4], m[5]))
-    pos_out[g, w] = turn * pos[g, w] + vec3(m[0], m[1], m[2])
-    mat_out[g, w] = turn * mat[g, w]
+    turn = wp.transpose(matrix(xmat[w, core]))
+    pos_out[g, w] = turn * (vector(xpos[w, body[g]]) - vector(xpos[w, core]))
+    mat_out[g, w] = turn * matrix(xmat[w, body[g]])
 
 
 @wp.kernel
@@ -183,48 +73,14 @@ def geom_poses(
     local = (a * a - wp.dot(u, u)) * wp.identity(n=3, dtype=real) + real(2.0) * wp.outer(u, u) + real(2.0) * a * wp.skew(u)
     scale = a * a + wp.dot(u, u)  # stored in single precision
     R = mat[group[k], w]
-    pos_out[k, w] = pos[group[k], w] + R * _vector(geom_pos[w % geom_pos.shape[0], g])
+    pos_out[k, w] = pos[group[k], w] + R * vector(geom_pos[w % geom_pos.shape[0], g])
     mat_out[k, w] = (R * local) / scale
-
-
-@wp.kernel
-def check_poses(
-    # In:
-    depth: wp.array2d(dtype=real),
-    max_depth: real,
-    started: wp.array(dtype=int),
-    # In, out:
-    pos: wp.array2d(dtype=vec3),
-    mat: wp.array2d(dtype=mat33),
-    pos_last: wp.array2d(dtype=vec3),
-    mat_last: wp.array2d(dtype=mat33),
-    # Out:
-    bad_out: wp.array(dtype=int),
-):
-    """Worlds with a pose that is not finite, or a geom deep inside the core, keep their last poses: far away where there are none."""
-    w = wp.tid()
-    bad = int(0)
-    for k in range(pos.shape[0]):
-        if not _finite(pos[k, w], mat[k, w]) or depth[k, w] > max_depth:
-            bad = 1
-    bad_out[w] = bad
-    for k in range(pos.shape[0]):
-        if bad == 1:
-            if started[w] == 0:
-                pos_last[k, w] = vec3(real(0.0), real(0.0), real(-1.0))
-                mat_last[k, w] = wp.identity(n=3, dtype=real)
-            pos[k, w] = pos_last[k, w]
-            mat[k, w] = mat_last[k, w]
-        elif started[w] == 0:
-            pos_last[k, w] = pos[k, w]
-            mat_last[k, w] = mat[k, w]
 
 
 @wp.kernel
 def accept_models(
     # In:
-    bad: wp.array(dtype=int),
-    converged: wp.array(dtype=int),
+    reason: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     pos: wp.array2d(dtype=vec3),
@@ -234,140 +90,25 @@ def accept_models(
     tangent0: wp.array2d(dtype=mat66),
     pos0: wp.array2d(dtype=vec3),
     mat0: wp.array2d(dtype=mat33),
-    started: wp.array(dtype=int),
     failed: wp.array(dtype=int),
 ):
-    """The linear models of this step: of the skin just solved; its last wrench where it did not converge; none where the pose was bad."""
+    """The linear models of this step: of the skin just solved; its last wrench where it found no balance; none where the input was bad."""
     g, w = wp.tid()
-    if bad[w] == 1:
+    why = reason[w]
+    if why == NOT_FINITE or why == INSIDE_CORE:
         wrench0[g, w] = vec6()
         tangent0[g, w] = mat66()
         pos0[g, w] = vec3()
         mat0[g, w] = wp.identity(n=3, dtype=real)
-    elif converged[w] == 0:
+    elif why == NOT_CONVERGED:
         tangent0[g, w] = mat66()
+        if g == 0:
+            failed[w] += 1
     else:
         wrench0[g, w] = wrench[g, w]
         tangent0[g, w] = tangent[g, w]
         pos0[g, w] = pos[g, w]
         mat0[g, w] = mat[g, w]
-    if g == 0:
-        if bad[w] == 0:
-            started[w] = 1
-            failed[w] += 1 - converged[w]
-
-
-@wp.kernel
-def linear_models(
-    # In:
-    pos: wp.array2d(dtype=vec3),
-    mat: wp.array2d(dtype=mat33),
-    wrench0: wp.array2d(dtype=vec6),
-    tangent0: wp.array2d(dtype=mat66),
-    pos0: wp.array2d(dtype=vec3),
-    mat0: wp.array2d(dtype=mat33),
-    # Out:
-    wrench_out: wp.array2d(dtype=vec6),
-):
-    """The skin's wrench on each group at the pose reached without acceleration."""
-    g, w = wp.tid()
-    total = vec6()
-    if _finite(pos[g, w], mat[g, w]):
-        total = wrench0[g, w] - tangent0[g, w] * _motion(pos[g, w], mat[g, w], pos0[g, w], mat0[g, w])
-    wrench_out[g, w] = total
-
-
-@wp.kernel
-def add_forces(
-    # In:
-    jacobian: wp.array3d(dtype=vec6),
-    wrench: wp.array2d(dtype=vec6),
-    # In, out:
-    qfrc: wp.array2d(dtype=float),
-):
-    w, i = wp.tid()
-    total = real(0.0)
-    for g in range(wrench.shape[0]):
-        total += wp.dot(jacobian[g, w, i], wrench[g, w])
-    qfrc[w, i] += float(total)
-
-
-@wp.kernel
-def find_rows(
-    # In:
-    slot: wp.array(dtype=int),
-    ne: wp.array(dtype=int),
-    efc_type: wp.array2d(dtype=int),
-    efc_id: wp.array2d(dtype=int),
-    # Out:
-    row_out: wp.array2d(dtype=int),
-):
-    """The first of the six rows of each weld that holds a slot [slot, world]; -1 where there was no room for it."""
-    s, w = wp.tid()
-    row = int(-1)
-    for r in range(wp.min(ne[w], efc_id.shape[1])):
-        if row < 0 and efc_type[w, r] == _EQUALITY and efc_id[w, r] == slot[s]:
-            row = r
-    row_out[s, w] = row
-
-
-@wp.kernel
-def write_rows(
-    # In:
-    h2: real,
-    group_slot: wp.array(dtype=int),
-    row: wp.array2d(dtype=int),
-    jacobian: wp.array3d(dtype=vec6),
-    tangent: wp.array2d(dtype=mat66),
-    sparse: int,
-    rownnz: wp.array2d(dtype=int),
-    rowadr: wp.array2d(dtype=int),
-    colind: wp.array3d(dtype=int),
-    # Out:
-    J_out: wp.array3d(dtype=float),
-    D_out: wp.array2d(dtype=float),
-    aref_out: wp.array2d(dtype=float),
-    pos_out: wp.array2d(dtype=float),
-):
-    """h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L."""
-    s, w = wp.tid()
-    first = row[s, w]
-    if first < 0:
-        return
-    S = mat66()
-    group = int(0)
-    for g in range(tangent.shape[0]):
-        if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
-            S += tangent[g, w]
-            group = g
-    for k in range(6):
-        pivot = wp.float64(0.0)
-        column = vec6()
-        if S[k, k] > _PIVOT * wp.abs(tangent_diagonal(tangent, group_slot, s, w, k)):
-            pivot = S[k, k]
-            for i in range(k, 6):
-                column[i] = S[i, k] / pivot
-            S -= pivot * wp.outer(column, column)
-        r = first + k
-        D_out[w, r] = float(wp.max(h2 * pivot, _NEGLIGIBLE))
-        aref_out[w, r] = 0.0
-        pos_out[w, r] = 0.0
-        if sparse == 1:
-            for n in range(rownnz[w, r]):
-                at = rowadr[w, r] + n
-                J_out[w, 0, at] = float(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
-        else:
-            for i in range(jacobian.shape[2]):
-                J_out[w, r, i] = float(wp.dot(column, jacobian[group, w, i]))
-
-
-@wp.func
-def tangent_diagonal(tangent: wp.array2d(dtype=mat66), group_slot: wp.array(dtype=int), s: int, w: int, k: int):
-    total = real(0.0)
-    for g in range(tangent.shape[0]):
-        if group_slot[g] == s:
-            total += tangent[g, w][k, k]
-    return total
 
 
 @wp.kernel
@@ -379,9 +120,7 @@ def reset_models(
     tangent_out: wp.array2d(dtype=mat66),
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
-    started_out: wp.array(dtype=int),
     failed_out: wp.array(dtype=int),
-    bad_out: wp.array(dtype=int),
 ):
     w = wp.tid()
     if not mask[w]:
@@ -391,9 +130,44 @@ def reset_models(
         tangent_out[g, w] = mat66()
         pos_out[g, w] = vec3()
         mat_out[g, w] = wp.identity(n=3, dtype=real)
-    started_out[w] = 0
     failed_out[w] = 0
-    bad_out[w] = 0
+
+
+@wp.kernel
+def body_forces(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    wrench: wp.array2d(dtype=vec6),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    xipos: wp.array2d(dtype=wp.vec3),
+    # Out:
+    xfrc_out: wp.array3d(dtype=float),
+):
+    """Wrenches on the bodies' centres of mass in the world's frame; the BioTac's body gets the opposite of all."""
+    w = wp.tid()
+    for b in range(xfrc_out.shape[1]):
+        for i in range(6):
+            xfrc_out[w, b, i] = 0.0
+    frame = matrix(xmat[w, core])
+    origin = vector(xpos[w, core])
+    back = vec3()
+    wind = vec3()
+    for g in range(wrench.shape[0]):
+        force = frame * vec3(wrench[g, w][0], wrench[g, w][1], wrench[g, w][2])
+        torque = frame * vec3(wrench[g, w][3], wrench[g, w][4], wrench[g, w][5])
+        back -= force
+        wind -= torque
+        _add_force(w, body[g], force, torque + wp.cross(origin - vector(xipos[w, body[g]]), force), xfrc_out)
+    _add_force(w, core, back, wind + wp.cross(origin - vector(xipos[w, core]), back), xfrc_out)
+
+
+@wp.func
+def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype=float)):
+    for i in range(3):
+        xfrc[w, b, i] = xfrc[w, b, i] + float(force[i])
+        xfrc[w, b, 3 + i] = xfrc[w, b, 3 + i] + float(torque[i])
 
 
 @wp.kernel
@@ -402,9 +176,8 @@ def write_sensors(
     address: wp.array(dtype=int),
     state: wp.array2d(dtype=real),
     wrench: wp.array2d(dtype=vec6),
-    bad: wp.array(dtype=int),
+    reason: wp.array(dtype=int),
     valid: wp.array(dtype=int),
-    converged: wp.array(dtype=int),
     failed: wp.array(dtype=int),
     iterations: wp.array(dtype=int),
     error: wp.array(dtype=real),
@@ -432,11 +205,14 @@ def write_sensors(
         for i in range(6):
             sensordata_out[w, address[5] + i] = float(-total[i])
     if address[6] >= 0:
-        good = float(converged[w])
+        why = reason[w]
+        good = float(1.0)
         residual = float(error[w])
-        if bad[w] == 1:
+        if why != CONVERGED:
+            good = 0.0
+        if why == NOT_FINITE or why == INSIDE_CORE:
             residual = wp.nan
-        if bad[w] == 1 or valid[w] == 0:
+        if residual != residual or valid[w] == 0:
             good = -1.0
         sensordata_out[w, address[6]] = good
         sensordata_out[w, address[6] + 1] = float(failed[w])

@@ -1,15 +1,12 @@
 """The skins of all worlds behind one small door: geoms where they will be in, wrenches, tangents and liquid out, all on the device."""
 
-import numpy as np
 import warp as wp
 
 from ..skin import GeomSet, SkinData, SkinModel
-from ..skin.contact import depth_in_core
-from ..skin.solver import step
+from ..skin.device_step import prepare_device, step_device
+from . import skin_kernels as kernels
 
 __all__ = ["BatchSkin"]
-
-real = wp.float64
 
 
 class BatchSkin:
@@ -17,26 +14,26 @@ class BatchSkin:
 
     Args:
       model: SkinModel.
+      nworld: number of worlds.
       geoms: `coupling.stepper.Geom` descriptions of what can touch.
       grids: a distance grid for each mesh among them.
       friction: (nworld, ngeom) Coulomb coefficients.
       materials: one Material for each world, or None for the model's.
       tangents: whether `tangent` is wanted.
 
-    Attributes (wp.arrays on the model's device, double precision):
-      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before `step`; pos_last, mat_last: of the
-        last step.
+    Attributes (wp.arrays on the model's device, double precision where nothing else is said):
+      data: the SkinData: positions, materials and liquids.
+      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before `step`.
       x: (nvert, nworld) nodes [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's origin [N, N m].
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
-      pressure: (nworld,) above rest [Pa]. error: (nworld,) estimated relative error of the last step in the energy norm.
-      converged, iterations: (nworld,) int of the last step.
-      depth: (ngeom, nworld) how deep each geom reaches into the core, written by `find_depth` [m].
+      pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the energy norm, estimated.
+      reason: (nworld,) int: 0, or why the last step failed (`skin.device_worlds`). iterations: (nworld,) int of the last step.
     """
 
     def __init__(self, model: SkinModel, nworld, geoms, grids, friction, materials=None, tangents=True):
         self.model, self.nworld, self._tangents = model, nworld, tangents
-        self.data = SkinData(model, nworld, materials)
+        self.data = SkinData(model, nworld, materials, resident=True)
         self.geoms = GeomSet(
             [g.type for g in geoms],
             [g.size for g in geoms],
@@ -48,63 +45,73 @@ class BatchSkin:
             device=model.device,
         )
         self.geoms.set_friction(friction)
-        self.ngroup = self.geoms.ngroup
-        struct = self.geoms.struct
-        self.pos, self.mat, self.pos_last, self.mat_last = struct.pos, struct.mat, struct.pos_last, struct.mat_last
-        self.x = self.data.x
+        self.ngroup, struct, st = self.geoms.ngroup, self.geoms.struct, self.data.worlds
+        self.pos, self.mat = struct.pos, struct.mat
+        self.x, self.reason, self.iterations, self.error = self.data.x, st.reason, st.iterations, st.error
+        self._motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
+        prepare_device(model, self.data, self.geoms)
+        self._small = self.data.device_memory.preconditioner
         with wp.ScopedDevice(model.device):
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
-            self.pressure = wp.zeros(nworld, dtype=real)
-            self.error = wp.zeros(nworld, dtype=real)
-            self.converged = wp.ones(nworld, dtype=int)
-            self.iterations = wp.zeros(nworld, dtype=int)
-            self.depth = wp.zeros((self.geoms.count, nworld), dtype=real)
+            self.pressure = wp.zeros(nworld, dtype=wp.float64)
+            rows = (self._small.capacity if tangents else 0, nworld)
+            self._row_group, self._row_part = wp.zeros(rows, dtype=int), wp.zeros(rows, dtype=wp.spatial_matrixd)
+            self._rest = self.data.rest_vert
 
-    def find_depth(self):
-        if self.model.has_core and self.geoms.count:
-            wp.launch(depth_in_core, self.depth.shape, [self.model.core_vert, self.geoms.struct], [self.depth], device=self.model.device)
+    @property
+    def nbytes(self):
+        """Device memory that grows with the number of worlds [bytes]."""
+        return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
-    def step(self, dt):
-        """Solves every world for the geoms where they are now. `pos` and `mat` must be finite."""
-        d = self.data
-        step(self.model, d, self.geoms, dt)
-        for target, value in (
-            (self.wrench, np.swapaxes(d.wrench, 0, 1)),
-            (self.pressure, d.pressure),
-            (self.error, d.error),
-            (self.converged, d.converged.astype(np.int32)),
-            (self.iterations, d.iterations.astype(np.int32)),
-        ):
-            _fill(target, value)
-        if self._tangents:
-            _fill(self.tangent, np.swapaxes(d.tangent(self.geoms), 0, 1))
+    def step(self):
+        """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA graph.
+
+        A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its last good state.
+        """
+        m, d, small = self.model, self.data, self._small
+        step_device(m, d, self.geoms)
+        self._launch(
+            kernels.read_outputs, self.nworld, [m.rest.pressure, int(m.has_liquid), d.worlds, self._wrench], [self.pressure, self.wrench]
+        )
+        if self._tangents and self.ngroup:
+            o, rows = d.outer, self._row_group.shape
+            touched = [m.outer.start, m.outer.slot, len(m.sample), o.touching, o.trial_geom, self.geoms.struct.group]
+            self._launch(kernels.group_rows, rows, [small.size, small.node, *touched], [self._row_group])
+            self._launch(kernels.drag_rows, rows, [small.liquid, small.size, small.node, small._G, d.x, self._row_group], [self._row_part])
+            self._launch(kernels.sum_rows, self.tangent.shape, [small.size, self._row_group, self._row_part], [self.tangent])
 
     def reset(self, mask):
-        """Puts the worlds of mask (nworld,) bool back to rest."""
-        mask = mask.numpy().astype(bool)
-        d, rest = self.data, self.model.rest
-        for array, value in (
-            (d.x, rest.vert[:, None]),
-            (d.x_last, rest.vert[:, None]),
-            (d.velocity, 0.0),
-            (d.increment, 0.0),
-            (d.outer.anchor_geom, -1),
-            *(((d.core.anchor_geom, -1), (d.core.clearance, 0.0)) if d.core else ()),
-        ):
-            host = array.numpy().copy()
-            host[:, mask] = value
-            _fill(array, host)
-        if d.motion.shape[1]:
-            d.motion[mask] = 0.0
-        if d.liquid:
-            d.liquid.last_pressure[mask] = rest.pressure
-            d.liquid.gauge_pressure[mask] = rest.pressure
-        for array, value in ((self.pressure, 0.0), (self.error, 0.0), (self.converged, 1), (self.iterations, 0)):
-            host = array.numpy().copy()
-            host[mask] = value
-            _fill(array, host)
+        """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
+        m, d, n = self.model, self.data, self.nworld
+        self._launch(kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity])
+        for state in [d.outer] + ([d.core] if d.core else []):
+            self._launch(kernels.reset_samples, state.anchor_geom.shape, [mask], [state.anchor_geom, state.trial_geom])
+            self._launch(kernels.reset_faces, state.touching.shape, [mask], [state.touching, state.kept, state.clearance])
+        self._launch(kernels.reset_geoms, self.pos.shape, [mask], [self.geoms.struct.pos_last, self._motion, self._touched_by])
+        self._launch(kernels.reset_worlds, n, [mask, m.rest.pressure if m.has_liquid else 0.0], [d.worlds, self.pressure])
+
+    def _launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
 
 
-def _fill(target, value):
-    wp.copy(target, wp.array(np.ascontiguousarray(value), dtype=target.dtype, ndim=target.ndim, device=target.device))
+def _world_bytes(nworld, *roots):
+    """Bytes of the wp.arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that objects hold."""
+    seen, total, stack = set(), 0, list(roots)
+    while stack:
+        thing = stack.pop()
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, wp.array):
+            if thing.ptr and thing.ptr not in seen and {nworld, 2 * nworld, 4 * nworld} & set(thing.shape):
+                seen.add(thing.ptr)
+                total += thing.capacity
+        elif isinstance(thing, (list, tuple)):
+            stack.extend(thing)
+        elif isinstance(thing, dict):
+            stack.extend(thing.values())
+        elif type(thing).__module__.startswith("biotac_mj") and not isinstance(thing, SkinModel):
+            stack.extend(vars(thing).values())
+            stack.extend(getattr(thing, name) for name in getattr(getattr(thing, "cls", None), "vars", ()))
+    return total

@@ -1,0 +1,251 @@
+"""The skin's linear model in mujoco_warp's dynamics: the equations of `coupling/` (docs/coupling.md) for all worlds at once.
+
+Arrays of mujoco_warp lead with the world and are single precision; ours are [item, world] and double. A wrench or a small motion has its
+linear part first. Everything is in the BioTac frame, about its origin.
+"""
+
+import mujoco
+import warp as wp
+
+from .kernels import matrix, vector
+
+__all__ = ["add_forces", "advance_groups", "find_rows", "follow", "linear_models", "write_rows"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec3 = wp.vec3d
+mat33 = wp.mat33d
+vec6 = wp.spatial_vectord
+mat66 = wp.spatial_matrixd
+
+_EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
+_NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
+_PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
+
+
+@wp.func
+def rotation(v: vec3):
+    """Rotation matrix of a rotation vector (Rodrigues)."""
+    angle2 = wp.dot(v, v)
+    angle = wp.sqrt(angle2)
+    a = real(1.0) - angle2 / real(6.0)
+    b = real(0.5) - angle2 / real(24.0)
+    if angle > real(1.0e-4):
+        a = wp.sin(angle) / angle
+        b = (real(1.0) - wp.cos(angle)) / angle2
+    k = wp.skew(v)
+    return wp.identity(n=3, dtype=real) + a * k + b * (k * k)
+
+
+@wp.func
+def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
+    """Small motion (translation of the origin's point, rotation vector) from pose 0 to the other."""
+    turn = mat * wp.transpose(mat0)
+    v = real(0.5) * vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
+    sine = wp.length(v)
+    if sine > real(1.0e-9):
+        v = wp.atan2(sine, real(0.5) * (wp.trace(turn) - real(1.0))) / sine * v
+    t = pos - pos0 - wp.cross(v, pos0)
+    return vec6(t[0], t[1], t[2], v[0], v[1], v[2])
+
+
+@wp.func
+def is_finite(pos: vec3, mat: mat33):
+    total = real(0.0)
+    for i in range(3):
+        total += wp.abs(pos[i])
+        for j in range(3):
+            total += wp.abs(mat[i, j])
+    return total < real(1.0e6)  # false for nan, too
+
+
+@wp.func
+def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=wp.vec3),
+               com: wp.array2d(dtype=wp.vec3), cvel: wp.array2d(dtype=wp.spatial_vector)):  # fmt: skip
+    """Where a body is after h at its present velocity."""
+    spin = vector(wp.spatial_top(cvel[w, b]))
+    pos = vector(xpos[w, b])
+    return pos + h * (vector(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, pos - vector(com[w, rootid[b]])))
+
+
+@wp.func
+def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=wp.mat33), cvel: wp.array2d(dtype=wp.spatial_vector)):
+    return rotation(h * vector(wp.spatial_top(cvel[w, b]))) * matrix(xmat[w, b])
+
+
+@wp.kernel
+def advance_groups(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    h: real,
+    rootid: wp.array(dtype=int),
+    isdofancestor: wp.array2d(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    com: wp.array2d(dtype=wp.vec3),
+    cvel: wp.array2d(dtype=wp.spatial_vector),
+    cdof: wp.array2d(dtype=wp.spatial_vector),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+    jacobian_out: wp.array3d(dtype=vec6),
+):
+    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative to the BioTac."""
+    g, w = wp.tid()
+    b = body[g]
+    frame = _ahead_mat(core, w, h, xmat, cvel)
+    origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
+    pos = wp.transpose(frame) * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
+    mat = wp.transpose(frame) * _ahead_mat(b, w, h, xmat, cvel)
+    pos_out[g, w] = pos
+    mat_out[g, w] = mat
+    finite = is_finite(pos, mat)  # what is lost takes no part in the dynamics
+    turn = wp.transpose(matrix(xmat[w, core]))
+    here = vector(xpos[w, core])
+    for i in range(jacobian_out.shape[2]):
+        share = real(isdofancestor[b, i] - isdofancestor[core, i])  # the bodies' own columns differ in sign alone: both are about `here`
+        j = vec6()
+        if finite and share != real(0.0):
+            spin = vector(wp.spatial_top(cdof[w, i]))
+            arm = here - vector(com[w, rootid[wp.where(share > real(0.0), b, core)]])
+            linear = share * (turn * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+            angular = share * (turn * spin)
+            j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
+        jacobian_out[g, w, i] = j
+
+
+@wp.kernel
+def follow(
+    # In:
+    h2: real,
+    jacobian: wp.array3d(dtype=vec6),
+    qacc: wp.array2d(dtype=float),
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+):
+    """Poses at the end of the step: those without acceleration, moved by h^2 J a."""
+    g, w = wp.tid()
+    m = vec6()
+    for i in range(jacobian.shape[2]):
+        m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
+    turn = rotation(vec3(m[3], m[4], m[5]))
+    pos_out[g, w] = turn * pos[g, w] + vec3(m[0], m[1], m[2])
+    mat_out[g, w] = turn * mat[g, w]
+
+
+@wp.kernel
+def linear_models(
+    # In:
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    wrench0: wp.array2d(dtype=vec6),
+    tangent0: wp.array2d(dtype=mat66),
+    pos0: wp.array2d(dtype=vec3),
+    mat0: wp.array2d(dtype=mat33),
+    # Out:
+    wrench_out: wp.array2d(dtype=vec6),
+):
+    """The skin's wrench on each group at the pose reached without acceleration."""
+    g, w = wp.tid()
+    total = vec6()
+    if is_finite(pos[g, w], mat[g, w]):
+        total = wrench0[g, w] - tangent0[g, w] * motion(pos[g, w], mat[g, w], pos0[g, w], mat0[g, w])
+    wrench_out[g, w] = total
+
+
+@wp.kernel
+def add_forces(
+    # In:
+    jacobian: wp.array3d(dtype=vec6),
+    wrench: wp.array2d(dtype=vec6),
+    # In, out:
+    qfrc: wp.array2d(dtype=float),
+):
+    w, i = wp.tid()
+    total = real(0.0)
+    for g in range(wrench.shape[0]):
+        total += wp.dot(jacobian[g, w, i], wrench[g, w])
+    qfrc[w, i] += float(total)
+
+
+@wp.kernel
+def find_rows(
+    # In:
+    slot: wp.array(dtype=int),
+    ne: wp.array(dtype=int),
+    efc_type: wp.array2d(dtype=int),
+    efc_id: wp.array2d(dtype=int),
+    # Out:
+    row_out: wp.array2d(dtype=int),
+):
+    """The first of the six rows of each weld that holds a slot [slot, world]; -1 where there was no room for it."""
+    s, w = wp.tid()
+    row = int(-1)
+    for r in range(wp.min(ne[w], efc_id.shape[1])):
+        if row < 0 and efc_type[w, r] == _EQUALITY and efc_id[w, r] == slot[s]:
+            row = r
+    row_out[s, w] = row
+
+
+@wp.func
+def tangent_diagonal(tangent: wp.array2d(dtype=mat66), group_slot: wp.array(dtype=int), s: int, w: int, k: int):
+    total = real(0.0)
+    for g in range(tangent.shape[0]):
+        if group_slot[g] == s:
+            total += tangent[g, w][k, k]
+    return total
+
+
+@wp.kernel
+def write_rows(
+    # In:
+    h2: real,
+    group_slot: wp.array(dtype=int),
+    row: wp.array2d(dtype=int),
+    jacobian: wp.array3d(dtype=vec6),
+    tangent: wp.array2d(dtype=mat66),
+    sparse: int,
+    rownnz: wp.array2d(dtype=int),
+    rowadr: wp.array2d(dtype=int),
+    colind: wp.array3d(dtype=int),
+    # Out:
+    J_out: wp.array3d(dtype=float),
+    D_out: wp.array2d(dtype=float),
+    aref_out: wp.array2d(dtype=float),
+    pos_out: wp.array2d(dtype=float),
+):
+    """h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L."""
+    s, w = wp.tid()
+    first = row[s, w]
+    if first < 0:
+        return
+    S = mat66()
+    group = int(0)
+    for g in range(tangent.shape[0]):
+        if group_slot[g] == s:  # bodies that are welded together move as one: their stiffnesses add
+            S += tangent[g, w]
+            group = g
+    for k in range(6):
+        pivot = wp.float64(0.0)
+        column = vec6()
+        if S[k, k] > _PIVOT * wp.abs(tangent_diagonal(tangent, group_slot, s, w, k)):
+            pivot = S[k, k]
+            for i in range(k, 6):
+                column[i] = S[i, k] / pivot
+            S -= pivot * wp.outer(column, column)
+        r = first + k
+        D_out[w, r] = float(wp.max(h2 * pivot, _NEGLIGIBLE))
+        aref_out[w, r] = 0.0
+        pos_out[w, r] = 0.0
+        if sparse == 1:
+            for n in range(rownnz[w, r]):
+                at = rowadr[w, r] + n
+                J_out[w, 0, at] = float(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
+        else:
+            for i in range(jacobian.shape[2]):
+                J_out[w, r, i] = float(wp.dot(column, jacobian[group, w, i]))

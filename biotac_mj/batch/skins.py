@@ -1,0 +1,171 @@
+"""BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the bodies."""
+
+import numpy as np
+import warp as wp
+
+from . import kernels
+
+__all__ = ["PoseBatch", "Skins"]
+
+CHANNELS = {"electrodes": 19, "pdc": 1, "pac": 22, "tac": 1, "tdc": 1, "contact_force": 6, "status": 5}
+
+
+class Skins:
+    """One BioTac in each of `nworld` worlds, in the touching bodies' poses that the caller gives.
+
+    Args:
+      touching: `coupling.touching.Touching`, what can touch.
+      skin: BatchSkin. film, acquisition: BatchFilm and BatchAcquisition, or None.
+      dt: time step [s].
+      addresses: where each of CHANNELS begins in the sensor data; -1: nowhere.
+
+    Attributes:
+      nworld: number of worlds.
+      failed: (nworld,) wp.array int, steps that found no balance since the reset.
+      wrench0, tangent0: (ngroup, nworld) wp.arrays, linear models in force: of the skin ON each touching body in the BioTac frame.
+    """
+
+    def __init__(self, touching, skin, film, acquisition, dt, addresses):
+        self.nworld, self.skin, self.film, self.acquisition = skin.nworld, skin, film, acquisition
+        self.device, self.dt = skin.model.device, float(dt)
+        self._core = int(touching.core)
+        shape = skin.ngroup, skin.nworld
+        if acquisition is None:
+            addresses = [*[-1] * 5, *addresses[5:]]
+        with wp.ScopedDevice(self.device):
+            self._body = wp.array(touching.body.astype(np.int32), dtype=int)
+            self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
+            self._group = wp.array(touching.group.astype(np.int32), dtype=int)
+            self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
+            self._pos, self.pos0 = (wp.zeros(shape, dtype=wp.vec3d) for _ in range(2))
+            self._mat, self.mat0 = (wp.zeros(shape, dtype=wp.mat33d) for _ in range(2))
+            self.wrench0 = wp.zeros(shape, dtype=wp.spatial_vectord)
+            self.tangent0 = wp.zeros(shape, dtype=wp.spatial_matrixd)
+            self.failed = wp.zeros(self.nworld, dtype=int)
+            self._valid = film.valid if film else wp.ones(self.nworld, dtype=int)
+            self._no_state = wp.zeros((self.nworld, 69), dtype=wp.float64)
+            self._all = wp.full(self.nworld, True, dtype=bool)
+        self.reset()
+
+    def reset(self, world_mask=None):
+        """Puts skins, sensors and their clocks of some worlds back to rest, as mjw.reset_data does with the rest of the world.
+
+        Args:
+          world_mask: (nworld,) of bool, a wp.array or on the host; None resets all.
+
+        Raises:
+          ValueError: another shape.
+        """
+        mask = self._all
+        if isinstance(world_mask, wp.array):
+            mask = world_mask
+        elif world_mask is not None:
+            mask = wp.array(np.asarray(world_mask, bool), dtype=bool, device=self.device)
+        if mask.shape != (self.nworld,) or mask.dtype is not wp.bool:
+            raise ValueError(f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, True resets")
+        self.skin.reset(mask)
+        models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
+        self._launch(kernels.reset_models, self.nworld, [mask], models)
+        if self.acquisition:
+            self.acquisition.reset(mask)
+
+    @property
+    def vert_xpos(self):
+        """(nworld, nvert, 3) nodes of the skins in the BioTac frame [m], a copy on the host."""
+        return np.swapaxes(self.skin.x.numpy(), 0, 1).copy()
+
+    @property
+    def wrench(self):
+        """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a copy on the host."""
+        return np.swapaxes(self.wrench0.numpy(), 0, 1).copy()
+
+    @property
+    def nbytes(self):
+        """Device memory that grows with the number of worlds, of skins and sensors together [bytes]."""
+        return self.skin.nbytes + (self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0)
+
+    def solve_at(self, pos, mat, geom_pos, geom_quat):
+        """Solves the skins for touching bodies at pos, mat [group, world] in the BioTac frame. Launches only.
+
+        Args:
+          geom_pos, geom_quat: mujoco_warp's arrays (1 or nworld, ngeom) of the geoms on their bodies.
+        """
+        skin = self.skin
+        poses = [geom_pos, geom_quat, pos, mat]
+        self._launch(kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat])
+        skin.step()
+        models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
+        self._launch(kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models)
+
+    def sense(self, sensordata):
+        """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches only."""
+        state, skin = self._no_state, self.skin
+        if self.acquisition:
+            self.film.solve(skin.x, self.acquisition.find_due(self.dt))
+            self.acquisition.advance(self.dt, self.film.impedance, self.film.valid, skin.pressure)
+            state = self.acquisition.state
+        outputs = [state, self.wrench0, skin.reason, self._valid, self.failed, skin.iterations, skin.error]
+        self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs], [sensordata])
+
+    @property
+    def groups(self):
+        """(ngroup, nworld)."""
+        return self.wrench0.shape
+
+    def _launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class PoseBatch(Skins):
+    """For a simulator that has no callback: poses in, forces and readings out, between its steps. Made by `biotac_mj.batch.make`.
+
+    The forces act in the simulator's next step, explicitly: with a touched mass m the step must stay below some 0.8 sqrt(m / k), k the
+    contact's stiffness (docs/coupling.md). Poses that are prescribed know no such limit.
+
+    Attributes:
+      xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre of mass, world frame.
+      sensordata: (nworld, 55) wp.array float, the channels of `readings` one after another.
+    """
+
+    def __init__(self, mjm, touching, skin, film, acquisition):
+        widths = list(CHANNELS.values())
+        super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
+        with wp.ScopedDevice(self.device):
+            self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
+            self._geom_quat = wp.array(mjm.geom_quat[None].astype(np.float32), dtype=wp.quat)  # (w, x, y, z), as mujoco_warp keeps it
+            self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
+            self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
+
+    def step(self, xpos, xmat, xipos):
+        """Solves the skins where the bodies are, and writes `xfrc_applied` and `sensordata`. Launches only.
+
+        Args:
+          xpos, xipos: (nworld, nbody, 3) float, frames and centres of mass of the bodies [m]; xmat: (nworld, nbody, 3, 3). Arrays of Warp,
+            or of anything that speaks DLPack (JAX, torch), on the batch's device; they are not copied.
+
+        Raises:
+          ValueError: a wrong shape.
+        """
+        nbody = self.xfrc_applied.shape[1]
+        for name, array, shape in (("xpos", xpos, (3,)), ("xmat", xmat, (3, 3)), ("xipos", xipos, (3,))):
+            if tuple(array.shape) != (self.nworld, nbody, *shape):
+                raise ValueError(f"{name} has shape {tuple(array.shape)}: pass {(self.nworld, nbody, *shape)}")
+        xpos, xmat, xipos = _as(xpos, wp.vec3), _as(xmat, wp.mat33), _as(xipos, wp.vec3)
+        self._launch(kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat])
+        self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
+        bodies = [self._core, self._body, self.wrench0, xpos, xmat, xipos]
+        self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
+        self.sense(self.sensordata)
+
+    def readings(self):
+        """{channel: (nworld, dim)} views of `sensordata`."""
+        ends = np.cumsum(list(CHANNELS.values()))
+        return {name: self.sensordata[:, end - width : end] for (name, width), end in zip(CHANNELS.items(), ends)}
+
+
+def _as(array, dtype):
+    """A (nworld, nbody) wp.array of dtype over the memory of another library's (nworld, nbody, ...) array."""
+    if isinstance(array, wp.array) and array.ndim == 2:
+        return array
+    whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
+    return wp.array(ptr=whole.ptr, shape=whole.shape[:2], dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False)
