@@ -22,9 +22,10 @@ def folder(tmp_path_factory):
         for k in numbers:
             n = 6 + k
             label = {"measured_counts": rng.uniform(0, 4095, (n, 23)), "measured_wrench": rng.normal(size=(n, 6))} if shard else {}
-            ones.append(Interaction(f"{k:03d}", ["ring_7mm", "sphere_7mm"][k % 2], ["press", "tap"][k // 3], "train", k, {}, 0.05 * np.arange(n),
-                                    wrench=rng.normal(size=(n, 6)), counts=rng.integers(0, 4096, (n, 23)),
-                                    indenter_pos=rng.normal(size=(n, 3)), indenter_quat=rng.normal(size=(n, 4)), **label))  # fmt: skip
+            columns = dict(wrench=rng.normal(size=(n, 6)), counts=rng.integers(0, 4096, (n, 23)), indenter_pos=rng.normal(size=(n, 3)),
+                           indenter_quat=rng.normal(size=(n, 4)), **label)  # fmt: skip
+            what, kind = ["ring_7mm", "sphere_7mm"][k % 2], ["press", "tap"][k // 3]
+            ones.append(Interaction(f"{k:03d}", what, kind, "train", k, {}, 0.05 * np.arange(n), **columns))
         write_shard(shard_path(out, shard), ones)
     return out
 
