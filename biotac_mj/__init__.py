@@ -24,7 +24,7 @@ from . import plugin  # registers the engine plugin  # noqa: E402
 
 __version__ = "0.1.0"
 
-__all__ = ["SkinData", "SkinGeometry", "SkinModel", "__version__", "attach", "import_mesh", "load_skin", "plugin", "step"]
+__all__ = ["SkinData", "SkinGeometry", "SkinModel", "__version__", "attach", "attach_to_hand", "import_mesh", "load_skin", "plugin", "step"]
 
 _HOME = {
     "SkinGeometry": "geometry",
@@ -34,6 +34,7 @@ _HOME = {
     "SkinData": "skin",
     "step": "skin",
     "attach": "coupling",
+    "attach_to_hand": "tasks.hands",
 }
 
 

@@ -49,7 +49,7 @@ class TouchTask(composer.Task, abc.ABC):
     estimated: tuple
     seconds = 4.0  # an episode
 
-    def __init__(self, machine, mounts, observe="tactile", physics_timestep=2.5e-3, biotac=None):
+    def __init__(self, machine, mounts, observe="tactile", physics_timestep=5e-3, biotac=None):
         if observe not in _OBSERVE:
             raise ValueError(f"unknown preset observe={observe!r}: choose one of {', '.join(_OBSERVE)}")
         self._arena, self.machine = arena(), machine

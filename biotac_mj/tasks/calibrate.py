@@ -5,6 +5,7 @@ will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are 
 """
 
 import argparse
+import os
 import pathlib
 
 import numpy as np
@@ -101,6 +102,17 @@ def _explore(folder, episodes):
     return {"explore/weight": weight, "explore/bias": bias, "explore/accuracy": right / len(rows)}
 
 
+def _add(path, found):
+    """Adds arrays to a file of others."""
+    stored = {}
+    if path.exists():
+        with np.load(path) as file:
+            stored = {name: file[name] for name in file.files}
+    temporary = path.with_suffix(f".part{os.getpid()}.npz")
+    np.savez_compressed(temporary, **stored | found)
+    temporary.rename(path)
+
+
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--tasks", default=",".join(SCRIPTED), help="comma-separated")
@@ -108,16 +120,12 @@ def main(arguments=None):
     parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).with_name("calibration.npz"), help="file to write")
     options = parser.parse_args(arguments)
-    stored = {}
-    if options.out.exists():
-        with np.load(options.out) as file:
-            stored = {name: file[name] for name in file.files}
     domain = {task: domain for domain, task in suite.tasks()}
     for task in options.tasks.split(","):
         if task not in SCRIPTED:
             raise ValueError(f"no task {task!r} to calibrate: choose from {', '.join(SCRIPTED)}")
         if task == "explore":
-            stored |= _explore(options.folder, options.episodes)
+            found = _explore(options.folder, options.episodes)
         else:
             made = [
                 _kept(options.folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i))
@@ -126,10 +134,8 @@ def main(arguments=None):
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
             fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
             print(f"{task}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
-            stored |= {f"{task}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
-        temporary = options.out.with_suffix(".part.npz")
-        np.savez_compressed(temporary, **stored)
-        temporary.rename(options.out)
+            found = {f"{task}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
+        _add(options.out, found)
 
 
 if __name__ == "__main__":

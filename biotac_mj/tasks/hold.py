@@ -17,9 +17,9 @@ _GRAVITY = 9.81
 class _Grip(TouchTask):
     estimated = ("grip", "load")
 
-    def __init__(self, lift, mass, physics_timestep=5e-3, **settings):
+    def __init__(self, lift, mass, **settings):
         gripper = Gripper(lift=lift)
-        super().__init__(gripper, gripper.mounts, physics_timestep=physics_timestep, **settings)
+        super().__init__(gripper, gripper.mounts, **settings)
         world = self._arena.mjcf_model.worldbody
         self._body = world.add("body", name="object")
         self._joint = self._body.add("freejoint", name="object")
@@ -49,8 +49,8 @@ class _Grip(TouchTask):
 
 
 class Hold(_Grip):
-    """The object's support goes away at 0.5 s, and its weight changes three times. Reward: 1 while it has sunk by less than 1 mm (0 at 10 mm),
-    times a half to one for gentleness: one up to 1.6 times the grip that friction needs plus 0.3 N, a half where it is 3 N more."""
+    """The object's support goes away at 0.5 s, and its weight changes three times. Reward: 1 while it has sunk by less than 1 mm (0 at
+    10 mm), times a half to one for gentleness: one up to 1.6 times the grip that friction needs plus 0.3 N, a half where it is 3 N more."""
 
     seconds = 4.0
 
@@ -73,10 +73,10 @@ class Hold(_Grip):
         return float(np.interp(time, np.ravel([[t, t + 0.1] for t in self._times]), np.repeat(self._pulls, 2)[1:-1]))
 
     def before_substep(self, physics, action, random_state):
-        time = physics.data.time
+        time = physics.data.time  # written directly: see Gantry.command
         if time > 0.5:
-            physics.bind(self._support).mocap_pos = AWAY
-        physics.bind(self._body).xfrc_applied = [0, 0, -self.pull(time), 0, 0, 0]
+            physics.data.mocap_pos[physics.bind(self._support).mocapid] = AWAY
+        physics.data.xfrc_applied[physics.bind(self._body).element_id, 2] = -self.pull(time)
 
     def get_reward(self, physics):
         needed = (self._mass * _GRAVITY + self.pull(physics.data.time)) / (2 * FRICTION)

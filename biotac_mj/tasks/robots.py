@@ -12,7 +12,7 @@ _DAMPING = 2 * np.sqrt(_STIFFNESS * _MASS)  # critical
 _YAW_INERTIA, _YAW_STIFFNESS = 1e-4, 20.0  # [kg m^2], [N m/rad]
 _LARGEST_FORCE = 12.0  # of a servo [N]: past it the finger gives way
 _PAD = 8.2e-3  # from the BioTac's axis to its pad [m]
-_GREY = (0.55, 0.58, 0.62, 1.0)
+_ROD = dict(type="capsule", size=[0.005], rgba=[0.55, 0.58, 0.62, 1.0], contype=0, conaffinity=0)
 
 
 def _quaternion(columns):
@@ -75,7 +75,8 @@ class _Machine(composer.Entity):
 
     def command(self, physics, action):
         """Sets the velocities of the axes: action (naxis,) in [-1, 1]."""
-        physics.bind(self._actuators).ctrl = np.clip(action, -1, 1) * np.array(self._speed)
+        # not through a binding: it would make dm_control recompute the whole step, skin included, before the next reading
+        physics.data.ctrl[physics.bind(self._actuators).element_id] = np.clip(action, -1, 1) * np.array(self._speed)
 
     def place(self, physics, position):
         """Puts the axes at position (naxis,) [m], [rad], at rest, and the servos with them."""
@@ -105,12 +106,8 @@ class Gantry(_Machine):
         if yaw:
             body = self._carriage(body, "wrist")
             self._axis(body, "yaw", [0, 0, 1], [-1.6, 1.6], 1.0, hinge=True)
-        body.add(
-            "geom", name="arm", type="capsule", fromto=[0.014, 0, 0, 0.014, 0, 0.05], size=[0.005], rgba=_GREY, contype=0, conaffinity=0
-        )
-        body.add(
-            "geom", name="holder", type="capsule", fromto=[0.008, 0, 0, 0.014, 0, 0], size=[0.005], rgba=_GREY, contype=0, conaffinity=0
-        )
+        body.add("geom", name="arm", fromto=[0.014, 0, 0, 0.014, 0, 0.05], **_ROD)
+        body.add("geom", name="holder", fromto=[0.008, 0, 0, 0.014, 0, 0], **_ROD)
         self.mount = body.add("site", name="mount", quat=_quaternion([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
 
 
@@ -122,12 +119,12 @@ class Gripper(_Machine):
         body = self._carriage(self._root.worldbody, "carriage")
         if lift:
             self._axis(body, "lift", [0, 0, 1], [-0.02, 0.08], 0.03)
-        body.add("geom", name="beam", type="capsule", fromto=[0, -0.03, 0.055, 0, 0.03, 0.055], size=[0.005], rgba=_GREY, contype=0, conaffinity=0)  # fmt: skip
+        body.add("geom", name="beam", fromto=[0, -0.03, 0.055, 0, 0.03, 0.055], **_ROD)
         self.mounts = []
         for side, name in ((1, "left"), (-1, "right")):
             finger = self._carriage(body, name, pos=[0, side * _PAD, 0])
             self._axis(finger, name, [0, -side, 0], [-0.05, 0.002], 0.02)
-            finger.add("geom", type="capsule", fromto=[0, 0, 0.012, 0, 0, 0.052], size=[0.005], rgba=_GREY, contype=0, conaffinity=0)
+            finger.add("geom", fromto=[0, 0, 0.012, 0, 0, 0.052], **_ROD)
             self.mounts.append(finger.add("site", name=f"mount_{name}", quat=_quaternion([[0, 0, 1], [0, side, 0], [-side, 0, 0]])))
 
     @property

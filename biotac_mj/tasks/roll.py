@@ -24,12 +24,15 @@ class RollBall(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
-        world.add("geom", name="table", type="plane", size=[0.1, 0.1, 0.01], pos=[0, 0, -_PAD - 2 * _RADIUS], rgba=[0.75, 0.6, 0.4, 1], friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)  # fmt: skip
+        rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)  # 2: the finger's machine is not in the way
+        floor = [0, 0, -_PAD - 2 * _RADIUS]
+        world.add("geom", name="table", type="plane", size=[0.1, 0.1, 0.01], pos=floor, rgba=[0.75, 0.6, 0.4, 1], **rolls)
         self._ball = world.add("body", name="ball")
         self._joint = self._ball.add("freejoint", name="ball")
-        self._ball.add("geom", name="ball", type="sphere", size=[_RADIUS], mass=_MASS, rgba=[0.85, 0.45, 0.15, 1], friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)  # fmt: skip
+        self._ball.add("geom", name="ball", type="sphere", size=[_RADIUS], mass=_MASS, rgba=[0.85, 0.45, 0.15, 1], **rolls)
         self._target = np.zeros(2)
-        world.add("body", name="target", mocap=True).add("geom", type="cylinder", size=[5e-4, 1e-4], rgba=[0.1, 0.6, 0.2, 1], contype=0, conaffinity=0)  # fmt: skip
+        mark = dict(type="cylinder", size=[5e-4, 1e-4], rgba=[0.1, 0.6, 0.2, 1], contype=0, conaffinity=0)
+        world.add("body", name="target", mocap=True).add("geom", **mark)
         self._observe("target", lambda physics: self._target.copy())
 
     def initialize_episode(self, physics, random_state):

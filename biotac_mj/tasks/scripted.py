@@ -1,7 +1,7 @@
 """Controllers that solve the tasks from touch, the machine's own position and the told target; and one that acts at random.
 
-A controller never sees the simulation's hidden state. What it believes about force, place and load comes from `touch.Estimator`, a regression
-calibrated on other episodes (`calibrate`), or, in the calibration itself, from the truth handed to `act`.
+A controller never sees the simulation's hidden state. What it believes about force, place and load comes from `touch.Estimator`, a
+regression calibrated on other episodes (`calibrate`), or, in the calibration itself, from the truth handed to `act`.
 """
 
 import numpy as np
@@ -142,7 +142,7 @@ class Explore(Scripted):
 
 
 class Hold(Scripted):
-    """Grips as hard as the load that it feels needs, with a margin; where the load nears the friction limit, which is slip, it closes fast."""
+    """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the friction limit: that is slip."""
 
     task = "hold"
     least = 0.35  # [N] before there is a load
