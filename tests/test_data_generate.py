@@ -177,6 +177,18 @@ def test_worker_processes_give_the_same_whole_set(small, tmp_path):
 
 
 @pytest.mark.slow
+def test_recordings_keep_readings_only(tmp_path):
+    options = dataclasses.replace(SMALL, count=1, labelled=0, recordings=1, kinds=("tap",))
+    report = generate(tmp_path, options, workers=0, progress=False)
+    assert report.interactions == 1 and report.recordings == 1 and report.made == 2
+    with TactileSet(tmp_path) as data, TactileSet(tmp_path / "recordings") as recorded:
+        assert len(data) == 1 and "measured_counts" not in data.columns
+        assert recorded.object.tolist() == ["table_edge"] and recorded.geometry is None and "displacement" not in recorded.columns
+        counts = recorded["measured_counts"][:]
+        assert np.isfinite(counts).all() and np.abs(counts[:, :19] - counts[0, :19]).max() > 20
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_same_seed_same_file_on_cuda(tmp_path):
     options = dataclasses.replace(SMALL, count=24, labelled=8, batch=8, device="cuda:0")
@@ -199,12 +211,16 @@ def test_condensed_tier(tmp_path):
 
 
 def test_all_objects_take_turns():
-    options = GenerateOptions(count=100, labelled=20, batch=3)
-    parts = batches(options)
-    assert sorted(i for part in parts for i in part.members) == list(range(100))
-    assert {part.name for part in parts if part.labelled} == set(INDENTERS)
-    assert {part.name for part in parts if not part.labelled} == set(OBJECTS)
-    assert max(len(part.members) for part in parts) <= 3 and [part.number for part in parts] == list(range(len(parts)))
+    parts = batches(GenerateOptions(count=100, labelled=20, recordings=30, batch=3))
+    assert sorted(i for part in parts for i in part.members) == list(range(130))
+    role = {name: [p for p in parts if (p.simulated, p.measured) == flags] for name, flags in
+            dict(labelled=(True, True), plain=(True, False), recorded=(False, True)).items()}  # fmt: skip
+    assert {i for part in role["labelled"] for i in part.members} == set(range(20))
+    assert {part.name for part in role["labelled"]} == set(INDENTERS)
+    assert {part.name for part in role["plain"]} == set(OBJECTS)
+    assert {part.name for part in role["recorded"]} == set(OBJECTS) - set(INDENTERS)
+    assert max(len(part.members) for part in parts) <= 3 and len({part.path for part in parts}) == len(parts)
+    assert parts[0].path == "shard-00000.h5" and role["recorded"][0].path == "recordings/shard-00000.h5"
 
 
 def test_readings_follow_a_ramp():
@@ -224,6 +240,7 @@ def test_readings_follow_a_ramp():
     [
         (dict(count=0), "count is 0"),
         (dict(labelled=9), "labelled is 9: it must lie between 0 and the count, 3"),
+        (dict(recordings=-1), "recordings is -1"),
         (dict(rate=0.0), "rate is 0.0 Hz"),
         (dict(seed=-1), "seed is -1"),
         (dict(tier="fast"), "unknown tier 'fast': choose full or condensed"),

@@ -7,18 +7,17 @@ import pathlib
 import time
 
 import numpy as np
-import tqdm
 
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
 from ..press_record import replacing
 from .objects import OBJECTS
-from .plan import KINDS, plan_motions
-from .schema import Interaction
-from .splits import assign
-from .store import TactileSet, shard_path, write_shard
+from .plan import KINDS
+from .store import TactileSet, shard_path
 
-__all__ = ["GenerateOptions", "Report", "generate"]
+__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate"]
+
+RECORDINGS = "recordings"  # folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +26,8 @@ class GenerateOptions:
 
     Attributes:
       count: interactions. labelled: of them, how many also get the readings of the synthetic measured sensor; the paper's indenters only.
+      recordings: further interactions, with pegs and table, of which the synthetic measured sensor's readings alone are kept, as if logged
+        by hand; in a set of their own, the folder `recordings` in this one.
       steps: time steps of each. rate: of them [Hz].
       seed: of everything.
       objects, kinds: to draw from.
@@ -39,6 +40,7 @@ class GenerateOptions:
 
     count: int = 2600
     labelled: int = 359
+    recordings: int = 0
     steps: int = 20
     rate: float = 20.0
     seed: int = 0
@@ -62,6 +64,8 @@ class GenerateOptions:
             raise ValueError(f"count is {self.count} and batch is {self.batch}: both must be at least 1")
         if not 0 <= self.labelled <= self.count:
             raise ValueError(f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}")
+        if self.recordings < 0:
+            raise ValueError(f"recordings is {self.recordings}: it must not be negative")
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ValueError(f"rate is {self.rate} Hz: it must be a positive number")
         if self.seed < 0:
@@ -80,12 +84,14 @@ class Report:
     """What a run did.
 
     Attributes:
-      interactions, steps: in the set. nonconverged: of these steps. made: shards made by this run; those that were there are kept.
+      interactions, steps: in the set. recordings: in that beside it. nonconverged: of these steps.
+      made: shards made by this run; those that were there are kept.
       seconds: wall time of this run, once and per stage. bytes: of the shards. device: its name.
     """
 
     interactions: int
     steps: int
+    recordings: int
     nonconverged: int
     made: int
     seconds: dict
@@ -94,24 +100,36 @@ class Report:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Batch:
-    number: int
+class Batch:
+    """What is simulated together and stored in one shard.
+
+    Attributes:
+      name: of the object. members: numbers of the interactions.
+      simulated, measured: whether the simulator and whether the synthetic measured sensor takes part.
+      path: of the shard in the set's folder.
+    """
+
     name: str
-    labelled: bool
-    members: list  # numbers of interactions
+    members: list
+    simulated: bool
+    measured: bool
+    path: str
 
 
-def batches(options: GenerateOptions) -> list[_Batch]:
-    """Interactions 0..labelled-1 are labelled; objects take turns, so that a part of a set is a smaller set of the same kind."""
+def batches(options: GenerateOptions) -> list[Batch]:
+    """Labelled interactions first, then the others, then recordings; objects take turns, so a part of a set is a smaller one like it."""
     indenters = [name for name in options.objects if name in INDENTERS]
-    groups = {}
-    for i in range(options.count):
-        names = indenters if i < options.labelled else options.objects
-        groups.setdefault((i < options.labelled, names[i % len(names)]), []).append(i)
-    out = []
-    for (labelled, name), members in groups.items():
-        for part in np.array_split(members, -(-len(members) // options.batch)):
-            out.append(_Batch(len(out), name, labelled, part.tolist()))
+    others = [name for name in options.objects if name not in INDENTERS] or indenters
+    ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
+    roles = ((indenters, True, True), (options.objects, True, False), (others, False, True))
+    out, number = [], {True: 0, False: 0}
+    for first, end, (names, simulated, measured) in zip([0, *ends], ends, roles):
+        for k, name in enumerate(names):
+            members = np.arange(first + k, end, len(names))
+            for part in np.array_split(members, -(-len(members) // options.batch)) if len(members) else ():
+                path = shard_path("" if simulated else RECORDINGS, number[simulated])
+                out.append(Batch(name, part.tolist(), simulated, measured, path.as_posix()))
+                number[simulated] += 1
     return out
 
 
@@ -129,32 +147,32 @@ def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | N
       FileNotFoundError: no such skin.
     """
     from ..skin import SkinModel, SkinOptions
+    from .making import Maker
 
     out = pathlib.Path(out)
     geometry = load_skin(options.skin)
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {"device": options.device.split(":")[0]}
     settings = json.loads(json.dumps(settings))
-    todo = [batch for batch in batches(options) if not _is_there(shard_path(out, batch.number), settings)]
+    todo = [batch for batch in batches(options) if not _is_there(out / batch.path, settings)]
     begin = time.perf_counter()
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
-    model = None
     seconds = {"plan": 0.0, "skin": 0.0, "measured skin": 0.0}
     if todo:
         model = SkinModel(geometry, options.material, SkinOptions(element=options.element, liquid=options.liquid), options.device)
         attributes = {"settings": settings, "skin": options.skin, "material": dataclasses.asdict(model.material), "element": model.element,
                       "tier": options.tier, "liquid": model.has_liquid, "device": _device_name(model.device)}  # fmt: skip
-        maker = _Maker(out, options, model, attributes, seconds)
-        maker.run(todo, workers, progress)
+        Maker(out, options, model, attributes, seconds).run(todo, workers, progress)
     seconds["all"] = time.perf_counter() - begin
     with TactileSet(out) as data:
         report = Report(
             interactions=len(data),
             steps=data.nstep,
+            recordings=options.recordings,
             nonconverged=int((~data["converged"][:]).sum()),
             made=len(todo),
             seconds={name: round(value, 1) for name, value in seconds.items()},
-            bytes=sum(path.stat().st_size for path in out.glob("shard-*.h5")),
+            bytes=sum(path.stat().st_size for path in out.rglob("shard-*.h5")),
             device=data.attributes["device"],
         )
     if todo:
@@ -181,104 +199,3 @@ def _device_name(device):
     import platform
 
     return platform.processor() or platform.machine()
-
-
-class _Maker:
-    """The pipeline: while workers read one batch, the next one is planned and simulated."""
-
-    def __init__(self, out, options, model, attributes, seconds):
-        self.out, self.options, self.geometry, self.model = out, options, model.geometry, model
-        self.attributes, self.seconds = attributes, seconds
-        self.time = np.arange(options.steps) / options.rate
-        self.split = np.empty(options.count, "<U10")
-        for k, (low, high) in enumerate(((0, options.labelled), (options.labelled, options.count))):
-            self.split[low:high] = assign(high - low, [options.seed, k])
-        self.measured = None
-
-    def run(self, todo, workers, progress):
-        from . import readings, synthetic_sensor
-
-        o = self.options
-        labelled = any(batch.labelled for batch in todo)
-        if labelled:
-            self.measured = synthetic_sensor.SyntheticSensor(o.measured_seed, o.measured_skin, self.model.device)
-        args = (self.geometry, o.sensor, self.measured.meter() if labelled else None)
-        total = sum(o.steps * (1 + batch.labelled) for batch in todo)
-        bar = tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False)
-        with bar, readings.readings_pool(self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args) as pool:
-            waiting = []
-            for batch in todo:
-                waiting.append(self._begin(batch, pool, bar))
-                if len(waiting) > 1:
-                    self._end(*waiting.pop(0), pool)
-            for one in waiting:
-                self._end(*one, pool)
-
-    def _begin(self, batch, pool, bar):
-        """Plans and simulates a batch and hands its readings to the workers."""
-        from . import readings, simulate, synthetic_sensor
-
-        o = self.options
-        clock = time.perf_counter()
-        seeds = [[o.seed, number] for number in batch.members]
-        motions = plan_motions(self.geometry, batch.name, seeds, o.steps, o.kinds, self.model.device)
-        clock = self._count("plan", clock)
-        walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
-        fields = walk(self.model, batch.name, motions, bar.update)
-        clock = self._count("skin", clock)
-        noise = [int(np.random.SeedSequence([o.seed, number, 1]).generate_state(1, np.uint64)[0]) for number in batch.members]
-        jobs = [pool.submit(readings._read, fields.displacement[k], self.time, fields.pressure[k], noise[k]) for k in range(len(motions))]
-        if not batch.labelled:
-            return batch, motions, fields, jobs, None, None
-        answer = self.measured.simulate(batch.name, motions, bar.update)
-        self._count("measured skin", clock)
-        # each contact of the session begins some seconds after the last one, while the sensor warms up
-        labels = [
-            pool.submit(synthetic_sensor.measure_in_worker, answer.displacement[k], self.time, answer.pressure[k], number, noise[k])
-            for k, number in enumerate(batch.members)
-        ]
-        return batch, motions, fields, jobs, answer, labels
-
-    def _count(self, stage, since):
-        now = time.perf_counter()
-        self.seconds[stage] += now - since
-        return now
-
-    def _end(self, batch, motions, fields, jobs, answer, labels, pool):
-        """Waits for the readings of a batch and writes its shard."""
-        from .schema import DISPLACEMENT_SCALE
-
-        interactions = []
-        for k, (number, motion, job) in enumerate(zip(batch.members, motions, jobs)):
-            read = job.result()
-            extra = {}
-            if labels is not None:
-                extra = {"measured_counts": labels[k].result(), "measured_wrench": answer.wrench[k].astype(np.float32)}
-            interactions.append(
-                Interaction(
-                    id=f"{number:06d}",
-                    object=batch.name,
-                    kind=motion.kind,
-                    split=str(self.split[number]),
-                    seed=self.options.seed,
-                    parameters=motion.parameters,
-                    time=self.time,
-                    displacement=fields.displacement[k] * np.float32(DISPLACEMENT_SCALE),
-                    wrench=fields.wrench[k],
-                    contact_force=None if fields.contact_force is None else fields.contact_force[k],
-                    pressure=fields.pressure[k],
-                    impedance=read.impedance,
-                    counts=read.counts,
-                    indenter_pos=motion.pos,
-                    indenter_quat=_quaternions(motion.mat),
-                    converged=fields.converged[k] & ~read.failed & (True if answer is None else answer.converged[k]),
-                    **extra,
-                )
-            )
-        write_shard(shard_path(self.out, batch.number), interactions, self.geometry, self.attributes)
-
-
-def _quaternions(mat):
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(mat).as_quat(), 1, axis=-1)

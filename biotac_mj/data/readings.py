@@ -14,7 +14,7 @@ from ..sensor.channels import CHANNELS
 from ..sensor.film import FilmConduction
 from .schema import DISPLACEMENT_SCALE
 
-__all__ = ["Readings", "readings_pool", "read_motion", "sample"]
+__all__ = ["Readings", "prepare_worker", "read_in_worker", "read_motion", "readings_pool", "sample"]
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -76,11 +76,13 @@ def read_motion(film: FilmConduction, vert_xpos, time, pressure, seed: int) -> R
 _here = {}  # what a worker keeps: the film of the set's skin
 
 
-def _start(geometry, sensor):
+def prepare_worker(geometry, sensor):
+    """Makes the film of a skin in this process."""
     _here["film"] = FilmConduction(geometry, sensor=sensor)
 
 
-def _read(displacement, time, pressure, seed):
+def read_in_worker(displacement, time, pressure, seed) -> Readings:
+    """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store."""
     film = _here["film"]
     return read_motion(film, film.geometry.vert + displacement * DISPLACEMENT_SCALE, time, pressure, seed)
 
@@ -95,7 +97,7 @@ class _Now:
 
 
 @contextlib.contextmanager
-def readings_pool(geometry: SkinGeometry, sensor: str | None, workers: int, start=_start, start_args=None):
+def readings_pool(geometry: SkinGeometry, sensor: str | None, workers: int, start=prepare_worker, start_args=None):
     """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0 workers: this process.
 
     New processes are spawned, since CUDA does not survive a fork.

@@ -199,7 +199,7 @@ def start_worker(geometry, sensor, meter: Meter | None):
     """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to make."""
     from . import readings
 
-    readings._start(geometry, sensor)
+    readings.prepare_worker(geometry, sensor)
     _meter["one"] = meter
 
 

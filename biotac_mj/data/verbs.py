@@ -10,6 +10,7 @@ def generate_verb(args) -> None:
     options = GenerateOptions(
         count=args.count,
         labelled=min(359, args.count) if args.labelled is None else args.labelled,
+        recordings=args.recordings,
         steps=args.steps,
         rate=args.rate,
         seed=args.seed,
@@ -28,6 +29,8 @@ def generate_verb(args) -> None:
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
     print(f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not converged")
+    if report.recordings:
+        print(f"{report.recordings} recordings of the synthetic measured sensor beside them")
     print(f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.device}")
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
 
