@@ -259,6 +259,7 @@ def _add_generate(verbs):
     verb.add_argument("--steps", type=int, default=20, help="time steps of each")
     verb.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="of the time steps")
     verb.add_argument("--labelled", type=int, help="of them, how many get the synthetic measured sensor's counts too (default: 359)")
+    verb.add_argument("--recordings", type=int, default=0, help="further interactions of which only the synthetic sensor's counts are kept")
     verb.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches")
     verb.add_argument("--kinds", nargs="+", default=list(INTERACTIONS), choices=INTERACTIONS, metavar="KIND", help="how it moves")
     verb.add_argument("--element", choices=("linear", "quadratic"), help="of the skin (default: the material's, or the mesh's)")
