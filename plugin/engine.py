@@ -7,6 +7,7 @@ may be raised into C, so an exception is kept, reported as a RuntimeWarning, sho
 import ctypes
 import functools
 import importlib
+import sys
 import threading
 import warnings
 
@@ -90,8 +91,12 @@ def _keep(error):
 
 def _guarded(on_error):
     def decorate(function):
+        finalizing = sys.is_finalizing  # what is left when MuJoCo frees the last mjData: this module's names are gone by then
+
         @functools.wraps(function)
         def call(*args):
+            if finalizing():
+                return on_error
             try:
                 return function(*args)
             except BaseException as error:  # noqa: BLE001 - C cannot take it
