@@ -104,7 +104,7 @@ def test_four_configurations_order_of_stiffness():
 def test_solids_fill_what_they_should(name):
     skin = configuration(name).geometry
     shell = configuration("deformable_shell").geometry
-    outside = 1e9 * (TetMesh(shell.vert, shell.elem).volumes.sum()) + 1751.130  # the coarse skin and the cavity of its card [mm^3]
+    outside = 1e9 * (TetMesh(shell.vert, shell.tets).volumes.sum()) + 1751.130  # the coarse skin and the cavity of its card [mm^3]
     wanted = outside - (1395.597 if name == "solid_with_core" else 0.0)
     mesh = TetMesh(skin.vert, skin.elem).check()
     assert 1e9 * mesh.volumes.sum() == pytest.approx(wanted, rel=0.02)

@@ -86,7 +86,7 @@ def test_press_writes_readings_skin_and_picture(capsys, tmp_path, monkeypatch):
         assert len(file["vert_xpos"]) == len(rows)
         moved = file["vert_xpos"][-1] - file["vert"][:]
         # the skin gives way by what the indenter travels, less what it overlaps in the contact's softness
-        assert 0.7 * 4e-4 < moved[:, 1].max() < 1.05 * 4e-4
+        assert 0.7 * 4e-4 < moved[:, 1].max() < 1.08 * 4e-4
         assert np.abs(moved[file["fixed"][:]]).max() < 1e-8
     assert len(np.unique(imread(out / "press.png")[::4, ::4].reshape(-1, 4), axis=0)) > 100
     assert sorted(path.name for path in out.iterdir()) == ["press.png", "readings.csv", "skin.h5"]

@@ -29,7 +29,8 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
     return {
         "nodes": skin.nvert,
-        "tetrahedra": f"{skin.nelem} with {skin.elem.shape[1]} nodes",
+        "tetrahedra": skin.nelem,
+        "nodes of a tetrahedron": skin.elem.shape[1],
         "outer nodes": len(np.unique(skin.outer_face)),
         "inner nodes": len(np.unique(skin.inner_face)),
         "held nodes": len(skin.fixed),
@@ -77,7 +78,7 @@ def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
     unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
     rows = []
     for key, value in n.items():
-        number = f"{value}" if isinstance(value, int | str) else f"{value:.3f}"
+        number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
         rows.append(f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |")
     rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
     rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
