@@ -144,13 +144,13 @@ class PoseBatch(Skins):
             or of anything that speaks DLPack (JAX, torch), on the batch's device; they are not copied.
 
         Raises:
-          ValueError: a wrong shape.
+          ValueError: a wrong shape, or not single precision.
         """
-        nbody = self.xfrc_applied.shape[1]
-        for name, array, shape in (("xpos", xpos, (3,)), ("xmat", xmat, (3, 3)), ("xipos", xipos, (3,))):
-            if tuple(array.shape) != (self.nworld, nbody, *shape):
-                raise ValueError(f"{name} has shape {tuple(array.shape)}: pass {(self.nworld, nbody, *shape)}")
-        xpos, xmat, xipos = _as(xpos, wp.vec3), _as(xmat, wp.mat33), _as(xipos, wp.vec3)
+        shape = self.xfrc_applied.shape[:2]
+        xpos, xmat, xipos = (
+            _as(array, dtype, shape, name)
+            for name, array, dtype in (("xpos", xpos, wp.vec3), ("xmat", xmat, wp.mat33), ("xipos", xipos, wp.vec3))
+        )
         self._launch(kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat])
         self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
         bodies = [self._core, self._body, self.wrench0, xpos, xmat, xipos]
@@ -159,13 +159,17 @@ class PoseBatch(Skins):
 
     def readings(self):
         """{channel: (nworld, dim)} views of `sensordata`."""
-        ends = np.cumsum(list(CHANNELS.values()))
+        ends = np.cumsum(list(CHANNELS.values())).tolist()
         return {name: self.sensordata[:, end - width : end] for (name, width), end in zip(CHANNELS.items(), ends)}
 
 
-def _as(array, dtype):
-    """A (nworld, nbody) wp.array of dtype over the memory of another library's (nworld, nbody, ...) array."""
-    if isinstance(array, wp.array) and array.ndim == 2:
-        return array
-    whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
-    return wp.array(ptr=whole.ptr, shape=whole.shape[:2], dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False)
+def _as(array, dtype, shape, name):
+    """A (nworld, nbody) wp.array of dtype over the memory of a wp.array or of another library's (nworld, nbody, ...) array."""
+    full = (*shape, *dtype._shape_)
+    if isinstance(array, wp.array) and array.dtype is dtype:
+        full, whole = shape, array
+    else:
+        whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
+    if whole.shape != full or (full != shape and whole.dtype is not wp.float32):
+        raise ValueError(f"{name} has shape {whole.shape} of {whole.dtype.__name__}: pass {full} of float32")
+    return wp.array(ptr=whole.ptr, shape=shape, dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False)
