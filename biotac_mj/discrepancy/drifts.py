@@ -4,7 +4,7 @@ import numpy as np
 
 from .recorded_effect import Finding, Parameter, RecordedEffect
 from .recording import counts_of, log_impedance
-from .shapes import correlation_length, evaluate_shape, fit_shapes
+from .shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 
 __all__ = ["CountGain", "CountOffset", "Drift", "GainChange", "SharedGain", "Thermal"]
 
@@ -81,8 +81,12 @@ class _Common(TimeShaped):
         pattern = self.pattern(np.exp(np.median(np.log(np.clip(session.counts[session.fit], 1, 4094)), axis=0)))[line.used]
         series, sd = line.amplitude(pattern)
         kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
-        shape = fit_shapes(line.time, series, kinds, floor=sd * 0.1)
-        if shape is None or shape.nats < (12 if line.loaded else 8):
+        shape = None if line.loaded else self._jump_of_all(line, pattern, session.known_jumps)
+        shape = shape or fit_shapes(line.time, series, kinds, floor=sd * 0.1)
+        if shape is None:
+            return []
+        late = line.loaded and (shape.kind == "step" or shape.onset > line.time[0])
+        if shape.nats < (30 if late else 12 if line.loaded else 8):
             return []
         found = self._finding(session, line, pattern, shape, tuple(int(k) for k in line.used))
         if found.parameters["counts"][0] < max(1.0, 0.1 * np.median(line.noise) * 1000):
@@ -91,21 +95,50 @@ class _Common(TimeShaped):
             # Unloaded every electrode shows its own amplitude of the same shape: do they follow the pattern?
             column = evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end)
             column = column - column.mean()
-            own = column @ (line.value - line.value.mean(0)) / (column @ column)
-            fit = pattern * (own @ pattern) / (pattern @ pattern)
-            agreement = float(own @ pattern / np.linalg.norm(own) / np.linalg.norm(pattern))
-            if abs(agreement) < 0.93:
+            if shape.kind == "step" and shape.neff == len(line.time):  # a jump: its own change, free of slow drift
+                own = line.jump_at(int(np.argmin(np.abs(line.time - shape.onset))), session.known_jumps)
+            else:
+                own = column @ (line.value - line.value.mean(0)) / (column @ column)
+            # A few electrodes may have something of their own besides: they are not asked.
+            ratio = own / pattern
+            middle = np.median(ratio)
+            inside = np.abs(ratio - middle) < 0.2 * abs(middle) + 4 * line.noise / np.sqrt(column @ column) / pattern
+            if inside.sum() < max(8, 0.7 * len(pattern)):
                 return []
-            if abs(agreement) > 0.98:  # the electrodes' own shares, a few per cent about the pattern, are part of the effect
-                share = own * (pattern @ pattern) / (own @ pattern)
+            agreement = abs(float(own[inside] @ pattern[inside] / np.linalg.norm(own[inside]) / np.linalg.norm(pattern[inside])))
+            if agreement < 0.93:
+                return []
+            fit = pattern * (own[inside] @ pattern[inside]) / (pattern[inside] @ pattern[inside])
+            shape.amplitude *= float(np.mean(fit / pattern) / shape.amplitude) if abs(shape.amplitude) > 0 else 1.0
+            found = self._finding(session, line, pattern, shape, tuple(int(k) for k in line.used))
+            if agreement > 0.98 and self.id == "warmup":  # the electrodes' own shares, a few per cent about the pattern, belong to it
+                share = np.where(inside, own / np.mean(fit / pattern), pattern)
                 found = self._finding(session, line, share, shape, tuple(int(k) for k in line.used))
-                found.parameters["spread"] = (float(np.std(share / pattern)), np.nan, np.nan)
+                found.parameters["spread"] = (float(np.std(share[inside] / pattern[inside])), np.nan, np.nan)
             noise = np.sqrt((line.noise**2) / (column @ column))
-            found.theta["misfit"] = float((((own - fit) / np.hypot(noise, 0.01 * np.abs(fit))) ** 2).sum())
-            found.note += f"; electrodes' own amplitudes agree with the pattern to {abs(agreement):.4f} (cosine)"
+            found.theta["misfit"] = float(((((own - fit) / np.hypot(noise, 0.02 * np.abs(fit))) ** 2)[inside]).sum())
+            found.note += f"; electrodes' own amplitudes agree with the pattern to {agreement:.4f} (cosine)"
         else:
             found.theta["misfit"] = -2 * shape.nats
         return [found]
+
+    @staticmethod
+    def _jump_of_all(line, pattern, known):
+        """A step that all electrodes make within a bin, or None; unloaded, where nothing else moves."""
+        at, step, w = line.jumps(known)
+        if not len(at):
+            return None
+        size = np.median(step / pattern, axis=1)
+        alike = (np.abs(step - size[:, None] * pattern) < 0.4 * np.abs(size[:, None] * pattern) + 4 * line.noise * np.sqrt(2 / w)).mean(1)
+        score = np.where(alike > 0.8, np.abs(size) / (np.median(line.noise) * np.sqrt(2 / w) / 2), 0)
+        i = int(np.argmax(score))
+        # A slow drift changes within a window too: a jump stands out of its surroundings.
+        if score[i] < 12 or abs(size[i]) < 8 * np.median(np.abs(size)):
+            return None
+        time, half = float(line.time[at[i]]), float(np.median(line.noise)) * np.sqrt(2 / w)
+        value = float(np.median(line.jump_at(at[i], known) / pattern))
+        return ShapeFit("step", time, 0.0, np.inf, value, 0.0, float(min(0.5 * score[i] ** 2, 400)), half, len(line.time), 1.0,
+                        {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
 
 
 class SharedGain(_Common):
@@ -125,7 +158,28 @@ class SharedGain(_Common):
         return np.ones(19)
 
 
-class CountOffset(_Common):
+class _InCounts(_Common):
+    """Patterns that are exact in counts, not in ln Z: theta["counts"] holds the factor from level to counts."""
+
+    multiplies = False
+
+    def _finding(self, session, line, pattern, shape, channels):
+        found = super()._finding(session, line, pattern, shape, channels)
+        counts = np.median(session.counts[session.fit], axis=0)[line.used]
+        mass = (counts if self.multiplies else 1) / np.abs(_counts_per_log(counts))
+        found.theta["counts"] = -1 / float(mass.mean())
+        return found
+
+    def apply(self, counts, time, channels, theta):
+        change = theta["counts"] * self._level(time, theta)[:, None]
+        return np.clip(counts * (1 + change) if self.multiplies else counts + change, 0, 4095)
+
+    def correct(self, counts, time, channels, theta):
+        change = theta["counts"] * self._level(time, theta)[:, None]
+        return np.clip(counts / np.maximum(1 + change, 0.05) if self.multiplies else counts - change, 0, 4095)
+
+
+class CountOffset(_InCounts):
     id, name, stage = "count_offset", "common offset in counts (reference voltage)", "A"
     physics = "all channels move by the same number of counts: reference or ground of the converter"
     params = {
@@ -140,7 +194,8 @@ class CountOffset(_Common):
         return v / v.mean()
 
 
-class CountGain(_Common):
+class CountGain(_InCounts):
+    multiplies = True
     id, name, stage = "count_gain", "common gain in counts (amplifier, excitation)", "A"
     physics = "all counts are multiplied by one factor: amplifier or excitation amplitude"
     params = {"amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "some per cent"), "tau": _LENGTH, "onset": _ONSET}
@@ -169,23 +224,31 @@ class Drift(TimeShaped):
         common = max(
             (f.parameters["counts"][0] for f in session.findings if isinstance(f.effect, _Common) and "counts" in f.parameters), default=0.0
         )
-        for k in range(len(line.used)):
+        for k in _whole_electrodes(session, line):
             unit = np.zeros(len(line.used))
             unit[k] = 1
             series, sd = line.amplitude(unit)
-            shape = fit_shapes(line.time, series, kinds, tests=len(line.used), floor=sd * 0.1)
+            through = line.explained_by_others(k) if line.loaded else None
+            if through is not None:
+                series = through(line.value[:, k] - line.value[:, k].mean())
+                sd = max(series.std(), line.noise[k])
+            shape = fit_shapes(line.time, series, kinds, tests=len(line.used), floor=sd * 0.1, through=through)
             if shape is None or shape.nats < (15 if line.loaded else 8):
                 continue
-            if line.loaded and shape.nats < 40:
+            if line.loaded and shape.nats < 20:
                 continue
             size = abs(shape.amplitude) * slope[k] * np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end))
             floor = max(2.0, 0.7 * line.noise[k] * np.sqrt(line.width) * slope[k])
             # Real electrodes share a gain to 3 %: what is left of it is no drift of their own.
-            if size < max(floor, 0.12 * common) or (line.loaded and (shape.explained < 0.5 or size < 3 * floor)):
+            if size < max(floor, 0.12 * common) or (line.loaded and (shape.explained < 0.3 or size < 3 * floor)):
                 continue
             energy = np.sum((series - series.mean()) ** 2) * shape.explained / sd**2
             if best is None or energy > best[0]:
                 best = energy, k, unit, shape
+        if best is None or not line.loaded:
+            jump = self._jump(session, line)
+            if jump and (best is None or jump[0].nats > 50):
+                return jump
         if best is None:
             return []
         _, k, unit, shape = best
@@ -193,6 +256,37 @@ class Drift(TimeShaped):
         if not line.loaded:
             found.ties = ("gain",)  # without load an offset and a gain of the channel look alike
             found.note += "; unloaded, an offset and a gain of the channel look alike"
+        return [found]
+
+    def _jump(self, session, line):
+        """One electrode changes its level from one second to the next while the others stand still."""
+        known = session.known_jumps
+        at, step, w = line.jumps(known)
+        if not len(at):
+            return []
+        n, c = line.value.shape
+        P = np.linalg.inv(line.covariance)
+        alone = step @ P / np.diag(P)
+        moving = np.sqrt((np.sort(np.abs(step), axis=1)[:, : c - 2] ** 2).mean(1))
+        z = np.abs(alone) / np.hypot(line.noise * np.sqrt(2 / w), 0.5 * moving[:, None])
+        order = np.sort(z, axis=1)
+        lone = order[:, -2] < 0.35 * order[:, -1]
+        score = np.where(lone, order[:, -1], 0)
+        i = int(np.argmax(score))
+        k = int(np.argmax(z[i]))
+        slope = np.abs(np.median(_counts_per_log(session.counts), axis=0))[line.used][k]
+        if score[i] < 10 or abs(alone[i, k]) * slope < 15:
+            return []
+        time = float(line.time[at[i]])
+        unit = np.zeros(c)
+        unit[k] = 1
+        half = 2 * float(line.noise[k]) / np.sqrt(w) + 0.5 * float(moving[i])
+        value = float(alone[i, k]) if line.loaded else float(line.jump_at(at[i], known)[k])
+        shape = ShapeFit("step", time, 0.0, np.inf, value, 0.0, float(min(0.5 * score[i] ** 2 - np.log(n * c), 200)), half, n, 1.0,
+                         {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
+        found = self._finding(session, line, unit, shape, (int(line.used[k]),))
+        found.ties = ("gain",)
+        found.note += f"; the other electrodes stand still meanwhile ({abs(value) * slope:.0f} counts)"
         return [found]
 
 
@@ -209,20 +303,20 @@ class GainChange(RecordedEffect):
         best = None
         n = len(line.time)
         cuts = np.unique(np.linspace(0.04 * n, 0.96 * n, 48).astype(int))
-        for k in range(len(line.used)):
-            unit = np.zeros(len(line.used))
-            unit[k] = 1
-            residual, _ = line.amplitude(unit)
+        for k in _whole_electrodes(session, line):
+            through = line.explained_by_others(k)
+            residual = through(line.value[:, k] - np.median(line.value[:, k]))
             signal = line.value[:, k] - np.median(line.value[:, k]) - residual
             if signal.std() < 4 * line.noise[k]:
                 continue
             for start, stop in [(c, n) for c in cuts] + [(a, b) for i, a in enumerate(cuts[::4]) for b in cuts[::4][i + 1 :]]:
                 on = np.zeros(n)
                 on[start:stop] = 1
-                base = np.stack([np.ones(n), signal], axis=1)
-                more = np.stack([np.ones(n), signal, on, on * signal], axis=1)
-                if min((on * signal).std(), ((1 - on) * signal).std()) < 2 * line.noise[k]:
-                    continue
+                share = (stop - start) / n
+                if not 0.1 < share < 0.9 or min(signal[on > 0].std(), signal[on == 0].std()) < 0.4 * signal.std():
+                    continue  # a gain shows where the load changes, on both sides
+                base = np.ones((n, 1))
+                more = np.concatenate([base, through(np.stack([on, on * signal], axis=1))], axis=1)
                 rss0, _ = _least_squares(base, residual)
                 rss1, w = _least_squares(more, residual)
                 if best is None or rss0 / rss1 > best[0]:
@@ -232,18 +326,17 @@ class GainChange(RecordedEffect):
         ratio, k, start, stop, w, rss1, residual, signal, more = best
         neff = max(4.0, n / correlation_length(residual - more @ w))
         nats = 0.5 * neff * np.log(ratio) - 2 * np.log(neff) - np.log(19) - 3
-        # The covariance saw both gains: what counts is how the slope of the truth on the prediction differs.
-        gain = float((1 + w[1] + w[3]) / (1 + w[1]) - 1) if abs(1 + w[1]) > 0.1 else float("nan")
-        if nats < 20 or not np.isfinite(gain) or abs(gain) < 0.08:
+        gain = float(w[2])
+        if nats < 20 or not 0.08 < abs(gain) < 1.2:
             return []
         covariance = np.linalg.pinv(more.T @ more) * rss1 / n * n / neff
-        half = 1.96 * float(np.sqrt(covariance[3, 3])) / abs(1 + w[1])
+        half = 1.96 * float(np.sqrt(covariance[2, 2]))
         whole = stop >= n
         first = float(line.time[start] - line.period / 2)
         last = float(session.recording.time[-1]) if whole else float(line.time[stop - 1] + line.period / 2)
         channel = int(line.used[k])
         rest = float(np.median(line.value[:, k]))
-        shift = float(w[2] / (1 + w[1]))
+        shift = float(w[1])
         theta = {"gain": gain, "rest": rest, "start": first, "end": np.inf if whole else last, "shift": shift}
         parameters = {"gain": (gain, gain - half, gain + half), "onset": (first, first - 2 * line.period, first + 2 * line.period)}
         note = f"its response to load changes by {gain:+.0%} against what the other electrodes say"
@@ -312,6 +405,11 @@ class Thermal(_Common):
     def _level(time, theta):
         lagged = _lagged(theta["temperature"], theta["lag"], theta["rate"]) - theta["reference"]
         return theta["slope"] * np.interp(time, np.arange(len(lagged)) / theta["rate"], lagged)
+
+
+def _whole_electrodes(session, line):
+    """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken for a drift."""
+    return [i for i, k in enumerate(line.used) if session.masked[session.fit, k].mean() < 0.03]
 
 
 def _counts_per_log(counts):

@@ -27,11 +27,17 @@ class Stuck(RecordedEffect):
         x = session.recording.electrodes[first:last]
         whole = _frozen_rows(x, rate)
         repeat = np.array([_repeat_share(c) for c in x.T])
+        # What the other electrodes do too (a filtered or coarse recording stands still at times) is no fault of one.
+        longest = np.array([runs(c)[1].max() for c in x.T])
+        usual = float(np.median(longest[longest < 0.5 * len(x)])) if (longest < 0.5 * len(x)).any() else 1.0
+        coarse = {k for f in session.findings if f.id == "quantise" for k in f.channels}
         for k in range(19):
+            if k in coarse:
+                continue
             p = repeat[k] if repeat[k] < 0.95 else np.median(repeat)
             if p > 0.9:
                 continue  # without noise a constant reading is no news
-            limit = max(10, 0.25 * rate, np.log(1e-9 / len(x)) / np.log(max(p, 0.02)))
+            limit = max(10, 0.25 * rate, 4 * usual, np.log(1e-9 / len(x)) / np.log(max(p, 0.02)))
             start, length = runs(x[:, k])
             long = [(s, n) for s, n in zip(start, length) if n >= limit and not whole[s : s + n].mean() > 0.5]
             if not long or self._is_clip(x[:, k], long):
@@ -53,9 +59,10 @@ class Stuck(RecordedEffect):
 
     @staticmethod
     def _is_clip(x, long):
-        """Runs at the record's end of range, entered smoothly, are clipping."""
-        edge = [x[s] in (x.max(), x.min()) for s, _ in long]
-        return len(long) > 2 and all(edge) and len({x[s] for s, _ in long}) <= 2
+        """Runs at one end of the channel's range are clipping, unless they are most of the record."""
+        if np.ptp(x) < 6 or sum(n for _, n in long) > 0.8 * len(x):
+            return False
+        return all(x[s] == x.max() for s, _ in long) or all(x[s] == x.min() for s, _ in long)
 
     def mask(self, counts, time, finding):
         mask = np.zeros(counts.shape, bool)
@@ -156,11 +163,14 @@ class Quantise(RecordedEffect):
         x = session.recording.electrodes
         if np.any(x[rows] != np.rint(x[rows])):
             return []
+        whole = np.array([_lattice(x[rows, k]) for k in range(19)])
+        rate = session.recording.rate
+        if np.mean(whole >= 2) > 0.8:
+            return [self._finding(tuple(range(19)), float(np.median(whole)), 0.0, float(session.recording.time[-1]) + 1, 50.0)]
         step = np.array([[_lattice(x[a:b, k]) for k in range(19)] for a, b in zip(edges[:-1], edges[1:])])
         coarse = step >= 2
         found = []
         common = coarse.mean(1) > 0.8
-        rate = session.recording.rate
         if common.any():
             for start, end in spans(common, edges / rate):
                 inside = (edges[:-1] / rate >= start - 1e-9) & (edges[1:] / rate <= end + 1e-9)
@@ -232,8 +242,28 @@ class Swap(RecordedEffect):
 
     def find(self, session):
         line = session.timeline()
-        found = self._best(line, session)
+        found = (None if line.loaded else self._exchanged(line, session)) or self._best(line, session)
         return [found] if found else []
+
+    def _exchanged(self, line, session):
+        """Unloaded: two electrodes take each other's level from one bin to the next."""
+        at, step, w = line.jumps()
+        best = None
+        for i in np.argsort(-np.abs(step).max(1) if len(at) else np.zeros(0))[:40]:
+            before, after = line.value[at[i] - w : at[i]].mean(0), line.value[at[i] + 1 : at[i] + w + 1].mean(0)
+            a, b = np.argsort(-np.abs(step[i]))[:2]
+            moved = abs(step[i, a]) + abs(step[i, b])
+            left = abs(after[a] - before[b]) + abs(after[b] - before[a])
+            slack = 6 * (line.noise[a] + line.noise[b]) / np.sqrt(w)
+            if moved > 5 * slack and left < 0.1 * moved + slack and (best is None or moved > best[0]):
+                best = moved, int(at[i]), int(a), int(b)
+        if best is None:
+            return None
+        _, cut, a, b = best
+        onset, end = float(line.time[cut]), float(session.recording.time[-1])
+        return Finding(self, tuple(int(line.used[k]) for k in (a, b)), {"start": onset, "end": end + 1},
+                       {"onset": (onset, onset - line.period, onset + line.period)}, 100.0, onset, end, 0.0,
+                       note="each takes the other's level from one moment to the next")  # fmt: skip
 
     def _best(self, line, session):
         z, t = line.value, line.time
@@ -241,37 +271,50 @@ class Swap(RecordedEffect):
         best = None
         for cut in np.unique(np.linspace(0.05 * n, 0.95 * n, 46).astype(int)):
             late = cut > n / 2  # the longer side says what is normal
-            normal, other = (z[:cut], z[cut:]) if late else (z[cut:], z[:cut])
-            if len(other) < 8:
+            gap = max(2, n // 40)  # the change may lie a little beside the cut
+            before, after = z[: max(cut - gap, 1)], z[cut + gap :]
+            normal, other = (before, after) if late else (after, before)
+            if len(other) < 8 or len(normal) < 3 * c:
                 continue
-            cov = np.cov(normal.T) + np.diag(line.noise**2 + 1e-8)
+            cov = (np.cov(normal.T) if line.loaded else line.covariance) + np.diag(line.noise**2 + 1e-8)
             P = np.linalg.inv(cov)
             mean = normal.mean(0)
-            now = self._energy(other, mean, P)
-            raw = [(a, b) for a in range(c) for b in range(a + 1, c)]
             d = other - mean
+            rows = ((d @ P) * d).sum(1)
+            now = float(np.median(rows))
+            raw = [(a, b) for a in range(c) for b in range(a + 1, c)]
             for a, b in raw:
                 # two columns change places: the change of the quadratic form, only these columns are touched
                 shift = other[:, b] - other[:, a]
                 delta = 2 * shift * (d @ P[:, a] - d @ P[:, b]) + shift**2 * (P[a, a] + P[b, b] - 2 * P[a, b])
-                after = now + delta.mean()
+                after = float(np.median(rows + delta))
                 ratio = np.log(max(now, 1e-9) / max(after, 1e-9))
                 gain = 0.5 * c * ratio * min(len(other), len(normal)) / 8
                 if ratio > 0.7 and (best is None or gain > best[0]):
                     best = gain, cut, late, a, b, ratio, after
-        if best is None or best[0] < 20 or best[6] > 6 * c:
+        if best is None or best[0] < 20 or best[6] > (12 if line.loaded else 4) * c:
             return None
         gain, cut, late, a, b, ratio, _ = best
-        onset = float(t[cut] - line.period / 2)
+        onset = self._onset(z, t, a, b, cut, late, line)
         start, end = (onset, float(session.recording.time[-1])) if late else (0.0, onset)
         channels = tuple(int(line.used[i]) for i in (a, b))
         return Finding(self, channels, {"start": start, "end": end + (1 if late else 0)}, {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},
                        gain, start, end, 0.0, note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}")  # fmt: skip
 
     @staticmethod
-    def _energy(z, mean, P):
-        d = z - mean
-        return float(((d @ P) * d).sum(1).mean())
+    def _onset(z, t, a, b, cut, late, line):
+        """The time at which exchanging the two turns from worse to better."""
+        gap = max(2, len(t) // 40)
+        pair = z[:, [a, b]]
+        normal = pair[: cut - gap] if late else pair[cut + gap :]
+        mean, sd = np.median(normal, axis=0), np.std(normal, axis=0) + line.noise[[a, b]]
+        cost = ((((pair - mean) / sd) ** 2) - (((pair[:, ::-1] - mean) / sd) ** 2)).sum(1)
+        cost = np.clip(cost, -50, 50)
+        inside = slice(max(cut - 2 * gap, 0), min(cut + 2 * gap, len(t)))
+        # as it stands is right before the onset, exchanged after it (or the other way round)
+        total = np.cumsum(cost[inside])
+        at = int(np.argmin(total) if late else np.argmax(total)) + inside.start
+        return float(t[min(at, len(t) - 1)] + line.period / 2)
 
     def apply(self, counts, time, channels, theta):
         out = counts.copy()

@@ -62,15 +62,22 @@ def _lag_one(d):
     """(19,) lag-1 autocorrelation, zero-mean, nan-aware; nan for an electrode without noise."""
     pair = d[1:] * d[:-1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        power = np.nanmean(d**2, axis=0)
-        out = np.nanmean(pair, axis=0) / power
+        power = _mean(d**2)
+        out = _mean(pair) / power
     out[~(power > 0.8)] = np.nan  # below that rounding to counts is all there is
     return out
 
 
+def _mean(x):
+    """Mean over rows of what is known; nan where nothing is."""
+    known = np.isfinite(x)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(known, x, 0).sum(0) / known.sum(0)
+
+
 def quiet(cuts, share=0.5):
     """The windows in which the third differences are smallest."""
-    energy = np.array([np.nanmedian(np.nanmean(d**2, axis=0)) for _, _, d in cuts])
+    energy = np.array([np.nanmedian(_mean(d**2)) for _, _, d in cuts])
     return [c for c, e in zip(cuts, energy) if e <= np.quantile(energy, share)]
 
 
@@ -93,9 +100,9 @@ class LowPass(RecordedEffect):
         found = []
         flag = np.where(np.isfinite(common), common > limit, False)
         # Movement of a loaded skin can imitate it in lively windows; in the quiet ones it cannot.
-        calm = np.array([np.nanmedian(np.nanmean(d**2, axis=0)) for _, _, d in cuts])
+        calm = np.array([np.nanmedian(_mean(d**2)) for _, _, d in cuts])
         calm = calm <= np.quantile(calm, 0.6)
-        stretches = spans(flag, edges, least=3)
+        stretches = spans(flag, edges, least=5)
         if flag[calm].mean() > 0.8:
             stretches = [(float(edges[0]), float(session.recording.time[-1]))]
         for start, end in stretches:
@@ -169,13 +176,16 @@ class CrossTalk(RecordedEffect):
             x = off - white
             c = k - k.mean()
             kappa = float(np.nansum(c * x) / (c @ c))
-            share = float(1 - np.nansum((x - x.mean() - kappa * c) ** 2) / np.nansum((x - x.mean()) ** 2))
+            chance = len(x) / n  # of the squares, from so few samples
+            left, total = np.nansum((x - x.mean() - kappa * c) ** 2), np.nansum((x - x.mean()) ** 2)
+            share = float(1 - max(left - chance, 0.05 * total) / max(total - chance, 0.05 * total))
             if best is None or share > best[1]:
                 best = name, share, kappa
         name, share, kappa = best
-        z = kappa * np.sqrt(n)
+        K = patterns[name][np.triu_indices(19, 1)]
+        z = kappa * np.sqrt(n * ((K - K.mean()) ** 2).sum())
         strong = np.flatnonzero((np.abs(corr - np.eye(19)) > max(0.15, 7 / np.sqrt(n))).any(1))
-        if share > 0.35 and kappa > 0.06 and z > 6:
+        if share > 0.4 and kappa > 0.06 and z > 7:
             channels, value, pattern = tuple(range(19)), kappa / 2, name
         elif 2 <= len(strong) <= 6:
             a, b = np.unravel_index(np.nanargmax(np.abs(corr - np.eye(19))), corr.shape)
@@ -203,9 +213,10 @@ class CrossTalk(RecordedEffect):
         ]
 
     @staticmethod
-    def _correlation(session, rows=None, share=0.25):
+    def _correlation(session, rows=None, share=None):
         """Correlation (19, 19) of fifth differences in the quietest share of windows of 40 rows, and how many independent samples made it."""
         recording = session.recording
+        share = (0.3 if session.timeline().loaded else 1.0) if share is None else share
         where = np.flatnonzero((session.fit if rows is None else rows) & ~recording.repeated)
         d = np.diff(session.counts[where], n=5, axis=0)
         bad = session.masked[where]
@@ -229,7 +240,7 @@ class CrossTalk(RecordedEffect):
         corr = d.T @ d / np.sqrt(np.outer(power, power) + 1e-12)
         corr[~alive], corr[:, ~alive] = 0, 0
         np.fill_diagonal(corr, 1)
-        return corr, len(d) / 4  # fifth differences repeat each sample's noise
+        return corr, len(d) / 2.9  # C(20, 10) / C(10, 5)^2: fifth differences repeat each sample's noise
 
     def correct(self, counts, time, channels, theta):
         return theta["centre"] + (counts - theta["centre"]) @ np.linalg.inv(theta["matrix"]).T
@@ -275,7 +286,9 @@ class Hum(RecordedEffect):
         if best is None:
             return []
         strength, f, channels, k_segments, start, stop = best
-        f, basis, w = _refine(x[start:stop], rate, f, channels)
+        f, _, _ = _refine(x[start:stop], rate, f, channels)
+        start, stop = _when(x, rate, f, channels, start, stop)
+        f, _, w = _refine(x[start:stop], rate, f, channels)
         amplitude = np.hypot(w[0], w[1])
         noise = np.std(np.diff(x[start:stop], n=2, axis=0), axis=0) / np.sqrt(6)
         if amplitude.max() < max(0.4, 0.12 * np.median(noise)):
@@ -353,14 +366,14 @@ class Noise(RecordedEffect):
         cuts = windows(session)
         if len(cuts) < 4:
             return []
-        sd = np.sqrt(np.array([np.nanmean(d**2, axis=0) for _, _, d in cuts]) / 20)
+        sd = np.sqrt(np.nan_to_num(np.array([_mean(d**2) for _, _, d in cuts])) / 20)
         law = electrode_noise(np.median(session.counts[session.fit], axis=0))
         ratio = np.maximum(sd, 0.3) / law
         calm = np.quantile(ratio, 0.3, axis=0)
         overall = np.median(calm)
         edges = np.array([c[0] for c in cuts] + [cuts[-1][1]])
         found = []
-        for k in range(19):
+        for k in np.flatnonzero(session.masked[session.fit].mean(0) < 0.02):
             excess = ratio[:, k] / np.maximum(np.median(ratio, axis=1), 0.3 * overall)
             own = np.median(excess)
             if own > 2.5:
@@ -373,7 +386,7 @@ class Noise(RecordedEffect):
                 own = float(np.median(excess[(edges[:-1] >= start - 1e-9) & (edges[1:] <= end + 1e-9)]))
             n = len(cuts) * 60
             nats = min(0.1 * n * np.log(own) ** 2, 1e4)
-            found.append(Finding(self, (k,), {}, {"factor": (float(own), np.nan, np.nan)}, nats, start, end, float(np.exp(-min(nats, 700))),
+            found.append(Finding(self, (int(k),), {}, {"factor": (float(own), np.nan, np.nan)}, nats, start, end, float(np.exp(-min(nats, 700))),
                                  note=f"{own:.1f} times as noisy as the other electrodes' law"))  # fmt: skip
         return found
 
@@ -398,6 +411,31 @@ def _stretches(n, rate):
         edges = np.linspace(0, n, parts + 1).astype(int)
         out += [(edges[i], edges[j]) for i in range(parts) for j in range(i + 1, parts + 1) if (i, j) != (0, parts)]
     return [(a, b) for a, b in out if b - a >= least]
+
+
+def _when(x, rate, f, channels, start, stop):
+    """First and last row of the stretch about start..stop in which the line is there, from its amplitude in short windows."""
+    size = int(max(64, min(2 * rate, (stop - start) // 6)))
+    k = len(x) // size
+    t = np.arange(size) / rate
+    wave = np.exp(-2j * np.pi * f * t[:-1])
+    y = np.diff(x[: k * size].reshape(k, size, -1)[:, :, list(channels)], axis=1)
+    level = np.abs(np.einsum("i,kic->kc", wave * np.hanning(size - 1), y)).mean(1)
+    inside = np.arange(k) * size
+    known = (inside >= start) & (inside + size <= stop)
+    if not known.any():
+        return start, stop
+    on = level > 0.5 * np.median(level[known])
+    a, b = start // size, max(start // size + 1, stop // size)
+    while a > 0 and on[max(a - 2, 0) : a].any():
+        a -= 1
+    while b < k and on[b : b + 2].any():
+        b += 1
+    while a < b - 2 and not on[a]:
+        a += 1
+    while b > a + 2 and not on[b - 1]:
+        b -= 1
+    return a * size, len(x) if b >= k else b * size
 
 
 def _refine(x, rate, f, channels):

@@ -20,7 +20,7 @@ from .recording import Recording
 
 __all__ = ["EFFECTS", "RecordingDiagnosis", "diagnose_recording"]
 
-EFFECTS = [Freeze(), Stuck(), Saturate(), Quantise(), Spikes(), Swap(), Hum(), LowPass(), CrossTalk(), CommonNoise(), Noise(), SharedGain(),
+EFFECTS = [Quantise(), Freeze(), Stuck(), Saturate(), Spikes(), Swap(), Hum(), LowPass(), CrossTalk(), CommonNoise(), Noise(), SharedGain(),
            CountOffset(), CountGain(), Thermal(), Drift(), GainChange(), Latency(), LoadLowPass(), Relaxation(), Hysteresis()]  # fmt: skip
 _COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
 _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
@@ -106,6 +106,13 @@ def _search(session, effects, bar):
         chosen = _choose(session, candidates)
         if chosen is None:
             break
+        alike = [f for f in session.findings if f.theta.get("kind") in ("step", "pulse") and f.channels == chosen.channels]
+        if len(alike) >= 2 and chosen.theta.get("kind") in ("step", "pulse"):
+            # One jump is an event, jumps again and again are a behaviour that no effect here describes.
+            session.give_up(
+                alike, f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} jumps again and again"
+            )
+            break
         session.accept(chosen)
     bar.update()
     for _ in range(4):
@@ -135,10 +142,10 @@ def _choose(session, candidates):
         if patterns:
             order = sorted(patterns, key=lambda f: f.theta["misfit"])
             loaded = session.timeline().loaded
-            slack = 12.0 if not loaded else 6.0
+            slack = 12.0 if not loaded else 40.0  # loaded, nearly parallel patterns are told apart by nothing but the load's remains
             best = order[0]
             near = [f for f in order if f.theta["misfit"] - order[0].theta["misfit"] < slack]
-            preferred = [f for f in near if f.id == "warmup"]
+            preferred = [f for f in (patterns if loaded else near) if f.id == "warmup"]
             best = preferred[0] if preferred else best
             best.ties = tuple(f.id for f in near if f is not best)
         if thermal:
@@ -175,6 +182,7 @@ def _late(session, effects):
     whole.counts, whole.masked, whole.force = session.counts.copy(), session.masked.copy(), session.force
     begin = session.recording.time[~session.fit][0]
     late = []
+    whole.findings = list(session.findings)
     for effect in _FAULTS:
         for finding in effect.find(whole):
             known = [f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)]
@@ -192,6 +200,8 @@ def _late(session, effects):
         candidates = [f for effect in (*_MOVING, *_NOISE[:1], *effects) for f in effect.find(whole)]
         known = {(f.id, f.channels) for f in session.findings}
         candidates = [f for f in candidates if (f.id, f.channels) not in known]  # an extrapolation that is a little off is no new effect
+        if session.unnamed:
+            candidates = [f for f in candidates if f.theta.get("kind") not in ("step", "pulse")]
         if any(f.id in _COMMON for f in session.findings):
             candidates = [f for f in candidates if f.id not in _COMMON or f.nats > 40]
         candidates = [f for f in candidates if f.start >= begin - 0.02 * session.recording.time[-1]]
@@ -217,6 +227,7 @@ def _settle(result, late):
     for finding in [*keep]:
         replay._take_out(finding)
     replay.findings = keep
+    replay.unnamed = session.unnamed
     result.session = replay
     result.findings = sorted(keep, key=lambda f: -f.nats)
     for finding in result.findings:

@@ -104,6 +104,16 @@ class Session:
         self.force = recording.force  # as the electrodes follow it
         self._timelines = {}
         self._view = None
+        self.unnamed = []  # what was seen and given up: texts
+
+    def give_up(self, findings, text):
+        """Takes findings back: what they describe belongs to something that has no name here."""
+        keep = [f for f in self.findings if f not in findings]
+        self.findings, self.counts, self.force = [], self.recording.electrodes.copy(), self.recording.force
+        self._timelines, self._view = {}, None
+        self.unnamed.append(text)
+        for finding in keep:
+            self.accept(finding)
 
     def force_view(self):
         """ForceView of the corrected counts, or None where force and electrodes are not related."""
@@ -126,6 +136,12 @@ class Session:
         if key not in self._timelines:
             self._timelines[key] = self._make(rows, self.counts)
         return self._timelines[key]
+
+    @property
+    def known_jumps(self):
+        """Times [s] of the jumps found so far, swaps among them."""
+        steps = [f for f in self.findings if f.id == "swap" or f.theta.get("kind") in ("step", "pulse") or f.id == "gain"]
+        return [t for f in steps for t in (f.start, f.end) if 0 < t < self.recording.time[-1]]
 
     def accept(self, finding):
         """Takes a finding out of the counts."""

@@ -52,6 +52,13 @@ def cells(session) -> list:
 
 def remainder(session) -> dict:
     """Describes what the amended model leaves: dict with `significant`, `text` and shares."""
+    out = _remainder(session)
+    if session.unnamed:
+        out.update(significant=True, text="; ".join([*session.unnamed, *([out["text"]] if out["significant"] else [])]))
+    return out
+
+
+def _remainder(session):
     line, deviation, inside = _line(session)
     slope = np.median(session.counts * (1 - session.counts / 4095), axis=0)[line.used]
     if not line.loaded:
@@ -103,8 +110,8 @@ def _loaded(line, deviation, slope):
         size = np.array([np.sqrt((residual[p, k] ** 2).mean()) for p in parts])
         ratio = np.log(np.maximum(size, line.noise[k])) - np.log(np.maximum(activity, 3 * line.noise[k]))
         spread = 1.4826 * np.median(np.abs(ratio - np.median(ratio))) + 0.15
-        odd = (ratio - np.median(ratio) > 5 * spread) & (size > 4 * np.median(size))
-        if (odd[1:] & odd[:-1]).any():
+        odd = (ratio - np.median(ratio) > 6 * spread) & (size > 5 * np.median(size))
+        if (odd[2:] & odd[1:-1] & odd[:-2]).any():
             where = np.flatnonzero(odd)
             start, end = line.time[parts[where[0]][0]], line.time[parts[where[-1]][-1]]
             guilty.append((size[odd].max() * slope[k], f"e{line.used[k] + 1} departs from the other electrodes by {size[odd].max() * slope[k]:.0f} counts"

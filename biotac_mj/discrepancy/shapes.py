@@ -79,15 +79,20 @@ def correlation_length(residual):
     return float(1 + 2 * rho[1 : stop[0] if len(stop) else len(rho)].sum())
 
 
-def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None, tests=1, floor=0.0) -> ShapeFit | None:
+def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None, tests=1, floor=0.0, through=None) -> ShapeFit | None:
     """The best shape, or None where the constant does as well.
 
     Args:
       t: (n,) [s]; x: (n,). kinds: which shapes. onsets: times to try [s], None a grid over the record.
       tests: how many series are looked at: its logarithm is part of the price. floor: noise of x known beforehand.
+      through: a linear function that x has been through and shapes have to go through, such as `Timeline.explained_by_others`.
     """
     n, length = len(t), t[-1] - t[0]
     labels, columns, power = _dictionary(n, float(t[0]), float(t[-1]), tuple(kinds), None if onsets is None else tuple(onsets))
+    if through is not None:
+        columns = through(columns)
+        columns = columns - columns.mean(0)
+        power = np.maximum((columns**2).sum(0), 0.02 * power)  # a shape that the others mimic is not found here
     centred = x - x.mean()
     total = float(centred @ centred)
     if total <= 0:
@@ -105,9 +110,10 @@ def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None
             if not group:
                 continue
             i = group[int(np.argmax(drop[group]))]
-            onset, tau, end = _polish(kind, t, centred, labels[i], length)
+            onset, tau, end = _polish(kind, t, centred, labels[i], length, through)
             shape = evaluate_shape(kind, t, onset, tau, end)
-            design = np.stack([np.ones(n), shape], axis=1)
+            seen = shape if through is None else through(shape)
+            design = np.stack([np.ones(n), seen], axis=1)
             (level, amplitude), *_ = np.linalg.lstsq(design, x, rcond=None)
             residual = x - design @ [level, amplitude]
             rss = float(residual @ residual) + n * floor**2 * 1e-3
@@ -118,11 +124,11 @@ def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None
                 chosen = ShapeFit(kind, onset, tau, end, amplitude, level, nats, np.sqrt(rss / n), neff, 1 - rss / total, {})
     if chosen is None or chosen.nats <= 0:
         return None
-    chosen.interval = _intervals(t, x, chosen)
+    chosen.interval = _intervals(t, x, chosen, through)
     return chosen
 
 
-def _polish(kind, t, x, label, length):
+def _polish(kind, t, x, label, length, through=None):
     """Local refinement of onset, tau, end by coordinate search on the explained variance."""
     _, onset, tau, end = label
     step = t[1] - t[0]
@@ -133,6 +139,7 @@ def _polish(kind, t, x, label, length):
 
     def explained(v):
         c = evaluate_shape(kind, t, v["onset"], v["tau"], v["end"])
+        c = c if through is None else through(c)
         c = c - c.mean()
         power = c @ c
         return (c @ x) ** 2 / power if power > 1e-9 else 0.0
@@ -160,7 +167,7 @@ def _polish(kind, t, x, label, length):
     return values["onset"], values["tau"], values["end"]
 
 
-def _intervals(t, x, fit):
+def _intervals(t, x, fit, through=None):
     """95 % intervals by linearisation, the residual's correlation in its scale; a step's onset by its profile."""
     base = {"amplitude": fit.amplitude, "tau": fit.tau, "onset": fit.onset, "end": fit.end}
     names = {"exponential": ["amplitude", "tau"], "ramp": ["amplitude"], "step": ["amplitude"], "pulse": ["amplitude"]}[fit.kind]
@@ -175,6 +182,8 @@ def _intervals(t, x, fit):
             side.append(v["amplitude"] * evaluate_shape(fit.kind, t, v["onset"], v["tau"], v["end"]))
         columns.append((side[0] - side[1]) / (2 * h))
     design = np.stack(columns, axis=1)
+    if through is not None:
+        design[:, 1:] = through(design[:, 1:])
     scale = np.maximum(np.linalg.norm(design, axis=0), 1e-30)
     normal = np.linalg.pinv((design / scale).T @ (design / scale), rcond=1e-10)
     sd = fit.sd * np.sqrt(np.diag(normal) * len(t) / fit.neff) / scale

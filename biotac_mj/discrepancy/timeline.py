@@ -53,8 +53,13 @@ class Timeline:
         effective = max(1.0, self.width * (1 - recording.repeated.mean()))
         self.noise = np.maximum(sample, 1e-5) / np.sqrt(effective)
         self._fill()
+        if self.width > 2:  # noise that is not white is larger in means than its samples say
+            self.noise = np.maximum(self.noise, noise_level(self.value, None, 1e-6))
+        self._departures = {}
         self.covariance = self._fast_covariance()
-        activity = np.sqrt(np.diag(self.covariance)) / self.noise
+        c = len(self.used)
+        apart = np.eye(c) - 1 / c  # what all electrodes do alike is no load: a contact raises some and lowers others
+        activity = np.sqrt(np.diag(apart @ self.covariance @ apart)) / self.noise
         self.loaded = bool(np.median(np.sort(activity)[-6:]) > 5)
 
     def _fill(self):
@@ -92,18 +97,63 @@ class Timeline:
         scale = pattern @ q
         return (self.value - self.value.mean(0)) @ q / scale, 1 / np.sqrt(scale)
 
-    def predicted(self, k):
-        """(m,) deviation of electrode `used[k]` from its mean as the others predict it [ln Z]."""
-        unit = np.zeros(len(self.used))
-        unit[k] = 1
-        return self.value[:, k] - self.value[:, k].mean() - self.amplitude(unit)[0]
+    def jumps(self, known=(), seconds=0.6):
+        """Changes of level within a bin: rows (q,) of bins, change (q, c) of means over `seconds` before and after [ln Z], bins on a side.
+
+        Bins near `known` times [s] of jumps already found are left out.
+        """
+        w = max(2, int(round(seconds / self.period)))
+        n, c = self.value.shape
+        if n < 6 * w:
+            return np.zeros(0, int), np.zeros((0, c)), w
+        total = np.concatenate([np.zeros((1, c)), np.cumsum(self.value, axis=0)])
+        at = np.arange(w, n - w - 1)
+        for time in known:
+            at = at[np.abs(self.time[at] - time) > (w + 2) * self.period]
+        return at, (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w, w  # bin `at` itself may be cut in two
+
+    def jump_at(self, row, known=(), seconds=6.0):
+        """(c,) change of level at bin `row`, a straight line on either side taken into account [ln Z]."""
+        w = int(round(seconds / self.period))
+        first, last = max(row - w, 0), min(row + w + 1, len(self.time))
+        for time in known:
+            other = int(np.argmin(np.abs(self.time - time)))
+            if first <= other < row:
+                first = other + 2
+            elif row < other < last:
+                last = other - 1
+        rows = np.array([i for i in range(first, last) if abs(i - row) > 0])
+        design = np.stack([np.ones(len(rows)), rows - row, (rows > row).astype(float)], axis=1)
+        if (rows > row).sum() < 3 or (rows < row).sum() < 3:
+            return np.zeros(self.value.shape[1])
+        return np.linalg.lstsq(design, self.value[rows], rcond=None)[0][2]
+
+    def explained_by_others(self, k):
+        """A function that takes out of (m,) or (m, q) what the other electrodes can say about electrode `used[k]`; loaded only.
+
+        Ridge regression on the others and on squares and products of their six principal components, because the place of a contact bends
+        what two electrodes have to do with each other. What an effect does must go through the same function before it is fitted.
+        """
+        if k not in self._departures:
+            x = np.delete(self.value, k, axis=1)
+            x = x - x.mean(0)
+            u, s, _ = np.linalg.svd(x, full_matrices=False)
+            keep = s > 1e-9 * s[0]
+            score = u[:, :6] * np.sqrt(len(x))
+            i, j = np.triu_indices(score.shape[1])
+            a = np.concatenate([np.ones((len(x), 1)), u[:, keep] * np.sqrt(len(x)), score[:, i] * score[:, j]], axis=1)
+            weight = np.concatenate([[0.0], np.mean(self.noise**2) / np.maximum(s[keep] ** 2 / len(x), 1e-12), np.full(len(i), 0.02)])
+            inverse = np.linalg.inv(a.T @ a / len(x) + np.diag(weight)) @ a.T / len(x)
+            self._departures[k] = a, inverse
+        a, inverse = self._departures[k]
+        return lambda y: y - a @ (inverse @ y)
 
 
-def noise_level(counts, repeated=None):
+def noise_level(counts, repeated=None, least=0.05):
     """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the quietest quarter of the record."""
     x = counts if repeated is None else counts[~repeated]
     d = np.diff(x, n=2, axis=0) / np.sqrt(6)
     size = max(20, len(d) // 60)
     k = max(1, len(d) // size)
     blocks = (d[: k * size].reshape(k, -1, d.shape[1]) ** 2).mean(1)
-    return np.maximum(np.sqrt(np.quantile(blocks, 0.25, axis=0)), 0.05)
+    return np.maximum(np.sqrt(np.quantile(blocks, 0.25, axis=0)), least)
