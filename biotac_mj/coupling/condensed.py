@@ -24,7 +24,7 @@ class CondensedStepper(FemStepper):
         super().__init__(config, geometry, geoms)
         g = len(geoms)
         sizes = {
-            "head": 6,
+            "head": 10,
             "geom_pos": 3 * g,
             "geom_mat": 9 * g,
             "motion": 3 * g,
@@ -69,7 +69,8 @@ class CondensedStepper(FemStepper):
         )
 
     def _read(self, state) -> Memory:
-        started, pressure, bulge, growth, softening, swelling = self._part(state, "head").tolist()
+        head = self._part(state, "head")
+        started, pressure, bulge, growth, softening, swelling = head[:6].tolist()
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         n, k = int(forces[0]), int(contacts[0])
         return Memory(
@@ -82,6 +83,8 @@ class CondensedStepper(FemStepper):
             growth=growth,
             softening=softening,
             swelling=swelling,
+            after=head[6:8].copy(),
+            drift=head[8:].copy(),
             geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
             geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
             motion=self._part(state, "motion").reshape(-1, 3),
@@ -96,7 +99,7 @@ class CondensedStepper(FemStepper):
                 "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
             )
         head = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening, memory.swelling
-        self._part(state, "head")[:] = head
+        self._part(state, "head")[:] = *head, *memory.after, *memory.drift
         self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
         self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
         self._part(state, "motion")[:] = memory.motion.ravel()

@@ -98,6 +98,45 @@ def _core_clearance(
     clearance_out[g] = least
 
 
+@wp.kernel
+def _strain(
+    # In:
+    count: wp.array(dtype=int),
+    number: wp.array(dtype=int),
+    force: wp.array(dtype=real),
+    outer: wp.array(dtype=int),
+    opposite: wp.array(dtype=int),
+    rest: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    strain_out: wp.array(dtype=real),
+):
+    """Largest displacement of the count[0] numbered outer nodes, mean square spread of their forces, share by which the wall is thinned.
+
+    Means are weighted with the squares of the forces, so that a node that begins to touch changes nothing at once.
+    """
+    total = real(0.0)
+    mean = vec3()
+    for k in range(count[0]):
+        w = force[k] * force[k]
+        total += w
+        mean += w * rest[outer[number[k]], 0]
+    mean = mean / total
+    depth = real(0.0)
+    spread = real(0.0)
+    thinned = real(0.0)
+    for k in range(count[0]):
+        w = force[k] * force[k] / total
+        i = outer[number[k]]
+        j = opposite[number[k]]
+        depth = wp.max(depth, wp.length(x[i, 0] - rest[i, 0]))
+        spread += w * wp.length_sq(rest[i, 0] - mean)
+        thinned += w * (real(1.0) - wp.length(x[i, 0] - x[j, 0]) / wp.length(rest[i, 0] - rest[j, 0]))
+    strain_out[0] = depth
+    strain_out[1] = spread
+    strain_out[2] = wp.max(thinned, real(0.0))
+
+
 _compliances = weakref.WeakKeyDictionary()
 
 
@@ -164,10 +203,7 @@ class CondensedSkin:
         self._prepare_liquid()
         self._systems, self._fields, self._last_system = {}, {}, None
         self._away32 = self._away.astype(np.float32)
-        # what is across the wall from each outer node
-        inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(model.fixed, g.outer_face)
-        self.opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
-        self.wall = self.rest[self._outer] - self.rest[self.opposite]
+        self._prepare_strain()
 
     # --- preparation -------------------------------------------------------------------------------------------------------------
 
@@ -191,6 +227,27 @@ class CondensedSkin:
 
     def _record(self, kernel, inputs, outputs, dim=1):
         return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+
+    def _prepare_strain(self):
+        """What `strain` needs: each outer node's nearest across the wall."""
+        g = self.model.geometry
+        inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(self.model.fixed, g.outer_face)
+        opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
+        count, number = wp.zeros(1, dtype=int, device="cpu"), wp.zeros(3 * len(self._outer), dtype=int, device="cpu")
+        force, out = wp.zeros(3 * len(self._outer), dtype=real, device="cpu"), wp.zeros(3, dtype=real, device="cpu")
+        outer, opposite = (wp.array(a, dtype=int, device="cpu") for a in (self._outer, opposite))
+        rest = wp.array(self.rest[:, None], dtype=vec3, device="cpu")
+        self._touched, self._touched_force, self._touched_count, self._strains = number.numpy(), force.numpy(), count.numpy(), out.numpy()
+        self._measure_strain = self._record(_strain, [count, number, force, outer, opposite, rest, self._x_wp], [out])
+
+    def strain(self, number, force):
+        """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces (n,), as the skin is now."""
+        n = len(number)
+        if not n:
+            return 0.0, 0.0, 0.0
+        self._touched[:n], self._touched_force[:n], self._touched_count[0] = number, force, n
+        self._measure_strain()
+        return self._strains.tolist()
 
     def _prepare_liquid(self):
         m = self.model

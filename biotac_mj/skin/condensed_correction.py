@@ -32,8 +32,9 @@ class Correction:
 
     def softening(self, depth, spread, squeezed):
         """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed share."""
-        h = self.depth * (1 + spread / self.width**2)
-        return (1 + depth * self.most / (depth + h * self.most)) / (1 + self.squeeze * squeezed**2)
+        wide = 1 + spread / self.width**2
+        h = self.depth * wide
+        return (1 + depth * self.most / (depth + h * self.most)) / (1 + self.squeeze * math.sqrt(wide) * squeezed**2)
 
     def swelling(self, pressure, youngs_modulus):
         """c at a pressure above that at rest [Pa]."""
@@ -47,7 +48,7 @@ class Correction:
 
 _FITTED = {
     "corotational": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 0.0, (0.25, 0.4), 0.5),
-    "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 6.0, (0.4, 0.4999), 0.45),
+    "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 5.3, (0.4, 0.4999), 0.45),
     "linear": Correction(math.inf, 1.0, 1.0, math.inf, 0.0, (0.0, 0.4), 1.0),
 }
 

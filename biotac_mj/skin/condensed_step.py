@@ -25,7 +25,7 @@ class Memory:
       force, change: (n,) forces and by how much they changed in the last step [N].
       pressure: of the liquid above that at rest [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it
         grew in the last step.
-      softening: s. swelling: c.
+      softening, swelling: s and c. after: (2,) what they are where the step left the skin, drift: (2,) by how much that grew in it.
       geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how far they moved in it [m].
       contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
     """
@@ -39,6 +39,8 @@ class Memory:
     growth: float
     softening: float
     swelling: float
+    after: np.ndarray
+    drift: np.ndarray
     geom_pos: np.ndarray
     geom_mat: np.ndarray
     motion: np.ndarray
@@ -48,7 +50,7 @@ class Memory:
     def rest(cls, ngeom):
         none = np.zeros(0)
         pos, mat = np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3))
-        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, 1.0, pos, mat, pos, np.zeros((0, 5)))
+        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, 1.0, np.ones(2), np.zeros(2), pos, mat, pos, np.zeros((0, 5)))
 
 
 @dataclasses.dataclass
@@ -85,7 +87,8 @@ class Step:
         self.bulge, self.pressure = memory.bulge + self.repeat * memory.growth, memory.pressure
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
-        self.softening, self.swelling = self._soften(), self._swell()
+        self.softening, self.swelling = (memory.after + self.repeat * memory.drift).tolist()
+        self.after, self.squeezed = np.ones(2), 0.0
         self._choose()
 
     def _choose(self):
@@ -151,28 +154,14 @@ class Step:
         """Stiffness of what touches at the last evaluation."""
         return Springs(self.skin.faces, self.closed, len(self.inner))
 
-    def _soften(self):
-        """s of the nodes that touched, from their displacements and how far their forces are spread."""
+    def _correct(self):
+        """s and c (2,) of the skin as it is."""
         s = self.skin
         outer = self.coordinate < 3 * len(s._outer)
-        touched = self.coordinate[outer] // 3
-        self.squeezed = 0.0
-        if not len(touched):
-            return 1.0
-        node, across = s._outer[touched], s.wall[touched]
-        moved, weight = self.u[node], self.force[outer] ** 2
-        weight /= weight.sum()
-        x = s.rest[node]
-        x = x - weight @ x
-        now = across + moved - self.u[s.opposite[touched]]
-        thinned = 1 - np.sqrt(np.einsum("ij,ij->i", now, now) / np.einsum("ij,ij->i", across, across))
-        self.squeezed = max(float(weight @ thinned), 0.0)
-        depth = math.sqrt(float(np.einsum("ij,ij->i", moved, moved).max()))
-        return s.correction.softening(depth, float(weight @ np.einsum("ij,ij->i", x, x)), self.squeezed)
-
-    def _swell(self):
-        """c at the liquid's pressure."""
-        return self.skin.correction.swelling(self.pressure, self.skin.model.material.youngs_modulus)
+        depth, spread, squeezed = s.strain(self.coordinate[outer] // 3, self.force[outer])
+        self.squeezed = squeezed
+        softening = s.correction.softening(depth, spread, squeezed)
+        return np.array([softening, s.correction.swelling(self.pressure, s.model.material.youngs_modulus)])
 
     def run(self):
         """Newton's method, repeated until the cavity's exact volume agrees."""
@@ -196,15 +185,16 @@ class Step:
             self.pressure = -self.share * float(self.along @ f + self.bulge) if self.a is not None else 0.0
             self._place(s._recover(self.coordinate, self.force, self.pressure, self.softening, self.swelling))
             s._measure_volume()
-            softening, swelling = self._soften(), self._swell()
-            settled = abs(softening - self.softening) < _SETTLED * softening and abs(swelling - self.swelling) < _SETTLED
+            self.after = self._correct()
+            settled = bool((np.abs(self.after - (self.softening, self.swelling)) < _SETTLED).all())
             if self.a is not None:
                 bulge = float(s._share.sum()) - s._cavity - float(np.vdot(s._gradient, self.u))
                 settled &= self.share * abs(bulge - self.bulge) < _SETTLED * abs(self.pressure) + 1.0
                 self.bulge = bulge
             if settled or number == _PASSES - 1:
                 break
-            self.softening, self.swelling = softening, swelling
+            f *= self.softening / self.after[0]
+            self.softening, self.swelling = self.after.tolist()
 
     def _at_candidates(self, force):
         """Values (n,) of self.coordinate at the candidates; zero elsewhere."""
@@ -284,6 +274,8 @@ class Step:
             self.bulge - self.memory.bulge if len(self.force) else 0.0,
             self.softening,
             self.swelling,
+            self.after,
+            self.after - self.memory.after if len(self.memory.force) else np.zeros(2),
             np.array(pos),
             np.array(mat),
             self.motion,

@@ -17,6 +17,7 @@ __all__ = ["CoreContact", "Meeting"]
 
 wp.set_module_options({"enable_backward": False})
 
+CONCAVE, SLACK = wp.constant(100.0), wp.constant(1e-4)  # hollows of the core are wider than 5 mm [1/m]; gradients are averages [m]
 _PROBE = 2e-4  # half a step of the differences that give the directions, half a cell of the core's grid [m]
 
 
@@ -43,6 +44,15 @@ def _measure_face(
     return least
 
 
+@wp.func
+def _may_be_near(t: wp.vec3i, core: Geoms, x: wp.array2d(dtype=vec3), reach: real):
+    """Whether a face can be nearer to the core than the reach, from one distance (which may change a little faster than its place does)."""
+    center = (x[t[0], 0] + x[t[1], 0] + x[t[2], 0]) / real(3.0)
+    radius = wp.max(wp.length_sq(x[t[0], 0] - center), wp.max(wp.length_sq(x[t[1], 0] - center), wp.length_sq(x[t[2], 0] - center)))
+    far = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], center)
+    return far < reach + real(1.2) * wp.sqrt(radius)
+
+
 @wp.kernel
 def _measure(
     # In:
@@ -65,6 +75,7 @@ def _meet(
     # In:
     node: wp.array(dtype=int),
     node_gap: wp.array(dtype=real),
+    away: wp.array(dtype=vec3),
     start: wp.array(dtype=int),
     incident: wp.array(dtype=int),
     rest_gap: wp.array(dtype=real),
@@ -80,21 +91,28 @@ def _meet(
 ):
     """Marks with 2 the faces that are nearer to the core than a share of their displacement.
 
-    What has moved by m and gets nearer by a share of m cannot touch if it began further away than both.
+    What has moved by m and gets nearer by a share of m cannot touch if it began further away than both; nor if it went along the core:
+    the distance to a convex body is convex, so it is at least what its gradient at rest says, and little less where the core is hollow.
     """
     most = real(1.0) + share[0]
     for i in range(node.shape[0]):
         n = node[i]
-        if most * wp.length(x[n, 0] - rest[n, 0]) > node_gap[i]:
+        u = x[n, 0] - rest[n, 0]
+        length = wp.length(u)
+        moved = most * length
+        left = node_gap[i] + wp.dot(u, away[i]) - real(CONCAVE) * length * length - real(SLACK)
+        if moved > node_gap[i] and left < share[0] * length:
             for k in range(start[i], start[i + 1]):
                 f = incident[k]
-                if seen_out[f] == 0:
+                if seen_out[f] == 0 and moved > rest_gap[f]:
                     seen_out[f] = 1
                     t = face[f]
-                    moved = wp.max(wp.length(x[t[0], 0] - rest[t[0], 0]), wp.length(x[t[1], 0] - rest[t[1], 0]))
-                    moved = wp.max(moved, wp.length(x[t[2], 0] - rest[t[2], 0]))
-                    if most * moved > rest_gap[f]:
-                        if _measure_face(f, face, sample, core, x, distance_out) < share[0] * moved:
+                    u0 = wp.length_sq(x[t[0], 0] - rest[t[0], 0])
+                    u1 = wp.length_sq(x[t[1], 0] - rest[t[1], 0])
+                    u2 = wp.length_sq(x[t[2], 0] - rest[t[2], 0])
+                    reach = share[0] * wp.sqrt(wp.max(u0, wp.max(u1, u2)))
+                    if _may_be_near(t, core, x, reach):
+                        if _measure_face(f, face, sample, core, x, distance_out) < reach:
                             seen_out[f] = 2
 
 
@@ -170,7 +188,7 @@ class CoreContact:
         order = np.argsort(self._corner.ravel(), kind="stable")
         order = order[self._corner.ravel()[order] >= 0]
         start = np.searchsorted(self._corner.ravel()[order], np.arange(len(self.node) + 1))
-        constants = [(self.node, int), (node_gap[:-1], real), (start, int), (order // 3, int), (rest_gap, real)]
+        constants = [(self.node, int), (node_gap[:-1], real), (self.direction, vec3), (start, int), (order // 3, int), (rest_gap, real)]
         constants = [wp.array(array, dtype=dtype, device="cpu") for array, dtype in constants]
         still = wp.array(rest[:, None], dtype=vec3, device="cpu")
         share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
