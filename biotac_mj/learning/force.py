@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from scipy.signal import lfilter
 
-from .recording import log_impedance
+from .recording import counts_of, log_impedance
 
 __all__ = ["ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
 
@@ -66,9 +66,10 @@ class _Candidate:
     shared: bool
     products: int
     strength: float
+    raw: bool = False
 
     def text(self):
-        words = ["ln Z"]
+        words = ["counts" if self.raw else "ln Z"]
         if self.window:
             words.append(f"averages over {', '.join(map(str, self.window))} rows")
         if self.products:
@@ -83,10 +84,15 @@ def _candidates():
         for warm_up in _WARM_UP:
             for shared in (False, True) if warm_up else (False,):
                 yield _Candidate(window, warm_up, shared, products, strength)
+    for window, warm_up, strength in itertools.product(_WINDOWS, _WARM_UP, _RIDGE):
+        yield _Candidate(window, warm_up, False, 0, strength, raw=True)
 
 
 def _kinds(candidates):
-    return [[c for c in candidates if c.products == products] for products in _PRODUCTS]
+    kinds = {}
+    for c in candidates:
+        kinds.setdefault((c.products, c.raw, bool(c.warm_up)), []).append(c)
+    return list(kinds.values())
 
 
 def _features(log_z, force, part, candidate):
@@ -98,6 +104,8 @@ def _features(log_z, force, part, candidate):
         rise = 1 - np.exp(-np.arange(n) / tau)
         if candidate.shared:
             log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
+    if candidate.raw:
+        log_z = counts_of(log_z) / 1000
     columns = [log_z, *(causal_average(log_z, tau) for tau in candidate.window)]
     if candidate.products:
         centred = log_z - log_z[part].mean(0)
@@ -149,7 +157,7 @@ def fit_force(counts, force, ntrain, seed=0, network=True, progress=None) -> For
                 error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
         if progress:
             progress()
-    # one of each degree of flexibility: their mean is steadier than any of them where the recording goes on to something new
+    # one of each degree of flexibility, with and without warm-up: their mean is steadier than any of them where something new comes
     best = [[min(kin, key=lambda c: np.mean(error[c], axis=0)[k]) for kin in _kinds(candidates)] for k in range(3)]
     prediction = _mean_of(best, log_z, force, slice(0, ntrain))
     base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]

@@ -46,7 +46,7 @@ def evaluate_recording(
         if share > 0.001
     ]
     with tqdm(
-        total=(3 if network else 1) + (66 if recording.force is not None else 0), disable=not progress, desc="evaluate", leave=False
+        total=(3 if network else 1) + (78 if recording.force is not None else 0), disable=not progress, desc="evaluate", leave=False
     ) as bar:
         reconstruction, traces = _reconstruction(recording.counts, ntrain, seed, network, bar)
         result = {

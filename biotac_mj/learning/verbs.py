@@ -1,11 +1,52 @@
 """The verbs `biotac train`, `biotac evaluate` and `biotac contact-patch`: their arguments here, their work beside it."""
 
+import argparse
+
 __all__ = ["add_verbs"]
 
 
 def add_verbs(verbs, verb):
     """Adds the three to argparse's subparsers; verb(verbs, name, run, text) makes one."""
+    _add_train(verbs, verb)
     _add_evaluate(verbs, verb)
+    _add_contact_patch(verbs, verb)
+
+
+def _add_train(verbs, verb):
+    v = verb(verbs, "train", _train, "Train and test all models on a data set; goes on where it was interrupted.")
+    v.add_argument("set", metavar="SET", help="data set with labelled interactions, made by `biotac generate`")
+    v.add_argument("--out", default="out/train", metavar="DIR", help="folder of predictions, errors and weights")
+    v.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of divisions, weights and batches")
+    v.add_argument("--splits", nargs="+", default=["trajectory", "ring_7mm"], metavar="NAME",
+                   help="trajectory (72/18/10 %% of interactions), or the object that training never sees, several with +")  # fmt: skip
+    v.add_argument("--only", nargs="+", metavar="NAME", help="of our models (default: all)")
+    v.add_argument(
+        "--paper", action=argparse.BooleanOptionalAction, default=True, help="latent projection and PointNet++; slow without a GPU"
+    )
+    v.add_argument("--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/learning.md)")
+    v.add_argument("--steps", type=int, help="of each training (default: the config's)")
+    v.add_argument("--limit", type=int, help="interactions to read, the first ones")
+    v.add_argument("--device", default="cpu", help="of torch: cpu, cuda")
+    v.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _train(args):
+    import dataclasses
+    import json
+    import pathlib
+
+    from .config import LearningConfig
+    from .experiment import train_all
+
+    settings = json.loads(pathlib.Path(args.config).read_text()) if args.config else {}
+    unknown = set(settings) - {f.name for f in dataclasses.fields(LearningConfig)}
+    if unknown:
+        raise ValueError(f"{args.config} sets {', '.join(sorted(unknown))}: LearningConfig has no such settings")
+    if args.steps:
+        settings |= {"steps": args.steps, "mesh_steps": max(1, int(0.7 * args.steps))}
+    train_all(args.set, args.out, args.seeds, args.splits, LearningConfig(**settings), args.device, args.paper, args.only, args.limit,
+              progress=not args.quiet)  # fmt: skip
+    print(f"written: {args.out}; judge it with `biotac evaluate {args.out}`")
 
 
 def _add_evaluate(verbs, verb):
@@ -15,6 +56,7 @@ def _add_evaluate(verbs, verb):
         _evaluate,
         "Judge learned models: trained ones on a data set, or electrode code and force regression on a recording of a real sensor.",
     )
+    v.add_argument("folder", nargs="?", metavar="DIR", help="what `biotac train` wrote")
     v.add_argument("--electrodes", metavar="FILE", help="a recording: text, 19 columns of raw counts e1..e19; reconstruction is judged")
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N]; force from electrodes is judged too")
     v.add_argument("--fraction", type=float, default=0.7, help="of the recording's rows, in time, that train")
@@ -26,8 +68,37 @@ def _add_evaluate(verbs, verb):
 def _evaluate(args):
     if args.electrodes:
         _evaluate_recording(args)
+    elif args.folder:
+        _evaluate_models(args)
     else:
-        raise ValueError("nothing to evaluate: give --electrodes FILE (and --force FILE)")
+        raise ValueError("nothing to evaluate: give a folder that `biotac train` wrote, or --electrodes FILE (and --force FILE)")
+
+
+def _evaluate_models(args):
+    from .report import evaluate_models, table
+
+    print(table(evaluate_models(args.folder, args.json)))
+
+
+def _add_contact_patch(verbs, verb):
+    v = verb(verbs, "contact-patch", _contact_patch, "Estimate how the skin is deformed and where it is touched, from electrode counts.")
+    v.add_argument("source", metavar="FILE", help="text of 19 columns of raw counts e1..e19, or readings.csv of `biotac press`")
+    v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
+    v.add_argument("--row", type=int, default=-1, help="which row to draw")
+    v.add_argument("--skin", default="default", help="mesh that the weights were trained on")
+    v.add_argument(
+        "--weights", metavar="FILE", help="inverse weights (default: those that come with the package, trained on synthetic data)"
+    )
+    v.add_argument("--out", default="out/contact", metavar="DIR", help="folder of contact.png and contact.json")
+
+
+def _contact_patch(args):
+    from .patch import contact_patch
+
+    one = contact_patch(args.source, args.out, args.tare, args.row, args.skin, args.weights)
+    x, y, z = one["centre_mm"]
+    print(f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, force about {one['force']:.2f} N")
+    print(f"deepest {one['deepest_mm']:.2f} mm; written: {args.out}/contact.png, contact.json (all rows)")
 
 
 def _evaluate_recording(args):

@@ -1,0 +1,131 @@
+"""A data set as the tensors that training works on."""
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from ..sensor.channels import CHANNELS
+from .recording import log_impedance
+
+__all__ = ["Arrays", "load_arrays"]
+
+
+@dataclasses.dataclass
+class Arrays:
+    """All time steps of a set that converged, n of them, on one device.
+
+    Attributes:
+      field: (n, nvert, 3) float16 displacements [mm].
+      owner: (n,) number of the interaction; first: (n,) row of its first step; time: (n,) seconds since then.
+      objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
+      counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the interaction's first row.
+      simulated: (n, 19) counts of the simulation's own film.
+      force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N] on labelled rows, 0 elsewhere.
+      geometry: SkinGeometry. path: of the set.
+    """
+
+    field: torch.Tensor
+    owner: torch.Tensor
+    first: torch.Tensor
+    time: torch.Tensor
+    objects: np.ndarray
+    labelled: np.ndarray
+    counts: torch.Tensor
+    tare: torch.Tensor
+    simulated: torch.Tensor
+    force: torch.Tensor
+    outer: np.ndarray
+    geometry: object
+    path: str = ""
+
+    @property
+    def device(self):
+        return self.field.device
+
+    def rows(self, interactions, labelled=False) -> torch.Tensor:
+        """Rows of these interactions; with `labelled` only rows with measured counts, without each interaction's tare row.
+
+        Raises:
+          ValueError: there are none.
+        """
+        wanted = torch.zeros(len(self.objects), dtype=torch.bool, device=self.device)
+        wanted[torch.as_tensor(np.asarray(interactions), device=self.device)] = True
+        mask = wanted[self.owner]
+        if labelled:
+            mask &= torch.isfinite(self.counts).all(1) & (torch.arange(len(mask), device=self.device) != self.first)
+        rows = mask.nonzero()[:, 0]
+        if not len(rows):
+            raise ValueError(
+                f"a part of the split has no {'labelled ' if labelled else ''}time steps: more interactions with measured counts are "
+                "needed (biotac generate --labelled), or another object"
+            )
+        return rows
+
+    def change(self, rows):
+        """(k, 19) tared measured counts of rows."""
+        return self.counts[rows] - self.tare[rows]
+
+    def log_change(self, rows):
+        """(k, 19) d ln Z of rows against their tare."""
+        value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(self.tare[rows].double().cpu().numpy())
+        return torch.as_tensor(value, dtype=torch.float32, device=self.device)
+
+
+def load_arrays(path, device="cpu", limit=None) -> Arrays:
+    """Reads a set (docs/data.md).
+
+    Args:
+      path: folder or shard. device: of torch. limit: interactions to read, the first ones; None reads all.
+
+    Raises:
+      FileNotFoundError: no such set.
+      ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions without a row before touch.
+    """
+    from ..data import TactileSet
+
+    with TactileSet(path) as data:
+        for name in ("displacement", "counts", "measured_counts", "contact_force"):
+            if name not in data.columns:
+                raise ValueError(
+                    f"{path} has no column {name}, only {', '.join(data.columns)}: make a set with `biotac generate --labelled N`"
+                )
+        for file in data._files:
+            channels = [c.decode() if isinstance(c, bytes) else str(c) for c in file.attrs["channels"]]
+            if tuple(channels) != CHANNELS:
+                raise ValueError(f"{file.filename} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is needed")
+        stop = len(data) if limit is None else min(limit, len(data))
+        nstep = int(data.stop[stop - 1])
+        good = data["converged"][:nstep].astype(bool) if "converged" in data.columns else np.ones(nstep, bool)
+        good[data.start[:stop]] = True
+        keep = np.flatnonzero(good)
+        owner = np.repeat(np.arange(stop), data.stop[:stop] - data.start[:stop])[keep]
+        first = np.searchsorted(keep, data.start[:stop])[owner]
+        field = np.empty((len(keep), data.geometry.nvert, 3), np.float16)
+        for a in range(0, len(keep), 2048):
+            field[a : a + 2048] = 1e3 * data["displacement"][keep[a : a + 2048]]
+        if not np.isfinite(field).all():
+            raise ValueError(f"{path} holds displacements that are not finite: make the set again, or leave those interactions out")
+        measured = data["measured_counts"][keep][:, :19]
+        labelled = np.asarray(data.labelled[:stop])
+        force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
+        rows = np.flatnonzero(labelled[owner])
+        for a in range(0, len(rows), 2048):
+            force[rows[a : a + 2048]] = np.linalg.norm(data["contact_force"][keep[rows[a : a + 2048]]], axis=2)
+        time = data["time"][keep]
+        tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731
+        return Arrays(
+            field=tensor(field, torch.float16),
+            owner=tensor(owner, torch.int64),
+            first=tensor(first, torch.int64),
+            time=tensor(time - time[first], torch.float32),
+            objects=np.asarray(data.object[:stop]),
+            labelled=labelled,
+            counts=tensor(measured, torch.float32),
+            tare=tensor(measured[first], torch.float32),
+            simulated=tensor(data["counts"][keep][:, :19], torch.float32),
+            force=tensor(force, torch.float16),
+            outer=np.unique(data.geometry.outer_face),
+            geometry=data.geometry,
+            path=str(path),
+        )

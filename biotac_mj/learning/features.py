@@ -1,0 +1,155 @@
+"""What a field of displacements says about the electrodes: principal components, film and strain over each electrode, the mirror image."""
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
+from torch import nn
+
+__all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix"]
+
+# e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline (Lin et al. 2013).
+ELECTRODE_MIRROR = np.array([10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18])
+_RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
+_FILM = 50e-6  # [m] left where the skin lies on the core, as in sensor.film
+
+
+class Pod(nn.Module):
+    """Principal components of displacement fields (proper orthogonal decomposition), not centred: rest is zero.
+
+    Args:
+      nvert: nodes. modes: components.
+
+    Attributes:
+      basis: (3 nvert, modes) orthonormal. scale: (modes,) root mean square of each component.
+    """
+
+    def __init__(self, nvert, modes=128):
+        super().__init__()
+        self.nvert = nvert
+        self.register_buffer("basis", torch.zeros(3 * nvert, modes))
+        self.register_buffer("scale", torch.ones(modes))
+
+    @classmethod
+    def fit(cls, field, rows, modes=128, most=16000, seed=0):
+        """Fits to rows of a field (n, nvert, 3) [mm], at most `most` of them, by a randomised decomposition."""
+        generator = torch.Generator().manual_seed(seed)
+        if len(rows) > most:
+            rows = rows[torch.randperm(len(rows), generator=generator)[:most].to(rows.device)]
+        x = field[rows].flatten(1).float()
+        modes = min(modes, *x.shape)
+        torch.manual_seed(seed)
+        _, s, v = torch.svd_lowrank(x, q=min(modes + 32, *x.shape), niter=3)
+        out = cls(field.shape[1], modes).to(x.device)
+        out.basis.copy_(v[:, :modes]), out.scale.copy_(s[:modes] / len(rows) ** 0.5 + 1e-9)
+        return out
+
+    def forward(self, u):
+        """(n, modes) components, each of unit variance in training, of u (n, nvert, 3) [mm]."""
+        return u.flatten(1).to(self.basis.dtype) @ self.basis / self.scale
+
+    def decode(self, x):
+        """(n, nvert, 3) [mm] of components."""
+        return ((x * self.scale) @ self.basis.T).view(len(x), self.nvert, 3)
+
+
+class FilmFeatures(nn.Module):
+    """Film and strain of the inner skin over each electrode, for one head that all electrodes share.
+
+    The gap h of an inner node is its rest value plus the displacement along the direction away from the core (linearised), at least 50 um.
+    For Gaussian patches of three radii around each electrode: mean ln(h / h0), mean h0 / h - 1, displacement along the electrode's
+    normal and two tangents [mm]; the slopes of the displacement over the patch of the middle radius (6, the skin's local strain
+    and tilt); and mean ln(h / h0) near the four excitation electrodes and over the whole film (5), which all currents cross.
+
+    The second tangent points away from the midplane, so that an electrode and its mirror image see alike.
+
+    Args:
+      geometry: SkinGeometry.
+    """
+
+    count = 5 * len(_RADII) + 6 + 5
+
+    def __init__(self, geometry):
+        super().__init__()
+        from ..sensor.core_surface import CoreSurface
+        from ..sensor.film import _CORE_RADIUS, EXCITATION
+
+        node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
+        place = geometry.vert[node]
+        gap, foot, triangle = CoreSurface(geometry.core_vert, geometry.core_face).closest(place)
+        away = place - foot
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        core = CoreSurface(geometry.core_vert, geometry.core_face)
+        away = np.where(length > 1e-5, away / np.maximum(length, 1e-12), core.normal[triangle])
+        gap = np.maximum(gap, _FILM)
+        self.nvert = geometry.nvert
+        normal = geometry.electrode_normal
+        along = np.array([1.0, 0, 0]) - normal[:, :1] * normal
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        across = np.cross(normal, along)
+        side = np.where(np.abs(geometry.electrode_pos[:, 2]) < 5e-4, 1.0, np.sign(geometry.electrode_pos[:, 2]))
+        across *= (np.sign(across[:, 2]) * side)[:, None]
+        frame = np.stack([normal, along, across], 1)  # (19, 3, 3): rows are directions
+
+        # over an electrode: distance along the surface, from where its normal meets the skin; what lies across the finger is far in depth
+        offset = place[None] - geometry.electrode_pos[:, None]
+        height = np.einsum("enk,ek->en", offset, normal)
+        flat = np.linalg.norm(offset - height[..., None] * normal[:, None], axis=2)
+        facing = np.einsum("nk,ek->en", away, normal)
+        patches = []
+        for radius in _RADII:
+            w = np.exp(-0.5 * (flat / radius) ** 2) * (height > -1.5e-3) * np.clip(facing, 0, 1)
+            w = np.where(w.sum(1, keepdims=True) > 1e-6, w, np.exp(-0.5 * (np.linalg.norm(offset, axis=2) / radius) ** 2) + 1e-30)
+            patches.append(w / w.sum(1, keepdims=True))
+        w = patches[1]
+        tangent = np.einsum("enk,eak->ena", offset, frame[:, 1:])  # (19, n, 2)
+        centred = tangent - np.einsum("en,ena->ea", w, tangent)[:, None]
+        spread = np.einsum("en,ena,enb->eab", w, centred, centred)
+        slope = np.einsum("en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2)))  # (19, 2, n)
+        operators = [w_[:, None] for w_ in patches] + [1e-3 * slope]
+        operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
+        linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(19 * operator.shape[1] * 3, -1)
+
+        angle = np.array(EXCITATION)
+        seeds = np.stack([angle[:, 0], -_CORE_RADIUS * np.cos(angle[:, 1]), _CORE_RADIUS * np.sin(angle[:, 1])], 1)
+        g = np.exp(-0.5 * (np.linalg.norm(place[None] - seeds[:, None], axis=2) / 3e-3) ** 2)
+        g = np.concatenate([g, np.ones((1, len(node)))])
+        g /= g.sum(1, keepdims=True)
+        # each electrode sees those of its own side first
+        order = np.where(geometry.electrode_pos[:, 2:] * np.sign(seeds[1, 2]) > 0, [[1, 0, 3, 2, 4]], [[0, 1, 2, 3, 4]])
+        self.register_buffer("order", torch.as_tensor(order), persistent=False)
+        for name, value in (("linear", linear), ("away", away), ("patch", np.concatenate(patches)), ("whole", g), ("gap", 1e3 * gap)):
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+        self.register_buffer("node", torch.as_tensor(node), persistent=False)
+
+    def forward(self, u):
+        """(n, 19, count) of u (n, nvert, 3) [mm]."""
+        inner = u[:, self.node].float()
+        n = len(u)
+        linear = (inner.flatten(1) @ self.linear.T).view(n, 19, -1)
+        film = torch.clamp(self.gap + (inner * self.away).sum(2), min=1e3 * _FILM)
+        thinner = torch.log(film / self.gap)
+        inverse = self.gap / film - 1
+        local = torch.cat([thinner, torch.log1p(inverse.clamp(min=-0.9))], 0)
+        local = (local @ self.patch.T).view(2, n, len(_RADII), 19).permute(1, 3, 0, 2).flatten(2)
+        mean_inverse = torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), 19).transpose(1, 2)
+        local[..., len(_RADII) :] = mean_inverse  # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
+        whole = (thinner @ self.whole.T)[:, self.order]
+        return torch.cat([local, linear, whole], 2)
+
+
+def mirror_matrix(geometry):
+    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0, by the shape functions of the tetrahedra there."""
+    vert, tets = geometry.vert, geometry.tets
+    target = vert * [1, 1, -1]
+    corner = vert[tets]
+    inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
+    near = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
+    b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
+    b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
+    best = np.argmax(b.min(2), axis=1)
+    chosen = np.clip(b[np.arange(len(b)), best], 0, None)  # curved surfaces do not mirror onto themselves exactly
+    chosen /= chosen.sum(1, keepdims=True)
+    node = tets[near[np.arange(len(b)), best]]
+    rows = np.repeat(np.arange(len(vert)), 4)
+    return coo_matrix((chosen.ravel(), (rows, node.ravel())), shape=(len(vert), len(vert))).tocsr()

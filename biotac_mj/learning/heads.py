@@ -1,0 +1,86 @@
+"""Networks from features of the deformed skin to d ln Z of the electrodes, all of them exactly zero for a skin at rest."""
+
+import torch
+from torch import nn
+
+from .electrode_vae import mlp
+
+__all__ = ["LocalHead", "PodHead", "averages", "next_average"]
+
+
+class PodHead(nn.Module):
+    """Components of the mesh -> (n, 19).
+
+    Args:
+      modes: components. width: of the two hidden layers. dropout: behind each.
+
+    Attributes:
+      damp: (modes,) factors of the components: of unit variance all, the last ones are mostly noise.
+    """
+
+    def __init__(self, modes, width=128, dropout=0.1):
+        super().__init__()
+        self.register_buffer("damp", torch.ones(modes))
+        self.net = mlp([modes, 2 * width, width, 19], dropout)
+
+    def forward(self, local, pod):
+        """local is not used; pod (n, modes)."""
+        return self.net(pod * self.damp) - self.net(torch.zeros_like(pod[:1]))
+
+
+class LocalHead(nn.Module):
+    """One head for all electrodes on what lies over each, a linear part for each electrode, and a small residual that sees the whole mesh.
+
+    The head has 19 times the data that a head for each would have, and has no way to recognise an indenter.
+
+    Args:
+      features: per electrode. modes: components of the mesh that the residual sees. width: of its layers.
+    """
+
+    def __init__(self, features, modes, width=128, dropout=0.1):
+        super().__init__()
+        self.register_buffer("scale", torch.ones(features))
+        self.register_buffer("damp", torch.ones(modes))
+        self.embedding = nn.Parameter(0.1 * torch.randn(19, 8))
+        self.shared = mlp([features + 8, width, width, 1], dropout)
+        self.own = nn.Parameter(torch.zeros(19, features))
+        self.residual = mlp([modes, width, 19], 0.3)
+        with torch.no_grad():
+            self.residual[-1].weight.mul_(0.1)
+
+    def forward(self, local, pod):
+        """(n, 19) of local (n, 19, features) and pod (n, modes)."""
+        x = local / self.scale
+        return self._raw(x, pod) - self._raw(torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
+
+    def _raw(self, x, pod):
+        embedding = self.embedding.expand(len(x), -1, -1)
+        shared = self.shared(torch.cat([x, embedding], -1))[..., 0]
+        return shared + (x * self.own).sum(-1) + self.residual(pod * self.damp)
+
+
+def next_average(average, value, dt, tau):
+    """Causal exponential average after one more step of dt [s]; time constants tau, a tuple [s].
+
+    Args:
+      average: (len(tau), ...) before; value: (...) now.
+    """
+    return torch.stack([a + (1 - torch.exp(torch.as_tensor(-dt / t))) * (value - a) for a, t in zip(average, tau)])
+
+
+def averages(value, first, time, tau):
+    """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal averages, which begin at zero.
+
+    Args:
+      first: (n,) row of each row's interaction's start. time: (n,) [s] within it. tau: time constants [s].
+    """
+    position = torch.arange(len(value), device=value.device) - first
+    out = []
+    for t in tau:
+        average = torch.zeros_like(value)
+        for k in range(1, int(position.max()) + 1):
+            row = (position == k).nonzero()[:, 0]
+            share = 1 - torch.exp(-(time[row] - time[row - 1]) / t)
+            average[row] = average[row - 1] + share.view(-1, *[1] * (value.ndim - 1)) * (value[row] - average[row - 1])
+        out.append(value - average)
+    return torch.cat(out, -1)

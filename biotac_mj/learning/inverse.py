@@ -1,0 +1,123 @@
+"""From electrodes back to the skin: displacements, contact forces and the patch that touches."""
+
+import numpy as np
+import torch
+from torch import nn
+
+from .electrode_vae import mlp
+from .features import ELECTRODE_MIRROR
+from .fitting import cycle, root_mean_square
+from .recording import log_impedance
+
+__all__ = ["InverseHead", "contact_centre", "field_errors", "log_change_of", "patch_overlap", "train_inverse"]
+
+PATCH = 0.15  # of the largest nodal force: nodes above it are the patch
+
+
+class InverseHead(nn.Module):
+    """d ln Z of the 19 electrodes -> displacements of all nodes and contact force on the outer ones, through components of both.
+
+    Args:
+      pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes. width, dropout: of the network.
+    """
+
+    def __init__(self, pod, force_modes, nouter, width=256, dropout=0.2):
+        super().__init__()
+        self.pod = pod
+        self.modes = pod.basis.shape[1]
+        self.register_buffer("force_basis", torch.zeros(nouter, force_modes))
+        self.register_buffer("force_scale", torch.ones(force_modes))
+        self.register_buffer("scale", torch.ones(19))
+        self.net = mlp([19, width, width, self.modes + force_modes], dropout)
+
+    def codes(self, log_change):
+        """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z (n, 19)."""
+        out = self.net(log_change / self.scale) - self.net(torch.zeros_like(log_change[:1]))
+        return out.split([self.modes, self.force_basis.shape[1]], 1)
+
+    def forward(self, log_change):
+        """Displacements (n, nvert, 3) [mm] and norm of the contact force (n, nouter) [N], at least 0."""
+        u, f = self.codes(log_change)
+        field = (u * self.pod.scale[0]) @ self.pod.basis.T
+        return field.view(len(u), self.pod.nvert, 3), ((f * self.force_scale[0]) @ self.force_basis.T).clamp(min=0)
+
+
+def train_inverse(arrays, train, validation, config, pod, seed=0, progress=None) -> InverseHead:
+    """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or None).
+
+    The loss weighs components by their size, so it is the error of the fields themselves.
+    """
+    torch.manual_seed(seed)
+    basis, now, then = pod
+    rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
+    force = arrays.force[rows].float()
+    modes = min(64, *force.shape)
+    head = InverseHead(basis, modes, force.shape[1]).to(arrays.device)
+    _, s, v = torch.svd_lowrank(force, q=modes, niter=3)
+    head.force_basis.copy_(v), head.force_scale.copy_(s / len(rows) ** 0.5 + 1e-9)
+    log_change = torch.zeros_like(arrays.counts)
+    both = torch.cat([rows, check])
+    log_change[both] = arrays.log_change(both)
+    head.scale.copy_(log_change[rows].square().mean(0).sqrt() + 1e-3)
+    forces = torch.zeros(len(log_change), modes, device=arrays.device)
+    forces[both] = arrays.force[both].float() @ head.force_basis / head.force_scale[0]
+    size = basis.scale / basis.scale[0]
+    order = torch.as_tensor(ELECTRODE_MIRROR, device=arrays.device)
+
+    def error(r, flip=False):
+        x = log_change[r]
+        u, f = head.codes(x[:, order] if flip else x)
+        value = root_mean_square(u - (then if flip else now)[r] * size)
+        return value if flip else value + 0.3 * root_mean_square(f - forces[r])
+
+    def loss(r):
+        return error(r) + (0.5 * error(r, True) if then is not None else 0)
+
+    cycle(head, loss, rows, config.batch, config.steps, config.learning_rate, lambda: error(check), weight_decay=0.01, seed=seed,
+          progress=progress)  # fmt: skip
+    return head
+
+
+def field_errors(got, truth) -> dict:
+    """Errors [mm] of fields (n, nvert, 3) [mm], each (n,): mean of all nodes, of those displaced by more than 50 um, of the largest
+    displacement."""
+    size = truth.norm(dim=2)
+    error = (got - truth).norm(dim=2)
+    moved = (size > 0.05).float()
+    return {
+        "mean": error.mean(1).cpu().numpy(),
+        "moved": ((error * moved).sum(1) / moved.sum(1).clamp(min=1)).cpu().numpy(),
+        "largest": (got.norm(dim=2).amax(1) - size.amax(1)).abs().cpu().numpy(),
+    }
+
+
+def contact_centre(force, place):
+    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), place (nouter, 3) [m] of the nodes."""
+    force = np.asarray(force, float)
+    weight = np.where(force > PATCH * force.max(1, keepdims=True), force, 0)
+    total = weight.sum(1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(total > 1e-6, weight @ place / total, np.nan)
+
+
+def patch_overlap(got, truth):
+    """(n,) intersection over union of the nodes above PATCH of their largest force; NaN where nothing touches."""
+    a = got > PATCH * got.max(1, keepdims=True)
+    b = truth > PATCH * truth.max(1, keepdims=True)
+    union = (a | b).sum(1)
+    return np.where(truth.max(1) > 1e-6, (a & b).sum(1) / np.maximum(union, 1), np.nan)
+
+
+def log_change_of(counts, tare):
+    """d ln Z (n, 19) of raw counts (n, 19) against the counts at rest, tare (19,) or (n, 19).
+
+    Raises:
+      ValueError: not 19 channels, values that are not finite, or outside 0..4095.
+    """
+    counts, tare = np.asarray(counts, float), np.asarray(tare, float)
+    if counts.shape[-1:] != (19,) or tare.shape[-1:] != (19,):
+        raise ValueError(f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed")
+    for name, value in (("counts", counts), ("tare", tare)):
+        if not np.isfinite(value).all() or value.min() < 0 or value.max() > 4095:
+            raise ValueError(f"{name} hold values that are not finite or outside 0..4095: pass raw counts, not tared ones")
+    return log_impedance(counts) - log_impedance(tare)

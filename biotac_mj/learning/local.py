@@ -1,0 +1,122 @@
+"""The better models: principal components or local film features, d ln Z as the target, the simulation's film as a teacher."""
+
+import torch
+
+from ..sensor.channels import FULL_SCALE
+from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
+from .fitting import cycle, root_mean_square
+from .graph import SparseMatrix
+from .heads import LocalHead, PodHead, averages
+from .recording import log_impedance
+
+__all__ = ["Features", "counts_change", "train_head"]
+
+
+def counts_change(log_change, tare):
+    """Change of counts (n, 19) from d ln Z (n, 19) and the counts at rest, `tare` (n, 19)."""
+    tare = tare.clamp(0.5, FULL_SCALE - 0.5)
+    return FULL_SCALE / (1 + (FULL_SCALE / tare - 1) * log_change.exp()) - tare
+
+
+class Features:
+    """Features of all rows of a set, and of all touches mirrored in z, computed once.
+
+    Args:
+      arrays: Arrays. config: LearningConfig.
+
+    Attributes:
+      film: FilmFeatures. local: (n, 19, k) now, and then minus its causal averages. mirrored: the same of the mirrored touches, or None.
+    """
+
+    def __init__(self, arrays, config):
+        self.arrays, self.config = arrays, config
+        self.film = FilmFeatures(arrays.geometry).to(arrays.device)
+        self.local = self._local(lambda u: u)
+        self.mirrored = self.matrix = None
+        if config.mirror:
+            self.matrix = SparseMatrix(mirror_matrix(arrays.geometry)).to(arrays.device)
+            self.mirrored = self._local(self.mirror)
+
+    def mirror(self, u):
+        """Fields (n, nvert, 3) of the touches mirrored in the plane z = 0."""
+        return self.matrix(u.float().transpose(0, 1).contiguous()).transpose(0, 1) * torch.tensor([1.0, 1.0, -1.0], device=u.device)
+
+    @torch.no_grad()
+    def _local(self, change):
+        a = self.arrays
+        value = torch.cat([self.film(change(u)) for u in a.field.split(256)])
+        return torch.cat([value, averages(value, a.first, a.time, self.config.window)], -1) if self.config.window else value
+
+    @torch.no_grad()
+    def components(self, pod, mirrored=False):
+        """(n, modes) components of all rows."""
+        change = self.mirror if mirrored else lambda u: u.float()
+        return torch.cat([pod(change(u)) for u in self.arrays.field.split(512)])
+
+
+def train_head(features, train, validation, config, kind="local", window=True, teach=True, mirror=True, log=True, seed=0,
+               pod=None, progress=None):  # fmt: skip
+    """Trains one head.
+
+    Args:
+      features: Features. train, validation: numbers of interactions.
+      kind: "pod" or "local". window: with causal averages. teach: first learn the d ln Z of the simulation's own film on all interactions
+        of the training part, labelled or not. mirror: with mirrored touches. log: targets d ln Z against a known tare; False: tared counts.
+      pod: (Pod, components, mirrored components or None), fitted on the training part.
+
+    Returns:
+      function (rows) -> (k, 19) predicted change of counts; the head is its attribute `head`.
+    """
+    a = features.arrays
+    torch.manual_seed(seed)
+    pod, now, then = pod
+    base = features.film.count
+    width = features.local.shape[2] if window else base
+    mirror = mirror and features.mirrored is not None
+    order = torch.as_tensor(ELECTRODE_MIRROR, device=a.device)
+    if kind == "pod":
+        head = PodHead(now.shape[1], config.width).to(a.device)
+    else:
+        head = LocalHead(width, min(32, now.shape[1]), config.width).to(a.device)
+        rows = a.rows(train)
+        head.scale.copy_(features.local[rows][..., :width].square().mean((0, 1)).sqrt() + 1e-6)
+
+    head.damp.copy_((pod.scale / pod.scale[0]).sqrt()[: len(head.damp)])
+
+    def output(rows, flip=False):
+        local = features.mirrored if flip else features.local
+        pods = then if flip else now
+        return head(local[rows][..., :width], pods[rows][:, : 32 if kind == "local" else None])
+
+    def predict(rows, flip=False):
+        d = output(rows, flip)
+        tare = a.tare[rows]
+        return counts_change(d, tare[:, order] if flip else tare) if log else d * config.scale
+
+    def loss(rows):
+        truth = a.change(rows)
+        value = root_mean_square(predict(rows) - truth)
+        if mirror:
+            value = value + 0.5 * root_mean_square(predict(rows, True) - truth[:, order])
+        return value / config.scale
+
+    labelled, check = a.rows(train, labelled=True), a.rows(validation, labelled=True)
+    if teach and log:
+        target = torch.as_tensor(log_impedance(a.simulated.cpu().numpy()), dtype=torch.float32, device=a.device)
+        target = target - target[a.first]
+
+        def teacher_loss(rows):
+            value = root_mean_square(output(rows) - target[rows])
+            return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order]) if mirror else value
+
+        cycle(head, teacher_loss, a.rows(train), 2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed, progress=progress)
+    rate = config.learning_rate * (0.5 if teach else 1)
+    cycle(head, loss, labelled, config.batch, config.steps, rate, lambda: root_mean_square(predict(check) - a.change(check)),
+          weight_decay=0.01, seed=seed, progress=progress)  # fmt: skip
+
+    @torch.no_grad()
+    def evaluate(rows):
+        return torch.cat([predict(r) for r in rows.split(2048)])
+
+    evaluate.head, evaluate.pod, evaluate.width = head, pod, width
+    return evaluate

@@ -1,0 +1,73 @@
+"""The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, down to a code of 128."""
+
+import torch
+from torch import nn
+
+from .graph import ChebConv, SparseMatrix
+
+__all__ = ["MeshVAE"]
+
+
+class MeshVAE(nn.Module):
+    """Code of a displacement field.
+
+    Encoder: convolution to `channels[0]` ("conv 128"), then for every factor a convolution and a selection of nodes, a last convolution,
+    fully connected layers to mean and log variance. The decoder mirrors it, interpolating up before each convolution.
+
+    Args:
+      levels: of `build_hierarchy`, one more than there are entries in `channels`.
+      first: channels of the first convolution. channels: of those before each downsampling. last: of the one behind them.
+      hidden: width of the fully connected layer. latent: size of the code. order: K of the convolutions.
+    """
+
+    def __init__(self, levels, first=128, channels=(128, 128, 256, 64), last=64, hidden=512, latent=128, order=6):
+        super().__init__()
+        if len(levels) != len(channels) + 1:
+            raise ValueError(f"{len(levels)} levels for {len(channels)} stages of channels: one more level than stages is needed")
+        self.nvert, self.latent, self.order = levels[0].laplacian.shape[0], latent, order
+        self.coarsest = levels[-1].laplacian.shape[0]
+        graphs = [SparseMatrix(level.laplacian, symmetric=True) for level in levels]
+        self.ups = nn.ModuleList(SparseMatrix(level.up) for level in levels[:-1])
+        for i, level in enumerate(levels[:-1]):
+            self.register_buffer(f"keep{i}", torch.as_tensor(level.keep), persistent=False)
+        widths = [first, *channels]
+        self.encode_convs = nn.ModuleList(
+            [ChebConv(graphs[0], 3, first, order)]
+            + [ChebConv(g, a, b, order) for g, a, b in zip(graphs, widths, widths[1:])]
+            + [ChebConv(graphs[-1], channels[-1], last, order)]
+        )
+        self.encode_dense = nn.Sequential(nn.Linear(self.coarsest * last, hidden), nn.ELU(), nn.Linear(hidden, 2 * latent))
+        self.decode_dense = nn.Sequential(nn.Linear(latent, hidden), nn.ELU(), nn.Linear(hidden, self.coarsest * last), nn.ELU())
+        self.decode_convs = nn.ModuleList(
+            [ChebConv(graphs[-1], last, channels[-1], order)]
+            + [ChebConv(g, b, a, order) for g, a, b in reversed(list(zip(graphs, widths, widths[1:])))]
+            + [ChebConv(graphs[0], first, 3, order, bias=False)]
+        )
+        self.last = last
+
+    def encode(self, u):
+        """Mean and log variance of the code, (batch, latent) each.
+
+        Args:
+          u: (batch, nvert, 3) displacements, divided by their scale.
+        """
+        x = nn.functional.elu(self.encode_convs[0](u.transpose(0, 1).contiguous()))
+        for i, conv in enumerate(self.encode_convs[1:-1]):
+            x = nn.functional.elu(conv(x, getattr(self, f"keep{i}")))
+        x = nn.functional.elu(self.encode_convs[-1](x))
+        mean, log_variance = self.encode_dense(x.transpose(0, 1).flatten(1)).chunk(2, -1)
+        return mean, log_variance.clamp(-14, 4)
+
+    def decode(self, z):
+        """(batch, nvert, 3) of codes z (batch, latent)."""
+        x = self.decode_dense(z).view(len(z), self.coarsest, self.last).transpose(0, 1)
+        x = nn.functional.elu(self.decode_convs[0](x))
+        for up, conv in zip(reversed(self.ups), self.decode_convs[1:-1]):
+            x = nn.functional.elu(conv(up(x)))
+        return self.decode_convs[-1](x).transpose(0, 1)
+
+    def forward(self, u):
+        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log variance."""
+        mean, log_variance = self.encode(u)
+        z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
+        return self.decode(z), mean, log_variance

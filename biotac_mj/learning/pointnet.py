@@ -1,0 +1,68 @@
+"""PointNet++ on 128 nodes of the skin: the fully supervised baseline of Narang et al. (ICRA 2021).
+
+The points keep their neighbours (the skin bends by a few millimetres, no more), so sampling and grouping are done once on the rest shape
+(Qi et al., 2017, choose them for every cloud).
+"""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import nn
+
+from .electrode_vae import mlp
+
+__all__ = ["PointNet", "farthest_points"]
+
+
+def farthest_points(point, count) -> np.ndarray:
+    """(count,) of points (n, 3), each the farthest from those before; the first is 0."""
+    keep = [0]
+    nearest = np.linalg.norm(point - point[0], axis=1)
+    for _ in range(count - 1):
+        keep.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(point - point[keep[-1]], axis=1))
+    return np.array(keep)
+
+
+class PointNet(nn.Module):
+    """Displacements of all nodes -> outputs, through set abstraction over 128, 32 and 8 points.
+
+    Args:
+      vert: (nvert, 3) rest positions [m]. free: nodes to sample from (those that can move).
+      outputs: 19. points: of the levels. neighbours: in each group. dropout: in the head.
+    """
+
+    def __init__(self, vert, free, outputs=19, points=(128, 32, 8), neighbours=16, dropout=0.3):
+        super().__init__()
+        vert, free = np.asarray(vert, float), np.asarray(free)
+        if len(free) < points[0]:
+            raise ValueError(f"the skin has {len(free)} free nodes: {points[0]} points cannot be sampled from them")
+        sample = free[farthest_points(vert[free], points[0])]
+        self.register_buffer("sample", torch.as_tensor(sample), persistent=False)
+        place = vert[sample]
+        size = np.abs(place - place.mean(0)).max()
+        self.register_buffer("rest", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False)
+        self.stages = nn.ModuleList()
+        width = 3
+        for i, (count, out) in enumerate(zip(points[1:], (64, 128))):
+            centre = farthest_points(place, count)
+            k = min(neighbours, len(place))
+            group = cKDTree(place).query(place[centre], k)[1]
+            relative = (place[group] - place[centre][:, None]) / size
+            self.register_buffer(f"group{i}", torch.as_tensor(group), persistent=False)
+            self.register_buffer(f"relative{i}", torch.as_tensor(relative, dtype=torch.float32), persistent=False)
+            self.stages.append(nn.Sequential(mlp([width + 3, out, out, out]), nn.ELU()))
+            place, width = place[centre], out
+        self.register_buffer("place", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False)
+        self.whole = nn.Sequential(mlp([width + 3, 256, 256]), nn.ELU())
+        self.head = mlp([256, 256, 128, outputs], dropout)
+
+    def forward(self, u):
+        """(batch, outputs) of u (batch, nvert, 3), displacements divided by their scale."""
+        x = u[:, self.sample]
+        for i, stage in enumerate(self.stages):
+            x = x[:, getattr(self, f"group{i}")]
+            place = getattr(self, f"relative{i}").expand(len(x), -1, -1, -1)
+            x = stage(torch.cat([x, place], -1)).amax(2)
+        x = self.whole(torch.cat([x, self.place.expand(len(x), -1, -1)], -1)).amax(1)
+        return self.head(x)

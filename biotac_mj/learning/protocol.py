@@ -1,0 +1,79 @@
+"""How models are judged: errors per interaction, coverage, paired tests, intervals. In raw counts; the paper's unit is counts / 2048."""
+
+import numpy as np
+from scipy.stats import wilcoxon
+
+__all__ = ["conformal_width", "coverage_curve", "interaction_errors", "paired_test", "quartiles"]
+
+
+def interaction_errors(predicted, truth, owner):
+    """RMS over the electrodes of each row, its mean over the rows of each interaction.
+
+    Args:
+      predicted, truth: (n, 19) tared counts. owner: (n,) interaction of each row.
+
+    Returns:
+      interactions (k,) and their errors (k,) [counts].
+
+    Raises:
+      ValueError: shapes that differ, no rows, or values that are not finite.
+    """
+    predicted, truth, owner = np.asarray(predicted, float), np.asarray(truth, float), np.asarray(owner)
+    if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 19 or len(owner) != len(truth):
+        raise ValueError(f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: (n, 19), (n, 19) and (n,) are needed")
+    if not len(truth):
+        raise ValueError("there are no rows to judge: the test part of the split is empty")
+    if not (np.isfinite(predicted).all() and np.isfinite(truth).all()):
+        raise ValueError("predicted or truth holds values that are not finite: look for NaN in the data set's measured_counts")
+    rms = np.sqrt(((predicted - truth) ** 2).mean(1))
+    which, index = np.unique(owner, return_inverse=True)
+    return which, np.bincount(index, rms) / np.bincount(index)
+
+
+def quartiles(values):
+    """Median, lower and upper quartile as floats."""
+    q25, q50, q75 = np.percentile(values, [25, 50, 75])
+    return float(q50), float(q25), float(q75)
+
+
+def coverage_curve(predicted, truth, levels):
+    """(len(levels),) share of all (row, electrode) pairs whose absolute error is at most each level [counts]."""
+    error = np.sort(np.abs(np.asarray(predicted, float) - truth).ravel())
+    return np.searchsorted(error, levels, side="right") / len(error)
+
+
+def paired_test(a, b) -> dict:
+    """Wilcoxon's signed-rank test of paired errors a, b (k,) of the same interactions, two-sided.
+
+    Returns:
+      dict: n, median of a - b [counts], share of interactions where a is better, p (1 where nothing differs).
+    """
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    if a.shape != b.shape or a.ndim != 1 or len(a) < 5:
+        raise ValueError(f"paired test of {a.shape} and {b.shape} errors: the same interactions, at least five, are needed")
+    difference = a - b
+    p = 1.0 if not difference.any() else float(wilcoxon(a, b).pvalue)
+    return {"n": len(a), "median_difference": float(np.median(difference)), "better": float((difference < 0).mean()), "p": p}
+
+
+def conformal_width(error, owner, alpha=0.1):
+    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with probability 1 - alpha on average.
+
+    Rows of one interaction are alike, so interactions are what is exchangeable: the distribution functions of their absolute errors are
+    averaged, with one more interaction of infinite error (pooling of distribution functions, Dunn, Wasserman and Ramdas, 2022).
+
+    Args:
+      error: (n, 19) predicted - truth on the validation interactions. owner: (n,).
+
+    Returns:
+      (19,); infinite where there are too few interactions for alpha.
+    """
+    error, owner = np.abs(np.asarray(error, float)), np.asarray(owner)
+    which, index = np.unique(owner, return_inverse=True)
+    weight = (1 / np.bincount(index))[index] / (len(which) + 1)
+    out = np.empty(error.shape[1])
+    for e in range(error.shape[1]):
+        order = np.argsort(error[:, e])
+        reached = np.searchsorted(np.cumsum(weight[order]), 1 - alpha - 1e-12)
+        out[e] = error[order[reached], e] if reached < len(order) else np.inf
+    return out

@@ -1,0 +1,208 @@
+"""`biotac evaluate FOLDER`: what `biotac train` predicted, over all seeds, beside the paper's numbers; JSON, a table and figures."""
+
+import json
+import pathlib
+
+import numpy as np
+
+from ..press_record import replacing
+from ..sensor.channels import electrode_noise
+from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
+
+__all__ = ["PAPER", "evaluate_models", "table"]
+
+# Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
+PAPER = {"trajectory": {"latent_projection": 0.010, "pointnet": 0.012}, "object": {"latent_projection": 0.015, "pointnet": 0.016}}
+UNIT = 2048.0
+_REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")  # rows to compare with: nothing that a user would serve
+_LEVELS = np.linspace(0, 150, 151)
+
+
+def evaluate_models(folder, out=None) -> dict:
+    """Reads a folder of `biotac train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures beside it.
+
+    Errors of an interaction are averaged over the seeds whose test part has it; medians and tests are over interactions.
+
+    Raises:
+      FileNotFoundError: no predictions in the folder.
+      ValueError: seeds that were trained on different sets.
+    """
+    folder = pathlib.Path(folder)
+    reports = [json.loads(p.read_text()) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
+    if not reports:
+        raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
+    if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
+        raise ValueError(f"{folder} holds predictions on different sets: give every set its own folder")
+    result = {"schema": "biotac_mj.learning.evaluation/1", "data": "synthetic", "unit": "tared counts",
+              "folder": str(folder), "paper": PAPER, "splits": {},
+              **{k: reports[0][k] for k in ("set", "interactions", "labelled")}}  # fmt: skip
+    drawn = {}
+    for split in dict.fromkeys(r["split"] for r in reports):
+        mine = [r for r in reports if r["split"] == split]
+        result["splits"][split], drawn[split] = _split(folder, split, mine)
+    ours = [n for n in next(iter(result["splits"].values()))["models"] if n not in _REFERENCES]
+    unseen = [s for s in result["splits"] if s != "trajectory"] or list(result["splits"])
+    result["default"] = min(ours, key=lambda n: np.mean([result["splits"][s]["models"][n]["median"] for s in unseen]))
+    for split, found in result["splits"].items():
+        found["tests"] = _tests(drawn[split]["errors"], result["default"])
+    out = pathlib.Path(out or folder / "evaluation.json")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    result["figures"] = _figures(result, drawn, out)
+    with replacing(out) as temporary:
+        pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
+    return result
+
+
+def table(result) -> str:
+    """What `evaluate_models` found, as text."""
+    lines = []
+    for split, found in result["splits"].items():
+        kind = "trajectory" if split == "trajectory" else "object"
+        where = kind if kind == split else f"{kind}: {split}"
+        seeds = " ".join(map(str, found["seeds"]))
+        lines.append(f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; RMS per interaction, counts")
+        lines.append(f"  {'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}{'+-':>8}{'paper':>8}")
+        for name, row in sorted(found["models"].items(), key=lambda item: item[1]["median"]):
+            low, high = row["quartiles"]
+            least, most = min(row["seed_medians"]), max(row["seed_medians"])
+            spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
+            lines.append(
+                f"  {name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}{row['interval_coverage']:>9.2f}"
+                f"{row['interval_half_width']:>8.1f}{PAPER[kind].get(name, ''):>8}"
+            )
+        lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")
+        for name, test in found["tests"].items():
+            better, middle = 100 * test["better"], test["median_difference"]
+            lines.append(f"  {name}: better on {better:.0f} % of {test['n']}, median of differences {middle:+.2f}, p = {test['p']:.2g}")
+        for name, error in found["mesh_mm"].items():
+            lines.append(
+                f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, {error['all']['moved']:.4f} mm where it moves more than 0.05"
+            )
+        for name, error in found["inverse_mm"].items():
+            centre = f", patch centre {error['centre_median']:.2f} mm" if "centre_median" in error else ""
+            lines.append(f"  inverse, {name}: {error['mean']:.4f} mm mean, {error['moved']:.4f} mm where it moves{centre}")
+    lines.append(f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}")
+    return "\n".join(lines)
+
+
+def _split(folder, split, reports):
+    errors, pooled, seconds = {}, {}, {}
+    coverage, intervals, noise, example = {}, {}, [], None
+    for report in reports:
+        with np.load(folder / f"{split}-{report['seed']}.npz") as file:
+            data = {k: file[k] for k in file.files}
+        test = data["test"]
+        truth, owner = data["truth"][test].astype(float), data["owner"][test]
+        raw = truth + data["tare"][test]
+        noise.append(np.sqrt((electrode_noise(raw) ** 2).mean(1)))
+        for key in (k for k in data if k.startswith("predicted_")):
+            name = key[len("predicted_") :]
+            got = data[key].astype(float)
+            which, value = interaction_errors(got[test], truth, owner)
+            errors.setdefault(name, {}).setdefault("seed", []).append(float(np.median(value)))
+            for k, v in zip(which.tolist(), value.tolist()):
+                errors[name].setdefault("each", {}).setdefault(k, []).append(v)
+            pooled.setdefault(name, []).append(np.sqrt(((got[test] - truth) ** 2).mean(1)))
+            coverage.setdefault(name, []).append(coverage_curve(got[test], truth, _LEVELS))
+            width = conformal_width(got[~test] - data["truth"][~test], data["owner"][~test])
+            inside = (np.abs(got[test] - truth) <= width).mean()
+            intervals.setdefault(name, []).append((float(inside), float(np.mean(width))))
+        for name, value in report["seconds"].items():
+            seconds.setdefault(name, []).append(value)
+        if report["seed"] == min(r["seed"] for r in reports):
+            example = {k: data[k][test] for k in data if k.startswith("predicted_")} | {
+                "truth": truth, "owner": owner, "time": data["time"][test], "object": data["object"][test],
+            }  # fmt: skip
+    models = {}
+    for name, e in errors.items():
+        value = np.array([np.mean(v) for v in e["each"].values()])
+        q50, q25, q75 = quartiles(value)
+        inside, width = np.mean(intervals[name], axis=0)
+        models[name] = {
+            "median": q50, "quartiles": [q25, q75], "median_2048": q50 / UNIT, "seed_medians": e["seed"],
+            "median_row": float(np.median(np.concatenate(pooled[name]))), "interval_coverage": inside, "interval_half_width": width,
+            "coverage_area": float(np.mean(np.mean(coverage[name], axis=0))),
+        }  # fmt: skip
+    found = {
+        "seeds": [r["seed"] for r in reports], "interactions": len(next(iter(errors.values()))["each"]), "models": models,
+        "noise_floor": float(np.median(np.concatenate(noise))),
+        "mesh_mm": _average([r["mesh"] for r in reports]), "inverse_mm": _average([r["inverse"] for r in reports]),
+        "ensemble_of": [r.get("ensemble_of") for r in reports], "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
+        "device": reports[0]["device"],
+    }  # fmt: skip
+    drawn = {"errors": {n: e["each"] for n, e in errors.items()}, "coverage": {n: np.mean(c, axis=0) for n, c in coverage.items()}}
+    return found, drawn | {"example": example}
+
+
+def _tests(errors, default):
+    pairs = [
+        ("latent_projection", "pointnet"),
+        *((default, other) for other in ("latent_projection", "pointnet", "linear", "physics_gain")),
+    ]
+    out = {}
+    for a, b in pairs:
+        if a in errors and b in errors and a != b:
+            keys = sorted(set(errors[a]) & set(errors[b]))
+            if len(keys) >= 5:
+                out[f"{a} against {b}"] = paired_test([np.mean(errors[a][k]) for k in keys], [np.mean(errors[b][k]) for k in keys])
+    return out
+
+
+def _average(reports):
+    """Means of equal trees of numbers."""
+    first = reports[0]
+    if isinstance(first, dict):
+        return {k: _average([r[k] for r in reports if k in r]) for k in first}
+    return np.mean(reports, axis=0).tolist()
+
+
+def _figures(result, drawn, out):
+    from matplotlib.figure import Figure
+
+    splits = list(result["splits"])
+    names = sorted(result["splits"][splits[0]]["models"], key=lambda n: result["splits"][splits[-1]]["models"][n]["median"])
+    figure = Figure(figsize=(6.2 * len(splits), 9.5), layout="constrained")
+    top, bottom = figure.subplots(2, len(splits), squeeze=False)
+    for axis, below, split in zip(top, bottom, splits):
+        each = [[np.mean(v) for v in drawn[split]["errors"][n].values()] for n in names]
+        axis.boxplot(each, orientation="horizontal", tick_labels=names, showfliers=False, whis=(5, 95))
+        axis.axvline(result["splits"][split]["noise_floor"], color="C2", lw=1, label="noise of the sensor")
+        for name, value in PAPER["trajectory" if split == "trajectory" else "object"].items():
+            axis.axvline(value * UNIT, color="C3" if name == "pointnet" else "C0", ls=":", lw=1, label=f"paper's {name} (real data)")
+        axis.set_xlim(0, 1.05 * max(np.percentile(e, 90) for n, e in zip(names, each) if n not in ("tare", "physics")))
+        axis.invert_yaxis()
+        axis.set_xlabel("RMS error per interaction [counts]")
+        axis.set_title(f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor")
+        axis.legend(fontsize=7, loc="lower right")
+        for name in names:
+            heavy = name in ("latent_projection", "pointnet", "tare", result["default"])
+            below.plot(_LEVELS, drawn[split]["coverage"][name], lw=1.8 if heavy else 0.7, label=name, alpha=1 if heavy else 0.6)
+        below.set_xlabel("absolute error at most [counts]")
+        below.set_ylabel("share of all readings")
+        below.legend(fontsize=7)
+    paths = [out.with_name(out.stem + "_errors.png"), out.with_name(out.stem + "_traces.png")]
+    figure.savefig(paths[0], dpi=110)
+    _traces(result, drawn, splits, paths[1])
+    return [str(p) for p in paths]
+
+
+def _traces(result, drawn, splits, path):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.4 * len(splits)), layout="constrained")
+    axes = figure.subplots(len(splits), 2, squeeze=False)
+    shown = [n for n in (result["default"], "latent_projection", "pointnet") if f"predicted_{n}" in drawn[splits[0]]["example"]]
+    for row, split in zip(axes, splits):
+        data = drawn[split]["example"]
+        size = {k: np.abs(data["truth"][data["owner"] == k]).max() for k in np.unique(data["owner"])}
+        one = sorted(size, key=size.get)[int(0.75 * len(size))]  # a strong touch, not the strongest
+        mine = data["owner"] == one
+        strong = np.argsort(np.abs(data["truth"][mine]).max(0))[::-1][:2]
+        for axis, e in zip(row, strong):
+            axis.plot(data["time"][mine], data["truth"][mine][:, e], "k.-", label="synthetic sensor")
+            for name in shown:
+                axis.plot(data["time"][mine], data[f"predicted_{name}"][mine][:, e], lw=1.2, label=name)
+            axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)
+            axis.set_xlabel("time [s]"), axis.set_ylabel("change [counts]")
+            axis.legend(fontsize=7)
+    figure.savefig(path, dpi=110)
