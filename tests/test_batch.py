@@ -283,6 +283,44 @@ def test_finger_and_ball_exchange_momentum_and_lose_none():
     np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=2e-3 * np.abs(before[:, 3:]).max())
 
 
+def test_a_ball_between_two_biotacs_feels_both():
+    spec = ball_spec()
+    spec.option.gravity = [0, 0, 0]
+    spec.body("ball").pos = [-8e-3, -7e-3 - RADIUS + 4e-4, 0]
+    spec.body("ball").first_joint().damping = [0.3, 0, 0]
+    across = {"pos": [0, -2 * (7e-3 + RADIUS) + 6e-4, 0], "quat": [0, 1, 0, 0]}  # its pad looks along +y
+    for prefix, pose in (("biotac_", {}), ("other_", across)):
+        batches.add(spec, skin=shell(), prefix=prefix, **pose)
+    mjm = spec.compile()
+    data = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, data)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, data, nworld=1)
+    both = [batches.attach(mjm, m, d, skin=shell(), prefix=prefix, readings=False) for prefix in ("biotac_", "other_")]
+    for _ in range(40):
+        mjw.step(m, d)
+    force = [d.sensordata.numpy()[0, mjm.sensor(f"{p}contact_force").adr[0] :][:3] for p in ("biotac_", "other_")]
+    assert force[0][1] > 0.02 and np.abs(d.qvel.numpy()).max() < 1e-4
+    assert force[1][1] == pytest.approx(force[0][1], rel=0.01)
+    assert d.qpos.numpy()[0, 0] == pytest.approx(-1e-4, abs=3e-5)  # half-way between the pads
+    both[1].active = False
+    for _ in range(40):
+        mjw.step(m, d)
+    assert d.qpos.numpy()[0, 0] < -3e-4  # nothing holds it against the first
+
+
+def test_each_world_has_its_liquid():
+    mjm, m, d, batch = make(press_spec(), 3, readings={"noise": False})
+    batch.skin.data.set_liquid(bulk_modulus=[2.2e9, 0.0, 2.2e9], fill_volume=[0.0, 0.0, 1e-8])
+    start = np.repeat(places(1), 3, axis=0)
+    for _ in press(m, d, start, 10, [1.2e-3] * 3):
+        pass
+    force, pdc = read(mjm, d, "contact_force")[:, :3], read(mjm, d, "pdc")[:, 0]
+    assert (read(mjm, d, "status")[:, 0] == 1).all()
+    assert pdc[1] == 2000 and pdc[0] > 2005 and pdc[2] > pdc[0] + 5
+    force = np.linalg.norm(force, axis=1)
+    assert force[1] < 0.98 * force[0] < 0.98 * force[2]
+
+
 def test_reset_of_some_worlds():
     mjm, m, d, batch = make(press_spec(), 3)
     start = places(3)
@@ -365,6 +403,14 @@ def test_errors_say_what_to_do():
     batches.add(crowded, skin=shell(), slots=0)
     with pytest.raises(ValueError, match="has room for 0: add it after the objects"):
         attach(crowded.compile())
+
+
+def test_strong_damping_is_warned_of():
+    spec = ball_spec(mass=0.001)
+    spec.body("ball").first_joint().damping, spec.body("ball").first_joint().name = [1.0, 0, 0], "slide"
+    batches.add(spec, skin=shell())
+    with pytest.warns(UserWarning, match=r"joint 'slide' is damped strongly \(time step x damping / inertia = 2\): .* smaller steps"):
+        attach(spec.compile(), readings=False)
 
 
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")

@@ -26,7 +26,7 @@ def dented(film, count, seed=0):
     out = []
     for _ in range(count):
         center = np.array([rng.uniform(-16e-3, -2e-3), -6e-3, rng.uniform(-4e-3, 4e-3)])
-        share = rng.uniform(0.6, 1.1) * np.exp(-((np.linalg.norm(vert - center, axis=1) / 3e-3) ** 2))
+        share = rng.uniform(0.6, 1.1) * np.exp(-((np.linalg.norm(vert - center, axis=1) / 4e-3) ** 2))
         out.append(vert + share[:, None] * (foot - vert) + 2e-5 * rng.normal(size=vert.shape))
     return np.stack(out)
 
@@ -40,7 +40,7 @@ def test_film_is_that_of_the_single_sensor(film):
     batch = BatchFilm(film, 5)
     batch.solve(as_warp(x), wp.ones(5, dtype=int))
     expected = channels.counts_from_impedance(film.impedance(x))
-    assert np.abs(expected - channels.counts_from_impedance(film.impedance(film.geometry.vert))).max() > 100  # something happened
+    assert np.abs(expected - channels.counts_from_impedance(film.impedance(film.geometry.vert))).max() > 50  # something happened
     np.testing.assert_allclose(channels.counts_from_impedance(batch.impedance.numpy()), expected, atol=0.1)
     assert batch.valid.numpy().all()
 

@@ -1,6 +1,7 @@
 """`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them into `mujoco_warp.step`."""
 
 import dataclasses
+import warnings
 
 import mujoco
 import numpy as np
@@ -22,6 +23,7 @@ from .skins import CHANNELS, PoseBatch
 __all__ = ["add", "attach", "make"]
 
 _SPRINGLESS = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+_DAMPED = 0.3  # time step x damping / inertia
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -98,7 +100,10 @@ def attach(
     _check_model(mjm, coupling)
     settings = dict(material=material, liquid=liquid, friction=friction, priority=priority, geoms=geoms, rounding=rounding, options=options)
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
-    slots = _slots(mjm, m, d, touching, prefix) if coupling == "two-way" else {}
+    slots = {}
+    if coupling == "two-way":
+        slots = _slots(mjm, m, d, touching, prefix)
+        _warn_of_damping(mjm, touching)
     film, acquisition = _readings(readings, rest_geometry(config, geometry), d.nworld, seed, device)
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
     batch = Batch(mjm, touching, slots, skin_of(bool(slots)), film, acquisition, addresses, coupling == "two-way")
@@ -195,6 +200,18 @@ def _check_model(mjm, coupling):
         raise ValueError("two-way coupling needs the flags constraint and equality: enable them, or use coupling='one-way'")
     if mjm.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
         raise ValueError("a touched body must not sleep: disable the flag sleep")
+
+
+def _warn_of_damping(mjm, touching):
+    trees = {int(mjm.body_treeid[b]) for b in (touching.core, *touching.body)} - {-1}
+    damped = mjm.opt.timestep * mjm.dof_damping / mjm.dof_M0
+    for i in np.flatnonzero(np.isin(mjm.dof_treeid, list(trees)) & (damped > _DAMPED)):
+        joint = mjm.jnt(int(mjm.dof_jntid[i])).name or f"#{mjm.dof_jntid[i]}"
+        warnings.warn(
+            f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the batch solves its skins where "
+            "the body would go without the integrator's damping; take smaller steps, less damping, or biotac_mj.attach on the CPU",
+            stacklevel=3,
+        )
 
 
 def _slots(mjm, m, d, touching, prefix):
