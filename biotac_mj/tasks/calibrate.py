@@ -1,4 +1,4 @@
-"""Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--tasks press,explore] [--episodes 12]
+"""Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--estimators press,grip] [--episodes 8]
 
 Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch is recorded around where it
 will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are kept in out/calibration, so that an interrupted run goes on.
@@ -115,26 +115,31 @@ def _add(path, found):
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--tasks", default=",".join(SCRIPTED), help="comma-separated")
-    parser.add_argument("--episodes", type=int, default=12, help="of each task, and of each object of explore")
+    parser.add_argument(
+        "--estimators", help="comma-separated: press, follow_edge, roll_ball, explore, grip (of hold and lift); default all"
+    )
+    parser.add_argument("--episodes", type=int, default=8, help="of each task, and of each object of explore")
     parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).with_name("calibration.npz"), help="file to write")
     options = parser.parse_args(arguments)
     domain = {task: domain for domain, task in suite.tasks()}
-    for task in options.tasks.split(","):
-        if task not in SCRIPTED:
-            raise ValueError(f"no task {task!r} to calibrate: choose from {', '.join(SCRIPTED)}")
-        if task == "explore":
+    groups = {}  # estimator -> the tasks that share it
+    for task, controller in SCRIPTED.items():
+        groups.setdefault(controller.calibration or task, []).append(task)
+    for name in groups if options.estimators is None else options.estimators.split(","):
+        if name not in groups:
+            raise ValueError(f"no estimator {name!r} to calibrate: choose from {', '.join(groups)}")
+        if name == "explore":
             found = _explore(options.folder, options.episodes)
         else:
             made = [
                 _kept(options.folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i))
-                for i in tqdm(range(options.episodes), desc=task)
+                for i, task in tqdm([(i, task) for i in range(options.episodes) for task in groups[name]], desc=name)
             ]
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
             fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
-            print(f"{task}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
-            found = {f"{task}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
+            print(f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
+            found = {f"{name}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
         _add(options.out, found)
 
 

@@ -27,7 +27,7 @@ class FollowEdge(TouchTask):
         super().__init__(gantry, [gantry.mount], **settings)
         self._discs = []
         for radius in _RADII:
-            disc = self._arena.mjcf_model.worldbody.add("body", name=f"disc_{1e3 * radius:.0f}mm", mocap=True)
+            disc = self._arena.mjcf_model.worldbody.add("body", name=f"disc_{1e3 * radius:.0f}mm", mocap=True, pos=AWAY)
             disc.add("geom", name=disc.name, type="cylinder", size=[radius, 4e-3], pos=[0, 0, -4e-3], rgba=[0.75, 0.6, 0.4, 1])
             self._discs.append(disc)
         self._center, self._radius = np.zeros(2), _RADII[0]

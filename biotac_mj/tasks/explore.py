@@ -65,7 +65,7 @@ class Explore(TouchTask):
 
 def _add(root, shape):
     """A mocap body with the shape, foremost point at its origin, upwards; both named after it."""
-    body = root.worldbody.add("body", name=shape.name, mocap=True)
+    body = root.worldbody.add("body", name=shape.name, mocap=True, pos=AWAY)
     pos, quat = np.empty(3), np.empty(4)
     mujoco.mju_rotVecQuat(pos, shape.pos, _TURNED_UP)
     mujoco.mju_mulQuat(quat, _TURNED_UP, shape.quat)

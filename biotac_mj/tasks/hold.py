@@ -21,7 +21,7 @@ class _Grip(TouchTask):
         gripper = Gripper(lift=lift)
         super().__init__(gripper, gripper.mounts, **settings)
         world = self._arena.mjcf_model.worldbody
-        self._body = world.add("body", name="object")
+        self._body = world.add("body", name="object", pos=AWAY)
         self._joint = self._body.add("freejoint", name="object")
         inertia = mass / 3 * (np.sum(_HALF**2) - _HALF**2)
         self._body.add("inertial", pos=[0, 0, 0], mass=mass, diaginertia=inertia)
@@ -56,7 +56,7 @@ class Hold(_Grip):
 
     def __init__(self, **settings):
         super().__init__(lift=False, mass=0.04, **settings)
-        self._support = self._arena.mjcf_model.worldbody.add("body", name="support", mocap=True)
+        self._support = self._arena.mjcf_model.worldbody.add("body", name="support", mocap=True, pos=AWAY)
         self._support.add("geom", name="support", type="box", size=[0.01, 0.004, 0.002], rgba=[0.5, 0.5, 0.5, 1])
         self._times, self._pulls = np.zeros(3), np.zeros(4)
         self._begin = 0.0

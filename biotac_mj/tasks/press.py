@@ -3,7 +3,7 @@
 import numpy as np
 from dm_control.utils import rewards
 
-from .base import TouchTask
+from .base import AWAY, TouchTask
 from .robots import Gantry
 
 __all__ = ["Press"]
@@ -22,7 +22,7 @@ class Press(TouchTask):
     def __init__(self, **settings):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
-        self._plate = self._arena.mjcf_model.worldbody.add("body", name="plate", mocap=True)
+        self._plate = self._arena.mjcf_model.worldbody.add("body", name="plate", mocap=True, pos=AWAY)
         self._plate.add("geom", name="plate", type="box", size=[0.04, 0.04, 0.005], pos=[0, 0, -0.005], rgba=[0.75, 0.6, 0.4, 1])
         self._targets = np.zeros(2)
         self._observe("target", lambda physics: np.array([self.target(physics)]))

@@ -3,7 +3,7 @@
 import numpy as np
 from dm_control.utils import rewards
 
-from .base import TouchTask
+from .base import AWAY, TouchTask
 from .robots import Gantry
 
 __all__ = ["RollBall"]
@@ -27,7 +27,7 @@ class RollBall(TouchTask):
         rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)  # 2: the finger's machine is not in the way
         floor = [0, 0, -_PAD - 2 * _RADIUS]
         world.add("geom", name="table", type="plane", size=[0.1, 0.1, 0.01], pos=floor, rgba=[0.75, 0.6, 0.4, 1], **rolls)
-        self._ball = world.add("body", name="ball")
+        self._ball = world.add("body", name="ball", pos=AWAY)
         self._joint = self._ball.add("freejoint", name="ball")
         self._ball.add("geom", name="ball", type="sphere", size=[_RADIUS], mass=_MASS, rgba=[0.85, 0.45, 0.15, 1], **rolls)
         self._target = np.zeros(2)

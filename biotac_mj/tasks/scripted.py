@@ -18,6 +18,7 @@ class Scripted:
     """Reads touch, estimates, acts. `act(observation, truth)` takes (nbiotac, nestimated) true values in place of the estimates."""
 
     task: str
+    calibration = None  # name of its estimator, where it is not that of the task
     estimator = None
 
     def reset(self):
@@ -30,7 +31,7 @@ class Scripted:
         self.frame += 1
         if truth is None:
             if self.estimator is None:
-                self.estimator = load_estimator(self.task)
+                self.estimator = load_estimator(self.calibration or self.task)
             truth = self.estimator(self.felt)
         touching = float(np.abs(self.felt).max()) > 0.6
         return np.clip(self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1)
@@ -144,7 +145,7 @@ class Explore(Scripted):
 class Hold(Scripted):
     """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the friction limit: that is slip."""
 
-    task = "hold"
+    task, calibration = "hold", "grip"
     least = 0.35  # [N] before there is a load
 
     def wait(self, observation):
@@ -193,7 +194,7 @@ class Random:
         """Nothing to forget."""
 
     def act(self, observation):
-        return self.rng.uniform(self.spec.minimum, self.spec.maximum)
+        return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 
 SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}

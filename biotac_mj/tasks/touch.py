@@ -107,12 +107,12 @@ def load_calibration() -> dict:
 
 
 def load_estimator(task) -> Estimator:
-    """The calibrated estimator of a task.
+    """The calibrated estimator of a task (of "grip" for hold and lift).
 
     Raises:
       ValueError: the task has none.
     """
     stored = load_calibration()
     if f"{task}/weight" not in stored:
-        raise ValueError(f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --tasks {task}`")
+        raise ValueError(f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --estimators {task}`")
     return Estimator(*(stored[f"{task}/{part}"] for part in ("scale", "weight", "error")))

@@ -1,0 +1,81 @@
+"""The tasks as Gymnasium environments: BioTac/Press-v0 and so on.
+
+    biotac_mj.tasks.register()
+    env = gymnasium.make("BioTac/Press-v0", observe="tactile")
+
+`gymnasium.make("biotac_mj.tasks.environments:BioTac/Press-v0")` registers them too.
+"""
+
+import gymnasium
+import numpy as np
+
+from . import suite
+
+__all__ = ["BioTacEnv", "IDS", "register"]
+
+IDS = {f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task) for domain, task in suite.tasks()}
+
+
+class BioTacEnv(gymnasium.Env):
+    """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0, 1].
+
+    Args:
+      domain, task: see `suite.tasks`.
+      observe: "tactile", "privileged" or "none".
+      render_mode: None or "rgb_array", the camera `side`.
+      width, height: of a picture [pixel].
+      settings: further arguments of the task (time_limit, physics_timestep, biotac ...).
+
+    Raises:
+      ValueError: no such task or preset.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
+
+    def __init__(self, domain, task, observe="tactile", render_mode=None, width=480, height=360, **settings):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        self.render_mode, self._size = render_mode, (height, width)
+        self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
+        action = self.suite.action_spec()  # all of them in [-1, 1]
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
+        counts = ("electrodes", "pac", "pdc", "tac", "tdc")
+        self.observation_space = gymnasium.spaces.Dict({
+            name: gymnasium.spaces.Box(*((0, 4095) if name.split("/")[-1] in counts else (-np.inf, np.inf)), spec.shape, np.float32)
+            for name, spec in sorted(self.suite.observation_spec().items())
+        })  # fmt: skip
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.suite.random_state.seed(seed)
+        return self._observation(self.suite.reset()), {}
+
+    def step(self, action):
+        step = self.suite.step(np.asarray(action, dtype=np.float64))
+        ended = step.last() and step.discount == 0.0
+        return self._observation(step), float(step.reward), bool(ended), bool(step.last() and not ended), {}
+
+    def render(self):
+        if self.render_mode is None:
+            return None
+        return self.suite.physics.render(*self._size, camera_id="side")
+
+    def close(self):
+        if self.suite is not None:
+            self.suite.close()
+            self.suite = None
+
+    def _observation(self, step):
+        return {name: np.asarray(step.observation[name], np.float32) for name in self.observation_space}
+
+
+def register():
+    """Registers all tasks with Gymnasium; once is enough, more do no harm. Returns their ids."""
+    for name, (domain, task) in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(name, entry_point=f"{__name__}:BioTacEnv", kwargs={"domain": domain, "task": task})
+    return list(IDS)
+
+
+register()

@@ -1,0 +1,200 @@
+"""BioTacs on hands: frames, freedoms, exclusions; the Menagerie's Shadow Hand where it is, else a small hand of our own."""
+
+import os
+import pathlib
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj.tasks.hands import HANDS, Mount, attach_to_hand
+
+# Two fingers of two links with flexion about x, a thumb opposite, and a ball: a synthetic hand.
+HAND = """<mujoco><worldbody>
+  <geom name="floor" type="plane" size="1 1 1" pos="0 0 -1"/>
+  <body name="ball" pos="0 -0.05 0.5"><freejoint/><geom name="ball" size="0.01" mass="0.01"/></body>
+  <body name="my_palm" gravcomp="1"><geom name="palm" type="box" size=".04 .01 .04"/>
+    {fingers}
+  </body></worldbody></mujoco>"""
+FINGER = """<body name="my_{n}middle" pos="{x} 0 .04" gravcomp="1"><joint name="{n}J2" axis="1 0 0"/>
+      <geom type="capsule" size=".008 .01" pos="0 0 .01"/>
+      <body name="my_{n}distal" pos="0 0 .025" gravcomp="1"><joint name="{n}J1" axis="1 0 0"/>
+        <geom name="{n}tip" type="capsule" size=".008 .01" pos="0 0 .012" mass=".013"/></body></body>"""
+
+
+def small_hand():
+    return mujoco.MjSpec.from_string(HAND.format(fingers="".join(FINGER.format(n=n, x=x) for n, x in (("a", -0.02), ("b", 0.02)))))
+
+
+def mounts():
+    return {n: Mount(f"{n}distal", (0, 0, 0.0107)) for n in ("a", "b")}
+
+
+def shadow_folder():
+    root = os.environ.get("MENAGERIE_ROOT") or pathlib.Path(__file__).resolve().parents[2] / "shared" / "menagerie"
+    folder = pathlib.Path(root) / "shadow_hand"
+    if not folder.is_dir():
+        pytest.skip("needs the Menagerie's shadow_hand: set MENAGERIE_ROOT")
+    return folder
+
+
+def springs(**settings):
+    """Settings of a skin that costs nothing."""
+    import spring_skin
+
+    return {"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    yield
+    biotac_mj.plugin.check()
+
+
+def tip_at(model, data, handle, joint, angle):
+    """Tip (3,) [m] of a finger with one joint bent."""
+    data.qpos[model.jnt_qposadr[model.joint(joint).id]] = angle
+    mujoco.mj_kinematics(model, data)
+    body = data.body(handle.body)
+    mat = body.xmat.reshape(3, 3)
+    data.qpos[model.jnt_qposadr[model.joint(joint).id]] = 0
+    return body.xpos + mat @ [-21.3e-3, 0, 0]
+
+
+def assert_pad_leads(model, data, handle, joint):
+    """Bending a finger moves its tip the way that the pad looks."""
+    tip, bent = tip_at(model, data, handle, joint, 0.0), tip_at(model, data, handle, joint, 0.05)
+    body = data.body(handle.body)
+    mujoco.mj_kinematics(model, data)
+    looks = -body.xmat.reshape(3, 3)[:, 1]
+    assert (bent - tip) @ looks > 0.9 * np.linalg.norm(bent - tip) > 0
+
+
+def test_a_hand_by_body_names():
+    spec = small_hand()
+    handles = biotac_mj.attach_to_hand(spec, mounts(), **springs())
+    assert list(handles) == ["a", "b"]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for name, handle in handles.items():
+        body = data.body(handle.body)
+        mat = body.xmat.reshape(3, 3)
+        np.testing.assert_allclose(body.xpos + mat @ [-21.3e-3, 0, 0], data.body(f"my_{name}distal").xpos + [0, 0, 0.032], atol=1e-6)
+        np.testing.assert_allclose(mat, [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-12)
+        assert_pad_leads(model, data, handle, f"{name}J1")
+    assert not any(model.geom(i).name.endswith("tip") for i in range(model.ngeom))
+    # the skin touches the ball and the floor, and none of the hand's own links
+    from test_attach import touching
+
+    assert touching(model, 0)[0] == touching(model, 1)[0] == ["floor", "ball"]
+    mujoco.mj_step(model, data, 3)
+    assert handles["a"].read(data, "status")[0] == 1
+
+
+def test_links_of_the_hand_can_touch_if_asked():
+    from test_attach import touching
+
+    spec = small_hand()
+    attach_to_hand(spec, mounts(), fingers=("a",), self_touch=True, **springs())
+    names = touching(spec.compile())[0]
+    # its own link and that link's parent are MuJoCo's to leave out
+    assert set(names) == {"floor", "ball", "palm", "btip", ""}
+
+
+def test_a_ball_between_two_fingers_feels_both():
+    """Fingers that bend onto a ball hold it: equal and opposite forces, from mj_step alone, with the FEM skin."""
+    text = """<mujoco><option timestep="0.004" integrator="implicitfast" gravity="0 0 0"/><worldbody>
+      <body name="ball"><freejoint/><geom name="ball" size="0.01" mass="0.02"/></body>
+      {}</worldbody></mujoco>"""
+    finger = """<body name="{n}" pos="0 {y} -.012" euler="0 0 {turn}"><joint name="{n}" type="slide" axis="0 -1 0" damping="20"/>
+      <geom type="box" size=".002 .002 .002" pos="0 .01 -.02" mass=".05"/></body>"""
+    spec = mujoco.MjSpec.from_string(text.format(finger.format(n="l", y=0.0185, turn=0) + finger.format(n="r", y=-0.0185, turn=180)))
+    hand = {n: Mount(n, (0, 0, 0.002), replaces=()) for n in "lr"}
+    handles = {n: attach_to_hand(spec, {n: hand[n]}, skin="coarse", tier="condensed")[n] for n in "lr"}
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(60):
+        data.qfrc_applied[model.jnt_dofadr[[model.joint(n).id for n in "lr"]]] = 0.5
+        mujoco.mj_step(model, data)
+    force = {n: h.read(data, "contact_force")[:3] for n, h in handles.items()}
+    assert force["l"][1] == pytest.approx(0.5, rel=0.03) and force["r"][1] == pytest.approx(0.5, rel=0.03)
+    assert np.linalg.norm(data.body("ball").xpos) < 1e-4
+
+
+def test_shadow_hand_both_variants():
+    """24 freedoms with the tip replaced, 19 with Shadow's own BioTac fingers; pads look where fingers bend, left and right."""
+    folder = shadow_folder()
+    for side in ("right", "left"):
+        for variant, nv, nu in (("replace", 24, 20), ("authentic", 19, 19)):
+            spec = mujoco.MjSpec.from_file(str(folder / f"{side}_hand.xml"))
+            handles = attach_to_hand(spec, "shadow_hand", variant=variant, **springs())
+            model = spec.compile()
+            assert (model.nv, model.nu, model.nplugin) == (nv, nu, 5)
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            for finger, handle in handles.items():
+                joint = f"{side[0]}h_{finger.upper()}J{'1' if variant == 'replace' else '2'}"
+                if variant == "replace" or finger != "th":  # the thumb's joint before the last turns across
+                    assert_pad_leads(model, data, handle, joint)
+                mass = model.body_mass[model.body_parentid[model.body(handle.body).id]] + model.body(handle.body).mass[0]
+                assert mass == pytest.approx(0.017 if finger == "th" else 0.013, abs=1e-4)  # as without BioTacs
+            if variant == "authentic":  # the tendon's servo drives what is left of the pair
+                servo = model.actuator(f"{side[0]}h_A_FFJ0")
+                assert model.joint(servo.trnid[0]).name == f"{side[0]}h_FFJ2" and servo.ctrlrange[1] == pytest.approx(1.5708)
+            mujoco.mj_step(model, data, 2)
+            assert all(h.read(data, "status")[0] == 1 for h in handles.values())
+
+
+def test_shadow_hand_with_some_fingers_inside_a_scene():
+    scene = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><body name="ball" pos="0 0 .5"><freejoint/><geom size=".02"/></body></worldbody></mujoco>'
+    )
+    hand = mujoco.MjSpec.from_file(str(shadow_folder() / "right_hand.xml"))
+    scene.attach(hand, frame=scene.worldbody.add_frame(pos=[0, 0, 1]), prefix="robot_")
+    handles = attach_to_hand(scene, "shadow_hand", fingers=("ff", "th"), prefix="tip_", **springs())
+    model = scene.compile()
+    assert [h.body for h in handles.values()] == ["tip_ff_core", "tip_th_core"]
+    assert model.body(model.body("tip_ff_core").parentid[0]).name == "robot_rh_ffdistal"
+    mujoco.mj_step(model, mujoco.MjData(model), 2)
+
+
+def test_mounting_frames_point_as_the_hands_do():
+    """Of each hand in the table the BioTac's -x is the finger's tip direction and its -y the pad's."""
+    for hand in HANDS.values():
+        for mount in hand.values():
+            matrix = np.empty(9)
+            mujoco.mju_quat2Mat(matrix, mount.quat)
+            np.testing.assert_allclose(matrix.reshape(3, 3) @ [-1, 0, 0], mount.tip, atol=1e-9)
+            np.testing.assert_allclose(matrix.reshape(3, 3) @ [0, -1, 0], mount.pad, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "settings, text",
+    [
+        (dict(hand="barrett"), r"unknown hand 'barrett': choose one of shadow_hand.*or give \{finger: Mount"),
+        (dict(hand="allegro_hand", variant="authentic"), r"only the shadow_hand comes with authentic BioTac fingers, not 'allegro_hand'"),
+        (dict(variant="new"), r"unknown variant 'new': choose replace or authentic"),
+        (dict(fingers=("ff", "pinky")), r"the hand has no finger 'pinky': choose from ff, mf, rf, lf, th"),
+        (dict(fingers=("ff",)), r"no link ends with 'ffdistal': the model has world, ball, my_palm"),
+        (dict(hand={"x": Mount("distal", (0, 0, 0))}), r"several links end with 'distal': the model has my_adistal, my_bdistal"),
+        (dict(hand={"a": Mount("adistal", (0, 0, 0), tip=(0, 0, 1), pad=(0, 0, 1))}), r"of link 'adistal' must be at right angles"),
+    ],
+)
+def test_bad_hands(settings, text):
+    with pytest.raises(ValueError, match=text):
+        attach_to_hand(small_hand(), **({"hand": "shadow_hand"} | settings))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ball", "cube", "can"])
+def test_shadow_hand_lifts(name, monkeypatch, repo):
+    """The example's hand lifts each object by most of its own lift, with at least three fingertips on it, thumb or palm helping."""
+    from test_examples import load
+
+    monkeypatch.setenv("MENAGERIE_ROOT", str(shadow_folder().parent))
+    result = load(repo, "shadow_hand_grasp").run(name, progress=False)
+    assert result["height"][-1] > 0.05
+    assert (result["force"][-1] > 0.05).sum() >= 3
+    assert (np.abs(result["counts"] - result["counts"][0]).max(axis=(0, 2)) > 20).sum() >= 4

@@ -1,0 +1,253 @@
+"""Every task, by one test; the Entity's observables; touch and its estimators; bad input."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
+
+# ruff: noqa: E402
+from dm_control import composer, mjcf
+
+from biotac_mj.sensor.channels import REST_COUNTS
+from biotac_mj.tasks import BioTac, load, scripted, suite, touch
+from biotac_mj.tasks.biotac import PRIVILEGED, TACTILE
+
+TASKS = [pytest.param(*pair, id="/".join(pair)) for pair in suite.tasks()]
+QUIET = {"noise": False}
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    import biotac_mj
+
+    yield
+    biotac_mj.plugin.check()
+
+
+def rollout(domain, task, steps, seed, **settings):
+    """Observations, rewards and positions of a random policy that pushes down, so that it touches."""
+    env = load(domain, task, task_kwargs={"random": seed, "time_limit": 1e3, **settings})
+    spec, rng = env.action_spec(), np.random.RandomState(seed)
+    step, rows = env.reset(), []
+    for _ in range(steps):
+        action = rng.uniform(spec.minimum, spec.maximum, size=spec.shape)
+        action[2 if domain == "finger" else -1] = -0.5 if domain == "finger" else 0.5
+        step = env.step(action)
+        for name, value in env.observation_spec().items():
+            value.validate(step.observation[name])
+        rows.append(np.concatenate([np.ravel(v) for v in step.observation.values()] + [[step.reward], env.physics.data.qpos]))
+        assert 0.0 <= step.reward <= 1.0
+    return np.array(rows), env
+
+
+def check(domain, task, steps):
+    first, env = rollout(domain, task, steps, 3)
+    assert np.isfinite(first).all()
+    again, _ = rollout(domain, task, steps, 3)
+    np.testing.assert_array_equal(first, again)
+    other, _ = rollout(domain, task, steps, 4)
+    assert (other != first).any()
+    touched = [np.abs(env.task.force(env.physics, i)).max() for i in range(len(env.task.biotacs))]
+    assert env.action_spec().shape == (len(env.action_spec().name.split("\t")),)
+    assert env.task.hidden(env.physics).shape == (len(env.task.biotacs), len(env.task.estimated))
+    return touched
+
+
+@pytest.mark.parametrize("domain, task", TASKS)
+def test_a_task(domain, task):
+    """Specs hold, rewards lie in [0, 1], nothing is NaN, the same seed gives the same trajectory and another one another."""
+    check(domain, task, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("domain, task", TASKS)
+def test_a_task_for_200_steps(domain, task):
+    """The same for 200 steps, in which what is there is touched."""
+    assert max(check(domain, task, 200)) > 0.01
+
+
+def test_an_episode_begins_anew():
+    """A reset after contact leaves no trace: skin and readings start from rest, without a new compilation."""
+    env = load("finger", "press", task_kwargs={"random": 0, "biotac": QUIET})
+    env.reset()
+    model = env.physics.model.ptr
+    for _ in range(45):
+        step = env.step(np.array([0, 0, -1.0]))
+    entity = env.task.biotacs[0]
+    assert entity.read(env.physics, "contact_force")[1] > 0.1
+    assert np.abs(step.observation["finger/biotac/electrodes"] - REST_COUNTS["1"]).max() > 20
+    step = env.reset()
+    assert env.physics.model.ptr is model
+    np.testing.assert_array_equal(step.observation["finger/biotac/electrodes"], REST_COUNTS["1"])
+    np.testing.assert_array_equal(entity.read(env.physics, "contact_force"), 0.0)
+
+
+class PlateTask(composer.Task):
+    """A plate pushed against a BioTac's pad, along its own frame's +y."""
+
+    def __init__(self, depth, **settings):
+        self.arena, self.entity, self.depth = composer.Arena(), BioTac(**settings), depth
+        self.arena.attach(self.entity, self.arena.mjcf_model.worldbody.add("site", name="mount", pos=[0, 0, 0.1]))
+        self.plate = self.arena.mjcf_model.worldbody.add("body", name="plate", mocap=True, pos=[0, 0, -1])
+        self.plate.add("geom", name="plate", type="box", size=[0.03, 0.01, 0.03])
+        self.set_timesteps(0.01, 0.005)
+
+    root_entity = property(lambda self: self.arena)
+
+    def get_reward(self, physics):
+        return 0.0
+
+    def before_step(self, physics, action, random_state):
+        time = min(physics.data.time / 0.1, 1.0)
+        physics.data.mocap_pos[0] = [0, -8.3e-3 - 0.01 + time * self.depth, 0.1]
+
+
+def environment(task, **settings):
+    options = dict(random_state=0, recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
+    return composer.Environment(task, **options | settings)
+
+
+def test_presets_and_patch():
+    """TACTILE and PRIVILEGED have the documented shapes; force and patch say where a plate presses: from the pad, along +y."""
+    task = PlateTask(0.6e-3, noise=False)
+    task.entity.observables.enable(TACTILE + PRIVILEGED)
+    env = environment(task)
+    step = env.reset()
+    nouter = len(task.entity.outer)
+    shapes = {"electrodes": (19,), "pac": (22,), "pdc": (1,), "tac": (1,), "tdc": (1,)}
+    shapes |= {"contact_force": (6,), "contact_patch": (6,), "skin": (nouter, 3)}
+    assert {name: step.observation[f"biotac/{name}"].shape for name in shapes} == shapes
+    assert not step.observation["biotac/contact_patch"].any()
+    for _ in range(15):
+        step = env.step(np.zeros(0))
+    force, patch, skin = (step.observation[f"biotac/{name}"] for name in ("contact_force", "contact_patch", "skin"))
+    assert force[1] > 0.3 and force[1] > 5 * np.abs(force[[0, 2]]).max()
+    np.testing.assert_allclose(patch[3:], -force[:3] / np.linalg.norm(force[:3]))
+    # the plate's face has come to y = -8.3 + 0.6 mm, so the touching skin lies there
+    assert patch[1] == pytest.approx(-7.7e-3, abs=0.25e-3) and -0.018 < patch[0] < 0.006 and abs(patch[2]) < 1.5e-3
+    assert skin[:, 1].min() == pytest.approx(-7.7e-3, abs=0.05e-3)  # nothing is behind the plate's face
+    task.entity.observables.enable(("pdc",))
+    assert list(environment(task).reset().observation) == ["biotac/pdc"]
+
+
+def test_delay_noise_and_rate_belong_to_the_observable():
+    task = PlateTask(0.6e-3)
+    observables = task.entity.observables
+    observables.enable(("electrodes", "pdc", "contact_force"))
+    observables.contact_force.rate, observables.contact_force.lag = 1000.0, 0.03
+    observables.pdc.noise, observables.pdc.rate = None, 25.0
+    env = environment(task)
+    env.reset()
+    assert (observables.electrodes.update_interval, observables.electrodes.delay) == (2, 0)  # 100 Hz at 5 ms
+    assert (observables.contact_force.update_interval, observables.contact_force.delay) == (1, 6)
+    truth, seen, pdc, counts = [], [], [], []
+    for _ in range(20):
+        step = env.step(np.zeros(0))
+        truth.append(task.entity.read(env.physics, "contact_force")[1])
+        seen.append(step.observation["biotac/contact_force"][1])
+        pdc.append(step.observation["biotac/pdc"][0])
+        counts.append(step.observation["biotac/electrodes"])
+    np.testing.assert_allclose(seen[4:], truth[1:-3])  # 30 ms are three control steps
+    changes = np.flatnonzero(np.diff(pdc[3:18]))
+    assert len(changes) and (np.diff(changes) >= 4).all()  # every 40 ms
+    counts = np.array(counts)
+    assert (counts == counts.round()).all() and counts.min() >= 0 and counts.max() <= 4095
+    assert np.diff(counts[-5:], axis=0).any()  # noise, though the plate is still
+
+
+def test_entity_attaches_to_any_site_and_twice():
+    arena = composer.Arena()
+    for name in ("left", "right"):
+        arena.attach(BioTac(name=name), arena.mjcf_model.worldbody.add("site", name=f"at_{name}", pos=[0.1 * (name == "left"), 0, 0]))
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    assert physics.model.nplugin == 2
+    assert physics.model.name2id("left/electrodes", "sensor") >= 0 and physics.model.name2id("right/core", "body") >= 0
+
+
+def test_estimator_recovers_a_quadratic_map_and_names_its_error():
+    """Ridge on quadratic features: exact on a noise-free quadratic map; the reported error is that of episodes it has not seen."""
+    rng = np.random.RandomState(0)
+    x = rng.standard_normal((2000, 20))
+    truth = np.stack([1 + 2 * x[:, 3] - x[:, 0] * x[:, 5], x[:, 19] ** 2], axis=1)
+    episode = np.repeat(range(8), 250)
+    fit = touch.Estimator.fit(x, truth, episode)
+    np.testing.assert_allclose(fit(x[:5]), truth[:5], atol=1e-3)
+    noisy = touch.Estimator.fit(x, truth + 0.3 * rng.standard_normal(truth.shape), episode)
+    np.testing.assert_allclose(noisy.error, 0.3, rtol=0.15)
+    with pytest.raises(ValueError, match="3 episodes: a fit needs four"):
+        touch.Estimator.fit(x[:300], truth[:300], np.repeat(range(3), 100))
+
+
+def test_touch_is_tared():
+    reader, rng = touch.Touch(), np.random.RandomState(0)
+    rest = {"a/electrodes": REST_COUNTS["2"], "a/pdc": np.array([2100.0])}
+    for _ in range(5):
+        assert not reader.update({k: v + rng.uniform(-2, 2, v.shape) for k, v in rest.items()}).any()
+    assert reader.tared
+    for _ in range(8):
+        felt = reader.update({"a/electrodes": REST_COUNTS["2"] + 100, "a/pdc": np.array([2300.0])})
+    assert felt.shape == (1, 20) and (felt[0, :19] < -0.5).all()  # counts rise where ln Z falls
+    assert felt[0, 19] == pytest.approx(2.0, abs=0.05)
+    with pytest.raises(ValueError, match="no electrodes in the observation: load the task with observe='tactile'"):
+        reader.update({"position": np.zeros(3)})
+
+
+def test_dm_controls_wrappers_and_viewer():
+    """Action scale, pixels and the viewer's own runtime, as for a task of dm_control.suite."""
+    from dm_control.suite.wrappers import action_scale, pixels
+
+    from biotac_mj.offscreen import find_gl
+
+    env = action_scale.Wrapper(load("finger", "press", task_kwargs={"random": 0}), minimum=-10.0, maximum=10.0)
+    assert (env.action_spec().maximum == 10.0).all()
+    env.reset()
+    before = env.task.machine.position(env.physics)
+    for _ in range(5):
+        env.step(np.array([10.0, 0, 0]))
+    assert env.task.machine.position(env.physics)[0] - before[0] > 0.5e-3  # full speed is 30 mm/s
+    from dm_control.viewer import runtime
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shown = runtime.Runtime(environment=load("finger", "press", task_kwargs={"random": 0}), policy=None)
+    shown.tick(0.05, paused=False)
+    shown.tick(0.05, paused=False)
+    assert shown.get_time() > 0
+    if find_gl() is None:
+        pytest.skip("no GL library to render pixels with")
+    import os
+
+    if os.environ.get("MUJOCO_GL", "") not in ("egl", "osmesa"):
+        pytest.skip("dm_control renders pixels headless only with MUJOCO_GL=egl or osmesa")
+    env = pixels.Wrapper(load("finger", "press", task_kwargs={"random": 0}), render_kwargs={"height": 48, "width": 64, "camera_id": "side"})
+    picture = env.reset().observation["pixels"]
+    assert picture.shape == (48, 64, 3) and picture.std() > 5
+
+
+@pytest.mark.parametrize(
+    "call, text",
+    [
+        (lambda: load("arm", "press"), "no domain 'arm': choose one of finger, gripper"),
+        (lambda: load("finger", "push"), "domain 'finger' has no task 'push': choose one of press"),
+        (lambda: load("finger", "press", task_kwargs={"observe": "touch"}), "unknown preset observe='touch': choose one of tactile"),
+        (lambda: load("finger", "explore", task_kwargs={"objects": ["peg"]}), "no object 'peg': choose from sphere_3-5mm"),
+        (lambda: BioTac(site="tip"), "BioTac got site='tip': an Entity is placed with robot.attach"),
+        (lambda: BioTac(tier="fast"), "unknown tier 'fast': choose one of full, condensed"),
+        (lambda: scripted.make_controller("juggle"), "no scripted controller for task 'juggle': there are press"),
+        (
+            lambda: touch.load_estimator("juggle"),
+            "no calibration of task 'juggle': run `python -m biotac_mj.tasks.calibrate --estimators juggle`",
+        ),
+    ],
+)
+def test_bad_input(call, text):
+    with pytest.raises(ValueError) as caught:
+        call()
+    assert text in str(caught.value)
+
+
+def test_unknown_observable():
+    with pytest.raises(ValueError, match="a BioTac has no observable 'e1': choose from electrodes, pac"):
+        BioTac().observables.enable(("e1",))
