@@ -18,7 +18,7 @@ from .metric import Metric
 from .stepper import make_readings, make_stepper
 from .touching import Touching
 
-__all__ = ["Instance", "Setup", "reset_state", "state_size"]
+__all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
 
 # head of the plugin state: steps that did not converge, then how the last committed step went
 _HEAD = 4
@@ -60,6 +60,12 @@ _cache_lock = threading.RLock()
 def _skin(config, touching):
     with _cache_lock:  # lru_cache alone would let two threads build the same skin
         return _cached_skin(_SkinKey(config, touching))
+
+
+def forget_skins():
+    """Makes the next model build its skins anew; those of living models stay."""
+    with _cache_lock:
+        _cached_skin.cache_clear()
 
 
 class Setup:

@@ -9,7 +9,7 @@ swelling   c = 1 / (1 + p / (k E)): pressure moves the skin by c times as much. 
 import dataclasses
 import math
 
-__all__ = ["Correction", "correction"]
+__all__ = ["FITTED", "Correction", "correction"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Correction:
         return low <= poissons_ratio <= high and squeezed <= self.squeezed
 
 
-_FITTED = {
+FITTED = {
     "corotational": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 0.0, (0.25, 0.4), 0.5),
     "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 5.3, (0.4, 0.4999), 0.45),
     "linear": Correction(math.inf, 1.0, 1.0, math.inf, 0.0, (0.0, 0.4), 1.0),
@@ -55,4 +55,4 @@ _FITTED = {
 
 def correction(law: str) -> Correction:
     """Of a material law; those that were not fitted have that of the corotational one and count as not measured."""
-    return _FITTED.get(law) or dataclasses.replace(_FITTED["corotational"], poissons_ratio=(0.0, 0.0), squeezed=0.0)
+    return FITTED.get(law) or dataclasses.replace(FITTED["corotational"], poissons_ratio=(0.0, 0.0), squeezed=0.0)
