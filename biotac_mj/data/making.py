@@ -58,13 +58,14 @@ class Maker:
         total = o.steps * sum(batch.simulated + batch.measured for batch in todo)
         bar = tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False)
         with bar, readings.readings_pool(self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args) as pool:
-            waiting = []
+            waiting, written = [], []
             for batch in todo:
                 waiting.append(self._begin(batch, pool, bar))
                 if len(waiting) > 1:
-                    self._end(waiting.pop(0))
-            for one in waiting:
-                self._end(one)
+                    written.append(self._end(waiting.pop(0), pool))
+            written += [self._end(one, pool) for one in waiting]
+            for one in written:
+                one.result()
 
     def _begin(self, batch, pool, bar) -> _Running:
         """Plans and simulates a batch and hands its readings to the workers."""
@@ -100,8 +101,8 @@ class Maker:
         self.seconds[stage] += now - since
         return now
 
-    def _end(self, running):
-        """Waits for the readings of a batch and writes its shard."""
+    def _end(self, running, pool):
+        """Waits for the readings of a batch and has its shard written: compressing it takes a core some seconds."""
         batch, ones = running.batch, []
         for k, (number, motion) in enumerate(zip(batch.members, running.motions)):
             columns = {"indenter_pos": motion.pos, "indenter_quat": _quaternions(motion.mat), "converged": np.ones(len(self.time), bool)}
@@ -131,7 +132,7 @@ class Maker:
                     **columns,
                 )
             )
-        write_shard(self.out / batch.path, ones, self.geometry if batch.simulated else None, self.attributes)
+        return pool.submit(write_shard, self.out / batch.path, ones, self.geometry if batch.simulated else None, self.attributes)
 
 
 def _quaternions(mat):
