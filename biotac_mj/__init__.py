@@ -24,7 +24,19 @@ from . import plugin  # registers the engine plugin  # noqa: E402
 
 __version__ = "0.1.0"
 
-__all__ = ["SkinData", "SkinGeometry", "SkinModel", "__version__", "attach", "attach_to_hand", "import_mesh", "load_skin", "plugin", "step"]
+__all__ = [
+    "SensorBioTac",
+    "SkinData",
+    "SkinGeometry",
+    "SkinModel",
+    "__version__",
+    "attach",
+    "attach_to_hand",
+    "import_mesh",
+    "load_skin",
+    "plugin",
+    "step",
+]
 
 _HOME = {
     "SkinGeometry": "geometry",
@@ -34,6 +46,7 @@ _HOME = {
     "SkinData": "skin",
     "step": "skin",
     "attach": "coupling",
+    "SensorBioTac": "coupling.sensor_biotac",
     "attach_to_hand": "tasks.hands",
 }
 

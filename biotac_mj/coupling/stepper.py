@@ -118,7 +118,11 @@ class _NoReadings:
 # A name, or where to find the factory the first time the name is used.
 _steppers = {"fem": "biotac_mj.coupling.fem:FemStepper"}
 _tiers = {"condensed": "biotac_mj.coupling.condensed:CondensedStepper"}  # instead of "fem"
-_readings = {"biotac": "biotac_mj.coupling.readings:SensorReadings", "none": _NoReadings}
+_readings = {
+    "biotac": "biotac_mj.coupling.readings:SensorReadings",
+    "latent_projection": "biotac_mj.learning.serve:LearnedReadings",
+    "none": _NoReadings,
+}
 
 
 def register_stepper(name, factory):

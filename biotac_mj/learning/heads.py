@@ -63,9 +63,9 @@ def next_average(average, value, dt, tau):
     """Causal exponential average after one more step of dt [s]; time constants tau, a tuple [s].
 
     Args:
-      average: (len(tau), ...) before; value: (...) now.
+      average: (len(tau), ...) before; value: (...) now. dt: float, or a tensor that fits value.
     """
-    return torch.stack([a + (1 - torch.exp(torch.as_tensor(-dt / t))) * (value - a) for a, t in zip(average, tau)])
+    return torch.stack([a + (1 - torch.exp(torch.as_tensor(-dt / t, dtype=value.dtype))) * (value - a) for a, t in zip(average, tau)])
 
 
 def averages(value, first, time, tau):

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..sensor.channels import FULL_SCALE
 
-__all__ = ["ELECTRODES", "Recording", "load_recording", "log_impedance", "counts_of"]
+__all__ = ["ELECTRODES", "Recording", "counts_of", "load_counts", "load_recording", "log_impedance"]
 
 ELECTRODES = 19
 _SHORTEST = 400  # rows: fewer leave too little for a time split with walk-forward choices
@@ -57,6 +57,29 @@ def load_recording(electrodes, force=None) -> Recording:
                 f"{electrodes} has {len(counts)} rows and the force file {len(force)}: they must be samples of the same instants"
             )
     return Recording(counts, force, ((counts <= 0) | (counts >= FULL_SCALE)).mean(0))
+
+
+def load_counts(path):
+    """(n, 19) raw counts of a text file as `load_recording` reads it, or of the columns e1..e19 of a CSV with a header.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_recording`; a header without all of e1..e19 is named.
+    """
+    path = pathlib.Path(path)
+    if path.suffix != ".csv":
+        return _table(path, ELECTRODES, "electrode counts e1..e19")
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}: give readings.csv of `biotac press`, or text of 19 columns")
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    header = [name.strip() for name in lines[0].split(",")] if lines else []
+    missing = [f"e{i}" for i in range(1, ELECTRODES + 1) if f"e{i}" not in header]
+    if missing:
+        raise ValueError(f"{path} has no columns {', '.join(missing)}: its header must name e1..e19")
+    columns = [header.index(f"e{i}") for i in range(1, ELECTRODES + 1)]
+    try:
+        return np.array([[float(row.split(",")[k]) for k in columns] for row in lines[1:]])
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path} has a row that is not numbers in columns e1..e19 ({error})") from error
 
 
 def log_impedance(counts):

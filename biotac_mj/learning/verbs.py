@@ -59,6 +59,10 @@ def _add_evaluate(verbs, verb):
     v.add_argument("folder", nargs="?", metavar="DIR", help="what `biotac train` wrote")
     v.add_argument("--electrodes", metavar="FILE", help="a recording: text, 19 columns of raw counts e1..e19; reconstruction is judged")
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N]; force from electrodes is judged too")
+    v.add_argument(
+        "--new-sensor", metavar="SET", help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights"
+    )
+    v.add_argument("--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)")
     v.add_argument("--fraction", type=float, default=0.7, help="of the recording's rows, in time, that train")
     v.add_argument("--seed", type=int, default=0, help="of the recording's networks")
     v.add_argument("--json", metavar="FILE", help="where the numbers go, a plot beside them (default: out/evaluate/...)")
@@ -68,6 +72,13 @@ def _add_evaluate(verbs, verb):
 def _evaluate(args):
     if args.electrodes:
         _evaluate_recording(args)
+    elif args.new_sensor:
+        from .few_shot import evaluate_new_sensor
+        from .weights import shipped
+
+        one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json or "out/evaluate/new_sensor.json")
+        for name, value in one["median_rms_counts_after_touches"].items():
+            print(f"  {'predict the tare' if name == 'tare' else name + ' touches':<20}{value:>8.2f} counts, median RMS per interaction")
     elif args.folder:
         _evaluate_models(args)
     else:

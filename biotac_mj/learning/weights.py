@@ -10,7 +10,7 @@ import torch
 from ..press_record import replacing
 from ..sensor.channels import CHANNELS
 
-__all__ = ["load_forward", "load_inverse", "mesh_key", "save_forward", "save_inverse", "shipped"]
+__all__ = ["load_forward", "load_inverse", "mesh_key", "save_forward", "save_inverse", "shipped", "window_of"]
 
 _FORMAT = "biotac_mj.learning.weights/1"
 
@@ -63,18 +63,27 @@ def _save(path, tensors, geometry, meta):
         save_file(tensors, str(temporary), {"biotac_mj": json.dumps(meta, sort_keys=True)})
 
 
-def _load(path, geometry, direction):
+def _meta(path):
+    return _read(path, ())[0]
+
+
+def _read(path, names=None):
+    """Description and tensors (all, or of these names) of a file."""
     from safetensors import safe_open
 
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no weights {path}: give the file that `biotac train` wrote, {direction}-SPLIT.safetensors")
+        raise FileNotFoundError(f"no weights {path}: give a file that `biotac train` wrote, forward-SPLIT or inverse-SPLIT.safetensors")
     try:
         with safe_open(str(path), framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
-            tensors = {k: file.get_tensor(k).float() for k in file.keys()}
+            return meta, {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}
     except Exception as error:
         raise ValueError(f"{path} is not a readable safetensors file ({error}): train again, or copy it again") from error
+
+
+def _load(path, geometry, direction):
+    meta, tensors = _read(path)
     if meta.get("format") != _FORMAT or meta.get("direction") != direction:
         raise ValueError(f"{path} holds no {direction} model of {_FORMAT}: it says {meta.get('format')}, {meta.get('direction')}")
     if meta["channels"] != list(CHANNELS[:19]):
@@ -100,6 +109,14 @@ def load_forward(path, geometry):
     model = ForwardModel(geometry, meta, tensors["pod.scale"].numel())
     _fill(model, {k.replace("member", "members.", 1) if k.startswith("member") else k: v for k, v in tensors.items()}, path)
     return model.eval()
+
+
+def window_of(path) -> tuple:
+    """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has none."""
+    from .features import FilmFeatures
+
+    meta = _meta(path)
+    return (len(meta["window"]), 19, FilmFeatures.count) if meta.get("window") else (0,)
 
 
 def load_inverse(path, geometry):

@@ -1,0 +1,61 @@
+"""`SensorBioTac`: one place to say where the counts of the electrodes come from, for MuJoCo, dm-control and batches alike."""
+
+import dataclasses
+
+__all__ = ["SIGNALS", "SensorBioTac"]
+
+SIGNALS = ("physics", "latent_projection")
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorBioTac:
+    """Settings of the readings.
+
+        handle = biotac_mj.attach(spec, site="tip", **SensorBioTac(signal="latent_projection").settings())
+
+    Attributes:
+      signal: "physics": conduction in the liquid film; "latent_projection": the learned model that did best on unseen objects,
+        trained on synthetic data (docs/learning.md).
+      sensor: "1" | "2" | "3", whose published rest counts are shown.
+      noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
+      film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
+
+    Raises:
+      ValueError: unknown signal, or weights for the physics.
+    """
+
+    signal: str = "physics"
+    sensor: str = "1"
+    noise: bool = True
+    weights: str | None = None
+    film_every_step: bool = False
+
+    def __post_init__(self):
+        if self.signal not in SIGNALS:
+            raise ValueError(f"unknown signal {self.signal!r}: choose one of {', '.join(SIGNALS)}")
+        if self.signal == "physics" and self.weights is not None:
+            raise ValueError(f"weights {self.weights!r} are given but the signal is 'physics': take signal='latent_projection'")
+
+    def options(self) -> dict:
+        """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
+        out = {"sensor": self.sensor, "noise": self.noise, "film_every_step": self.film_every_step}
+        return out if self.weights is None else out | {"weights": str(self.weights)}
+
+    def settings(self, options=None) -> dict:
+        """Arguments for `biotac_mj.attach` and `tasks.BioTac`: readings and options; `options` are further ones to keep."""
+        name = "biotac" if self.signal == "physics" else self.signal
+        return {"readings": name, "options": {**(options or {}), "readings": self.options()}}
+
+    def batch(self):
+        """Argument `readings` of `biotac_mj.batch`."""
+        return self.options() | ({} if self.signal == "physics" else {"signal": self.signal})
+
+    def readings(self, geometry, seed=0):
+        """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
+        if self.signal == "physics":
+            from ..sensor.readings import PhysicsReadings
+
+            return PhysicsReadings(geometry, seed=seed, **self.options())
+        from ..learning.serve import NetworkReadings
+
+        return NetworkReadings(geometry, seed=seed, **self.options())

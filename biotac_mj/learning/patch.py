@@ -1,0 +1,134 @@
+"""`biotac contact-patch`: deformation and contact patch of a BioTac from its electrodes, drawn from below as in the paper's figure."""
+
+import json
+import pathlib
+
+import numpy as np
+import torch
+
+from ..geometry import load_skin
+from ..press_record import replacing
+from .inverse import PATCH, contact_centre, log_change_of
+from .recording import load_counts
+from .weights import load_inverse, shipped
+
+__all__ = ["contact_patch", "draw_skin", "estimate"]
+
+
+def estimate(counts, tare, geometry, weights=None):
+    """Displacements and contact force of raw counts.
+
+    Args:
+      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin of the weights. weights: file; None takes the package's.
+
+    Returns:
+      displacement (n, nvert, 3) [m] and force (n, nouter) [N] on the nodes of the outer surface, sorted.
+
+    Raises:
+      ValueError: not 19 channels, values that are not finite or no raw counts, or weights of another skin.
+    """
+    change = log_change_of(counts, tare)
+    head = load_inverse(weights or shipped("inverse"), geometry)
+    with torch.no_grad():
+        field, force = head(torch.as_tensor(change, dtype=torch.float32))
+    return 1e-3 * field.double().numpy(), force.double().numpy()
+
+
+def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", weights=None) -> dict:
+    """Estimates every row of a recording, draws one; writes contact.png and contact.json into `out`.
+
+    Args:
+      source: text of 19 columns, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor at rest.
+      row: which row is drawn and returned.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: a bad table, or a tare or row that the recording does not have.
+    """
+    counts = load_counts(source)
+    if not 1 <= tare < len(counts):
+        raise ValueError(f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at")
+    if not -len(counts) <= row < len(counts):
+        raise ValueError(f"--row {row}: the recording has {len(counts)} rows")
+    geometry = load_skin(skin)
+    row = row % len(counts)
+    field, force = estimate(counts, counts[:tare].mean(0), geometry, weights)
+    outer = np.unique(geometry.outer_face)
+    place = geometry.vert[outer]
+    area = _node_area(geometry, outer)
+    patch = force > PATCH * force.max(1, keepdims=True)
+    centre = contact_centre(force, place)
+    table = {
+        "schema": "biotac_mj.learning.contact_patch/1", "weights": "trained on synthetic data", "source": str(source),
+        "centre_mm": [None if np.isnan(c).any() else (1e3 * c).tolist() for c in centre],
+        "force_N": force.sum(1).tolist(), "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
+        "deepest_mm": (1e3 * np.linalg.norm(field[:, outer], axis=2).max(1)).tolist(),
+    }  # fmt: skip
+    out = pathlib.Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    with replacing(out / "contact.json") as temporary:
+        pathlib.Path(temporary).write_text(json.dumps(table))
+    one = {"row": row} | {k: table[name][row] for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))}
+    one["centre_mm"] = table["centre_mm"][row] or [float("nan")] * 3
+    _figure(geometry, outer, field[row], force[row], centre[row], counts[row], counts[:tare].mean(0), one, out / "contact.png")
+    return one
+
+
+def _node_area(geometry, outer):
+    """(nouter,) [m2]: a third of each adjacent face."""
+    corner = geometry.vert[geometry.outer_face]
+    third = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6
+    return np.bincount(np.searchsorted(outer, geometry.outer_face).ravel(), np.repeat(third, 3), len(outer))
+
+
+def draw_skin(axis, vert, face, value, limit, title, cmap="viridis"):
+    """Draws a surface seen from the pad's side (along +y): faces coloured by the mean of nodal values, shaded, far ones first.
+
+    Args:
+      axis: of matplotlib. vert: (n, 3) [m]; face: (m, 3); value: (n,); limit: of the colours.
+
+    Returns:
+      the collection, for a colour bar.
+    """
+    import matplotlib
+    from matplotlib.collections import PolyCollection
+
+    corner = vert[face]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
+    seen = normal[:, 1] < 0
+    order = np.flatnonzero(seen)[np.argsort(-corner[seen][:, :, 1].mean(1))]
+    colour = matplotlib.colormaps[cmap](np.clip(value[face[order]].mean(1) / limit, 0, 1))
+    light = 0.35 + 0.65 * np.clip(normal[order] @ (np.array([-0.35, -0.85, 0.4]) / 1.003), 0, 1)
+    colour[:, :3] *= light[:, None]
+    axis.add_collection(PolyCollection(1e3 * corner[order][:, :, [0, 2]], facecolors=colour, edgecolors=colour, linewidths=0.3))
+    axis.set_xlim(-23, 3), axis.set_ylim(-8.5, 8.5)
+    axis.set_aspect("equal")
+    axis.set_title(title, fontsize=10)
+    axis.set_xlabel("x [mm], tip on the left"), axis.set_ylabel("z [mm]")
+    return matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(0, limit), cmap)
+
+
+def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 3.9), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1, 0.8])
+    shape = geometry.vert + field
+    depth = 1e3 * np.linalg.norm(field, axis=1)
+    bar = draw_skin(left, shape, geometry.outer_face, depth, max(depth[outer].max(), 1e-3), "displacement from electrodes [mm]")
+    figure.colorbar(bar, ax=left, shrink=0.8)
+    nodal = np.zeros(geometry.nvert)
+    nodal[outer] = force / _node_area(geometry, outer) * 1e-3
+    bar = draw_skin(middle, shape, geometry.outer_face, nodal, max(nodal.max(), 1e-6), "contact pressure from electrodes [kPa]", "inferno")
+    figure.colorbar(bar, ax=middle, shrink=0.8)
+    if np.isfinite(centre).all():
+        middle.plot(1e3 * centre[0], 1e3 * centre[2], "+", color="c", ms=12, mew=2)
+    e = 1e3 * geometry.electrode_pos
+    for axis in (left, middle):
+        axis.plot(e[:, 0], e[:, 2], ".", color="w", ms=3)
+    right.bar(np.arange(1, 20), counts - tare, color="C0")
+    right.set_xlabel("electrode"), right.set_title("measured change [counts]", fontsize=10)
+    what = f"row {one['row']}: force about {one['force']:.2f} N, patch {one['area_mm2']:.1f} mm2"
+    figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)
+    figure.savefig(path, dpi=120)

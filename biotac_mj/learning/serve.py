@@ -1,0 +1,138 @@
+"""The network in the film's place: what a step of MuJoCo, of dm-control or of a batch asks for the electrodes."""
+
+import functools
+
+import numpy as np
+import torch
+
+from ..sensor.acquisition import Acquisition
+from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, impedance_from_counts
+from .weights import load_forward, shipped, window_of
+
+__all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkReadings"]
+
+
+class NetworkReadings:
+    """Counts of all channels: electrodes from a network, the rest as `sensor.readings.PhysicsReadings` has it. The state is the caller's.
+
+    Args:
+      geometry: the skin that the weights were trained on.
+      weights: file; None takes those of the package (trained on synthetic data).
+      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; `sensor` gives the rest counts that d ln Z is added to.
+
+    Attributes:
+      nstate: length of the state: the acquisition's, the time of the last film, and what the network's window remembers.
+    """
+
+    def __init__(self, geometry, weights=None, seed=0, noise=True, sensor="1", film_every_step=False, temperature=REST_TEMPERATURE):
+        if sensor not in REST_COUNTS:
+            raise ValueError(f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
+        self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
+        self.temperature = temperature
+        self._weights, self._geometry = weights or shipped("forward"), geometry
+        self._rest = impedance_from_counts(REST_COUNTS[sensor])
+        self._memory = window_of(self._weights)
+        self.nstate = Acquisition.nstate + 1 + int(np.prod(self._memory))
+
+    @functools.cached_property
+    def model(self):
+        return load_forward(self._weights, self._geometry)
+
+    def _parts(self, state):
+        n = Acquisition.nstate
+        return state[:n], state[n : n + 1], state[n + 1 :]
+
+    def reset(self, state, pressure=0.0, time=0.0):
+        """Writes the skin at rest into state (nstate,)."""
+        acquisition, last, memory = self._parts(state)
+        self.acquisition.reset(acquisition, self._rest, pressure, self.temperature, time)
+        last[:], memory[:] = time, 0
+
+    def advance(self, state, time, dt, vert_xpos, pressure):
+        """Samples (time, time + dt]; arguments and errors as `PhysicsReadings.advance`."""
+        acquisition, last, memory = self._parts(state)
+        impedance = None
+        if self.acquisition.needs_impedance(acquisition, time, dt):
+            vert_xpos = np.asarray(vert_xpos, float)
+            if vert_xpos.shape != self._geometry.vert.shape:
+                raise ValueError(f"vert_xpos has shape {vert_xpos.shape}: this network reads {self._geometry.vert.shape}")
+            u = torch.as_tensor(1e3 * (vert_xpos - self._geometry.vert), dtype=torch.float32)[None]
+            before = torch.as_tensor(memory.reshape(1, *self._memory), dtype=torch.float32) if memory.size else None
+            change, after = self.model.log_change(u, before, time + dt - last[0])
+            impedance = self._rest * np.exp(change[0].double().numpy())
+        self.acquisition.advance(acquisition, time, dt, impedance, pressure, self.temperature)
+        if impedance is not None:
+            last[0] = time + dt
+            if memory.size:
+                memory[:] = after.numpy().ravel()
+
+    def readings(self, state):
+        """dict of counts, as `PhysicsReadings.readings`."""
+        return self.acquisition.readings(self._parts(state)[0])
+
+
+class LearnedReadings:
+    """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to it."""
+
+    def __init__(self, config, geometry):
+        self._network = NetworkReadings(geometry, seed=config.seed, **dict(config.options.get("readings", {})))
+        self.nstate = self._network.nstate
+
+    @functools.cached_property
+    def rest(self):
+        state = np.zeros(self.nstate)
+        self._network.reset(state)
+        return self._network.readings(state)
+
+    def reset(self, state):
+        self._network.reset(state)
+
+    def advance(self, state, time, dt, vert_xpos, pressure):
+        self._network.advance(state, time, dt, vert_xpos, pressure)
+        return self._network.readings(state)
+
+
+class LearnedBatchFilm:
+    """Stands where `sensor.batch_film.BatchFilm` stands: impedances of `nworld` skins, on their device.
+
+    All worlds are computed whenever one may be due, in single precision. Do not capture it in a CUDA graph: torch launches are not Warp's.
+
+    Args:
+      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: between two solves, for the window [s].
+
+    Attributes:
+      impedance: (nworld, 19) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (19,); nbytes.
+    """
+
+    def __init__(self, geometry, nworld, device="cpu", weights=None, sensor="1", dt=0.01):
+        import warp as wp
+
+        self.device, self._dt = wp.get_device(device), dt
+        torch_device = wp.device_to_torch(self.device)
+        self.model = load_forward(weights or shipped("forward"), geometry).to(torch_device)
+        self.rest = impedance_from_counts(REST_COUNTS[sensor])
+        with wp.ScopedDevice(self.device):
+            self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=wp.float64)
+            self.valid = wp.ones(nworld, dtype=int)
+        self._rest = torch.as_tensor(self.rest, device=torch_device)
+        self._vert = torch.as_tensor(geometry.vert, device=torch_device)
+        self._average = torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
+        self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
+
+    def solve(self, x, due):
+        """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,) wp.array of int."""
+        import warp as wp
+
+        wanted = wp.to_torch(due) != 0
+        if not bool(wanted.any()):
+            return
+        place = wp.to_torch(x).view(*x.shape, 3).transpose(0, 1)
+        u = (1e3 * (place - self._vert)).float()
+        finite = torch.isfinite(u).all(dim=2).all(dim=1)
+        change, average = self.model.log_change(torch.where(finite[:, None, None], u, 0), self._average, self._dt)
+        now = wanted & finite
+        if self._average is not None:
+            self._average = torch.where(now[:, None, None, None], average, self._average)
+        z = wp.to_torch(self.impedance)
+        z.copy_(torch.where(now[:, None], self._rest * change.double().exp(), z))
+        wp.to_torch(self.valid).copy_(torch.where(wanted, finite.int(), wp.to_torch(self.valid)))
