@@ -171,6 +171,11 @@ def test_bad_sets_are_named(skin, tmp_path):
     with pytest.raises(ValueError, match="schema 'biotac_mj.data/0': this version reads 'biotac_mj.data/1'"):
         TactileSet(tmp_path)
     write_shard(shard_path(tmp_path, 0), [make(skin, 0)], skin)
+    with h5py.File(shard_path(tmp_path, 0), "a") as file:
+        file.attrs["channels"] = file.attrs["channels"][::-1]
+    with pytest.raises(ValueError, match="channels in the order tac tdc pac pdc e19 .*: e1 e2 .* is needed"):
+        TactileSet(tmp_path)
+    write_shard(shard_path(tmp_path, 0), [make(skin, 0)], skin)
     write_shard(shard_path(tmp_path, 1), [make(skin, 0)], skin)
     with pytest.raises(ValueError, match="'one-000' occurs in two shards"):
         TactileSet(tmp_path)

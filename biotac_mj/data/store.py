@@ -275,13 +275,18 @@ def _open(path):
     try:
         file = h5py.File(path)
     except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error}): it is no HDF5 file or it is damaged; delete it and run the command again"
-        ) from error
-    if file.attrs.get("schema") != SCHEMA:
-        found = file.attrs.get("schema")
+        raise ValueError(f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; delete it and run the command again") from error
+    try:
+        if file.attrs.get("schema") != SCHEMA:
+            raise ValueError(f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; generate or import it again")
+        channels = tuple(str(name) for name in file.attrs["channels"])
+        if channels != CHANNELS:
+            raise ValueError(
+                f"{path} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is needed; reorder the counts"
+            )
+    except BaseException:
         file.close()
-        raise ValueError(f"{path} has schema {found!r}: this version reads {SCHEMA!r}; generate or import it again")
+        raise
     return file
 
 
