@@ -244,6 +244,20 @@ def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
     np.testing.assert_allclose(read(mjm, d, "contact_force")[0], handle.read(data, "contact_force"), atol=5e-3 * weight)
 
 
+def test_sparse_and_dense_constraints_give_one_motion():
+    qpos = []
+    for jacobian in (mujoco.mjtJacobian.mjJAC_DENSE, mujoco.mjtJacobian.mjJAC_SPARSE):
+        spec = ball_spec()
+        spec.option.jacobian = jacobian
+        _, m, d, _ = make(spec, 1, readings=False)
+        assert m.is_sparse == (jacobian == mujoco.mjtJacobian.mjJAC_SPARSE)
+        for _ in range(25):
+            mjw.step(m, d)
+        qpos.append(d.qpos.numpy()[0, 0])
+    assert qpos[0] == pytest.approx(qpos[1], abs=1e-7)
+    assert abs(qpos[0]) < 2e-3  # of 12 mm without the skin
+
+
 def test_tangent_is_that_of_the_single_world():
     _, m, d, batch = make(ball_spec(mass=0.3), 2, readings=False)
     for _ in range(20):
@@ -400,8 +414,8 @@ def test_errors_say_what_to_do():
         with pytest.raises(ValueError, match=text):
             attach(other.compile())
     crowded = ball_spec()
-    batches.add(crowded, skin=shell(), slots=0)
-    with pytest.raises(ValueError, match="has room for 0: add it after the objects"):
+    batches.add(crowded, skin=shell(), coupling="one-way")
+    with pytest.raises(ValueError, match="no room for two-way coupling of the BioTac 'biotac_' with ball: add it after the objects"):
         attach(crowded.compile())
 
 

@@ -27,16 +27,28 @@ _DAMPED = 0.3  # time step x damping / inertia
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
-def add(spec, site=None, body=None, pos=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0), prefix="biotac_", skin="default", slots=None) -> str:
+def add(
+    spec,
+    site=None,
+    body=None,
+    pos=(0.0, 0.0, 0.0),
+    quat=(1.0, 0.0, 0.0, 0.0),
+    prefix="biotac_",
+    skin="default",
+    coupling="two-way",
+    geoms=None,
+) -> str:
     """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
 
     Args:
-      spec: the MjSpec to change. Add the objects first, as for `biotac_mj.attach`.
+      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can touch and move against the
+        BioTac now, and names those that have no name.
       site, body: name of the site or the body it is fixed to; neither is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds.
       skin: as for `biotac_mj.attach`; give `attach` the same.
-      slots: how many bodies that move may touch it two-way; None counts those with colliding geoms now.
+      coupling: "one-way" makes no room.
+      geoms: names of the geoms that will touch; None is every colliding one.
 
     Returns:
       prefix.
@@ -45,20 +57,39 @@ def add(spec, site=None, body=None, pos=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.
       ValueError: unknown site or body; the prefix is taken. FileNotFoundError: no such skin.
     """
     _check_place(spec, site, body, prefix)
-    if slots is None:
-        slots = len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
+    own = spec.site(site).parent if site is not None else spec.worldbody if body is None else spec.body(body)
+    bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
     child = _model(reference(skin)[1])
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:
         spec.attach(child, site=spec.site(site), prefix=prefix)
     else:
-        parent = spec.worldbody if body is None else spec.body(body)
-        spec.attach(child, frame=parent.add_frame(), prefix=prefix)
-    _add_slots(spec, spec.body(prefix + "core"), prefix, slots)
-    for i in range(slots):
+        spec.attach(child, frame=own.add_frame(), prefix=prefix)
+    _add_slots(spec, spec.body(prefix + "core"), prefix, len(bodies))
+    for i, name in enumerate(bodies):
         weld = spec.equality(f"{prefix}couple{i}")  # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
-        weld.active, weld.name2 = True, "world"
+        weld.active, weld.name2 = True, name
     return prefix
+
+
+def _movers(spec, own, prefix, geoms):
+    """Names of the bodies with joints, or the world, that carry geoms which can touch and move against body `own`."""
+    own, names = _mover(own), {}
+    for geom in spec.geoms:
+        if not (geom.contype or geom.conaffinity) if geoms is None else geom.name not in geoms:
+            continue
+        body = _mover(geom.parent)
+        if body.id != own.id or body.name != own.name:
+            body.name = body.name or f"{prefix}touching{len(names)}"
+            names[body.name] = True
+    return list(names)
+
+
+def _mover(body):
+    """The nearest body with a joint upwards from a body, or the world."""
+    while body.parent is not None and body.name != "world" and not body.joints:
+        body = body.parent
+    return body
 
 
 def attach(
@@ -118,7 +149,7 @@ def make(
     """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step, such as mjx.
 
     Args:
-      mjm: an MjModel made from a spec that `add` changed with slots=0; its time step is that of the sensors.
+      mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
       prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options: as for `attach`.
@@ -215,28 +246,27 @@ def _warn_of_damping(mjm, touching):
 
 
 def _slots(mjm, m, d, touching, prefix):
-    """{body that moves against the BioTac: weld constraint whose rows it gets}; takes their meaning from the welds, in m and d too."""
+    """{group that moves against the BioTac: weld constraint whose rows it gets}; the other welds are switched off, in m and d."""
     core, tree = touching.core, mjm.body_treeid
     roots = [int(mjm.body_weldid[b]) if tree[b] >= 0 else 0 for b in touching.body]
     needed = sorted({root for root in roots if root or tree[core] >= 0})
     welds = [i for i in range(mjm.neq) if (mjm.eq(i).name or "").startswith(prefix + "couple")]
-    if len(needed) > len(welds):
+    place = {int(mjm.body_weldid[mjm.eq_obj2id[i]]): i for i in welds}
+    without = [mjm.body(root).name or f"#{root}" for root in needed if root not in place]
+    if without:
         raise ValueError(
-            f"{len(needed)} bodies can touch the BioTac {prefix!r} but it has room for {len(welds)}: add it after the objects, pass "
-            "add(slots=...), or name the geoms that may touch with attach(geoms=[...])"
+            f"there is no room for two-way coupling of the BioTac {prefix!r} with {', '.join(without)}: add it after the objects, with "
+            "coupling='two-way', or name the geoms that may touch with add(geoms=[...]) and attach(geoms=[...])"
         )
     rows = sum(6 if t == mujoco.mjtEq.mjEQ_WELD else 3 if t == mujoco.mjtEq.mjEQ_CONNECT else 1 for t in mjm.eq_type)
     if needed and d.njmax < rows + 7:
         raise ValueError(f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a larger njmax")
-    first, second, active0, active = (a.numpy().copy() for a in (m.eq_obj1id, m.eq_obj2id, m.eq_active0, d.eq_active))
-    for k, weld in enumerate(welds):
-        used = k < len(needed)
-        first[weld], second[weld] = core, needed[k] if used else 0
-        active0[weld], active[:, weld] = used, used
-    for target, value in ((m.eq_obj1id, first), (m.eq_obj2id, second), (m.eq_active0, active0), (d.eq_active, active)):
-        target.assign(value)
-    slot = dict(zip(needed, welds))
-    return {g: slot[root] for g, root in enumerate(roots) if root in slot}
+    active0, active = m.eq_active0.numpy().copy(), d.eq_active.numpy().copy()
+    for root, weld in place.items():
+        active0[weld] = active[:, weld] = root in needed
+    m.eq_active0.assign(active0)
+    d.eq_active.assign(active)
+    return {g: place[root] for g, root in enumerate(roots) if root in needed}
 
 
 def _readings(choice, geometry, nworld, seed, device):
