@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import biotac_mj
 from biotac_mj.data.liquid_conduction import LiquidConduction, column_tetrahedra
-from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, relax
+from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, relax
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance, electrode_noise, impedance_from_counts
 from biotac_mj.sensor.film import EXCITATION, FilmConduction
@@ -171,6 +171,12 @@ def test_simulator_does_not_use_it():
     users = [p.relative_to(package).as_posix() for p in package.rglob("*.py") if "synthetic_sensor" in p.read_text() or
              "liquid_conduction" in p.read_text()]  # fmt: skip
     assert {u.split("/")[0] for u in users} <= {"data"}
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"needs scikit-fem: pip install 'biotac-mj\[data\]', or take --labelled 0"):
+        SyntheticSensor(0, "coarse")
 
 
 def test_an_electrode_without_liquid_is_named(skin):

@@ -9,6 +9,7 @@ grasps); what is chosen says so.
 """
 
 import dataclasses
+import importlib.util
 
 import numpy as np
 
@@ -91,12 +92,19 @@ class SyntheticSensor:
 
     Attributes:
       variation: SensorVariation. model: SkinModel of its skin.
+
+    Raises:
+      ValueError: scikit-fem is missing.
     """
 
     def __init__(self, seed: int = 0, skin: str = "fine", device="cpu"):
         from ..skin import SkinModel, SkinOptions
         from ..skin.material import Material
 
+        if importlib.util.find_spec("skfem") is None:
+            raise ValueError(
+                "the synthetic measured sensor needs scikit-fem: pip install 'biotac-mj[data]', or make a set with --labelled 0"
+            )
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
         options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
