@@ -75,6 +75,73 @@ def rest_gap(
 
 
 @wp.func
+def touch_sample(
+    i: int,
+    w: int,
+    b: vec3,
+    t: wp.vec3i,
+    x0: vec3,
+    x1: vec3,
+    x2: vec3,
+    k: real,
+    kt: real,
+    geoms: Geoms,
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+):
+    """Contact of sample i at b of a face: geom (-1: none), least distance [m], force [N], its tangent [N/m], anchor."""
+    p = b[0] * x0 + b[1] * x1 + b[2] * x2
+    touched = int(-1)
+    clearance = real(1.0)
+    gap = real(0.0)
+    normal = vec3()
+    local = vec3()
+    for g in range(geoms.count):
+        R = geoms.mat[g, w]
+        y = wp.transpose(R) * (p - geoms.pos[g, w])
+        dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        clearance = wp.min(clearance, dn[3])
+        if dn[3] < gap:
+            gap = dn[3]
+            touched = g
+            normal = vec3(dn[0], dn[1], dn[2])
+            local = y
+    force = vec3()
+    K = mat33()
+    stick = local
+    if touched >= 0:
+        fn = -k * gap
+        force = fn * normal
+        nn = wp.outer(normal, normal)
+        K = k * nn
+        mu = geoms.friction[touched, w]
+        if mu > real(0.0):
+            if anchor_geom[i, w] == touched:
+                stick = anchor[i, w]
+            else:
+                # touched within this step: slip counts from where the sample was on the geom when the step began
+                last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
+                stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+            slip = local - stick
+            slip = slip - wp.dot(slip, normal) * normal
+            length = wp.length(slip)
+            tangent = wp.identity(n=3, dtype=real) - nn
+            if kt * length <= mu * fn:
+                force = force - kt * slip
+                K = K + kt * tangent
+            else:
+                along = slip / length
+                force = force - mu * fn * along
+                K = K + mu * fn / length * (tangent - wp.outer(along, along))
+                stick = local - mu * fn / kt * along
+        R = geoms.mat[touched, w]
+        force = R * force
+        K = R * K * wp.transpose(R)
+    return touched, clearance, force, K, stick
+
+
+@wp.func
 def touch_face(
     f: int,
     w: int,
@@ -131,54 +198,15 @@ def touch_face(
     kt = k * stick_ratio
     for s in range(nsample):
         i = f * nsample + s
-        touched = int(-1)
+        geom_out[i, w] = -1
         if near == 1:
             b = sample[s]
-            p = b[0] * x0 + b[1] * x1 + b[2] * x2
-            gap = real(0.0)
-            normal = vec3()
-            local = vec3()
-            for g in range(geoms.count):
-                R = geoms.mat[g, w]
-                y = wp.transpose(R) * (p - geoms.pos[g, w])
-                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                clearance = wp.min(clearance, dn[3])
-                if dn[3] < gap:
-                    gap = dn[3]
-                    touched = g
-                    normal = vec3(dn[0], dn[1], dn[2])
-                    local = y
+            touched, gap, force, K, stick = touch_sample(i, w, b, t, x0, x1, x2, k, kt, geoms, x_last, anchor_geom, anchor)
+            clearance = wp.min(clearance, gap)
             if touched >= 0:
                 touching = 1
-                fn = -k * gap
-                force = fn * normal
-                nn = wp.outer(normal, normal)
-                K = k * nn
-                mu = geoms.friction[touched, w]
-                stick = local
-                if mu > real(0.0):
-                    if anchor_geom[i, w] == touched:
-                        stick = anchor[i, w]
-                    else:
-                        # touched within this step: slip counts from where the sample was on the geom when the step began
-                        last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
-                        stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
-                    slip = local - stick
-                    slip = slip - wp.dot(slip, normal) * normal
-                    length = wp.length(slip)
-                    tangent = wp.identity(n=3, dtype=real) - nn
-                    if kt * length <= mu * fn:
-                        force = force - kt * slip
-                        K = K + kt * tangent
-                    else:
-                        along = slip / length
-                        force = force - mu * fn * along
-                        K = K + mu * fn / length * (tangent - wp.outer(along, along))
-                        stick = local - mu * fn / kt * along
+                geom_out[i, w] = touched
                 anchor_out[i, w] = stick
-                R = geoms.mat[touched, w]
-                force = R * force
-                K = R * K * wp.transpose(R)
                 force_out[i, w] = force
                 f0 += b[0] * force
                 f1 += b[1] * force
@@ -189,7 +217,6 @@ def touch_face(
                 b11 += (b[1] * b[1]) * K
                 b12 += (b[1] * b[2]) * K
                 b22 += (b[2] * b[2]) * K
-        geom_out[i, w] = touched
     touching_out[f, w] = touching
     corner_out[3 * f, w] = f0
     corner_out[3 * f + 1, w] = f1

@@ -1,5 +1,7 @@
 """SkinData: everything about a skin that changes, for every world."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
@@ -117,9 +119,6 @@ class SkinData:
             self.force = wp.zeros_like(self.x)
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
             self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
-            if not self.resident:
-                self.direction, self.product, self.bending = (wp.zeros_like(self.x) for _ in range(3))
-                self.elastic = model.elasticity.allocate(nworld)
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
             self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
@@ -131,6 +130,24 @@ class SkinData:
         self.core_pos = np.zeros((nworld, 3))
         self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
         self.reset()
+
+    # of steps from the host; never made where the state is resident
+
+    @functools.cached_property
+    def elastic(self):
+        return self.model.elasticity.allocate(self.nworld)
+
+    @functools.cached_property
+    def direction(self):
+        return wp.zeros_like(self.x)
+
+    @functools.cached_property
+    def product(self):
+        return wp.zeros_like(self.x)
+
+    @functools.cached_property
+    def bending(self):
+        return wp.zeros_like(self.x)
 
     def _allocate_device(self):
         from .device_worlds import Worlds

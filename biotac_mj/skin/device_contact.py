@@ -1,25 +1,30 @@
-"""Contact and liquid of all worlds on the device: far faces are left out, near ones evaluated by the same law as on the host."""
+"""Contact of all worlds on the device: far faces are left out, near ones evaluated by the same law as on the host."""
 
 import warp as wp
 
-from .contact import Geoms, touch_face
-from .liquid import contact_pressure
+from .contact import Geoms, touch_face, touch_sample
 from .shapes import distance_bound
 from .types import mat33, real, vec3
 
 __all__ = [
+    "block_index",
     "commit_contacts",
     "contact_inside_core",
     "cull_faces",
     "near_contact",
     "partial_wrench",
-    "release_pressure",
-    "settle_pressure",
+    "sample_contact",
+    "sum_samples",
     "sum_wrench",
-    "wet_faces",
 ]
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def block_index(a: int, b: int):
+    """Which of the six stored blocks of a face couples corners a <= b: 00 01 02 11 12 22."""
+    return a * (5 - a) // 2 + b
 
 
 @wp.kernel
@@ -122,125 +127,100 @@ def near_contact(
 
 
 @wp.kernel
-def wet_faces(
+def sample_contact(
     # In:
-    chunk: int,
     face: wp.array(dtype=wp.vec3i),
-    slot: wp.array(dtype=int),
-    sample: wp.array(dtype=vec3),
     area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
     stiffness: real,
-    reference: wp.array(dtype=real),
-    touching: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=vec3),
+    stick_ratio: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    near: wp.array2d(dtype=int),
+    # Out:
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+    force_out: wp.array2d(dtype=vec3),
+    gap_out: wp.array2d(dtype=real),
+    tangent_out: wp.array2d(dtype=mat33),
+):
+    """The same by samples, for few worlds: `sum_samples` then adds up the faces."""
+    i, w = wp.tid()
+    f = i // sample.shape[0]
+    if on[w] == 0:
+        return
+    if near[f, w] == 0:
+        return
+    t = face[f]
+    k = stiffness * area[f] / real(sample.shape[0])
+    touched, gap, force, K, stick = touch_sample(
+        i, w, sample[i % sample.shape[0]], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, geoms, x_last, anchor_geom, anchor
+    )
+    geom_out[i, w] = touched
+    gap_out[i, w] = gap
+    if touched >= 0:
+        anchor_out[i, w] = stick
+        force_out[i, w] = force
+        tangent_out[i, w] = K
+
+
+@wp.kernel
+def sum_samples(
+    # In:
+    still: int,
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
     x: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
-    # Out:
-    volume_out: wp.array2d(dtype=real),
-    wet_out: wp.array2d(dtype=vec3),
-    corner_out: wp.array2d(dtype=vec3),
-):
-    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient (see `liquid.wetting`)."""
-    c, w = wp.tid()
-    if on[w] == 0:
-        return
-    third = real(1.0) / real(3.0)
-    total = real(0.0)
-    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
-        t = face[f]
-        x0 = x[t[0], w]
-        x1 = x[t[1], w]
-        x2 = x[t[2], w]
-        total -= wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
-        wet = vec3(third, third, third)
-        normal = wp.cross(x1 - x0, x2 - x0)
-        k = slot[f]
-        if k >= 0:
-            if touching[k, w] == 1:
-                nsample = sample.shape[0]
-                share = real(1.0) / real(nsample)
-                full = real(2.0) * reference[w]
-                overlap = real(0.0)
-                for s in range(nsample):
-                    pressure = contact_pressure(k * nsample + s, w, geom, force, area[k] * share)
-                    dry = real(1.0)
-                    if pressure < full:
-                        dry = pressure / full
-                        overlap += share * dry * pressure / (real(2.0) * stiffness)
-                    else:
-                        overlap += share * (pressure - reference[w]) / stiffness
-                    wet -= share * dry * sample[s]
-                total += overlap * wp.length(normal) / real(2.0)
-        wet_out[f, w] = wet
-        g = real(-0.5) * normal
-        for a in range(3):
-            corner_out[3 * f + a, w] = wet[a] * g
-    volume_out[c, w] = total
-
-
-@wp.kernel
-def settle_pressure(
-    # In:
-    enclosed: real,
-    share: wp.array2d(dtype=real),
-    offset: wp.array(dtype=real),
-    kappa: wp.array(dtype=real),
-    natural: wp.array(dtype=real),
-    on: wp.array(dtype=int),
-    # Out:
-    volume_out: wp.array(dtype=real),
-    pressure_out: wp.array(dtype=real),
-):
-    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's volume."""
-    w = wp.tid()
-    if on[w] == 0:
-        return
-    volume = enclosed
-    for c in range(share.shape[0]):
-        volume += share[c, w]
-    volume_out[w] = volume
-    pressure_out[w] = offset[w] - kappa[w] * (volume - natural[w])
-
-
-@wp.kernel
-def release_pressure(
-    # In:
-    sample: wp.array(dtype=vec3),
-    area: wp.array(dtype=real),
-    stiffness: real,
-    reference: wp.array(dtype=real),
-    pressure: wp.array(dtype=real),
-    touching: wp.array2d(dtype=int),
+    near: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
     force: wp.array2d(dtype=vec3),
-    near: wp.array2d(dtype=int),
-    on: wp.array(dtype=int),
-    # In, out:
-    block: wp.array2d(dtype=mat33),
+    gap: wp.array2d(dtype=real),
+    tangent: wp.array2d(dtype=mat33),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
 ):
-    """See `liquid.soften_contact`; only where the tangent was made anew."""
-    f, w = wp.tid()
+    """Corner c of a face adds up its force, and two of the six blocks of the tangent."""
+    f, c, w = wp.tid()
     if on[w] == 0:
         return
-    p = pressure[w]
-    if near[f, w] == 1 and touching[f, w] == 1 and p > real(0.0):
-        nsample = sample.shape[0]
-        share = area[f] / real(nsample)
-        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness * share
-        for s in range(nsample):
-            i = f * nsample + s
-            c = contact_pressure(i, w, geom, force, share)
-            if c > real(0.0) and c < real(2.0) * reference[w]:
-                n = wp.normalize(force[i, w])
-                K = factor * wp.outer(n, n)
-                b = sample[s]
-                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
-                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
-                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
-                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
-                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
-                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+    if near[f, w] == 0:
+        return
+    nsample = sample.shape[0]
+    touching = int(0)
+    total = vec3()
+    first = mat33()  # block c c
+    second = mat33()  # block c (c + 1)
+    free = real(1.0)
+    d = (c + 1) % 3
+    for s in range(nsample):
+        i = f * nsample + s
+        free = wp.min(free, gap[i, w])
+        if geom[i, w] >= 0:
+            touching = 1
+            b = sample[s]
+            total += b[c] * force[i, w]
+            K = tangent[i, w]
+            first += (b[c] * b[c]) * K
+            second += (b[c] * b[d]) * K
+    corner_out[3 * f + c, w] = total
+    if touching == 1:
+        block_out[6 * f + block_index(c, c), w] = first
+        block_out[6 * f + block_index(wp.min(c, d), wp.max(c, d)), w] = second
+    if c == 0:
+        touching_out[f, w] = touching
+        if still == 1:
+            clearance[f, w] = free
+    if still == 1:
+        seen[3 * f + c, w] = x[face[f][c], w]
 
 
 @wp.kernel

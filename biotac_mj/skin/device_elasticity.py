@@ -68,9 +68,11 @@ def polar_mixed(F: mat33):
     eye = wp.identity(n=3, dtype=real)
     R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
     S = wp.transpose(R) * F
-    turn = R * wp.skew(wp.inverse(wp.trace(S) * eye - S) * axial(S))
-    R = R + turn
-    return R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
+    # what is left is 1e-7: single precision gives the rest of its digits
+    s = narrow(S)
+    a = axial(S)
+    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * wp.vec3(float(a[0]), float(a[1]), float(a[2]))
+    return R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
 
 
 @wp.func
@@ -140,7 +142,7 @@ def linear_product(
         return
     t = elem[e]
     B = narrow(inverse_edges[e])
-    F = narrow(edge_matrix(x, t, w) * inverse_edges[e])
+    F = narrow(edge_matrix(x, t, w)) * B
     dF = edges_single(p, t, w) * B
     dP = wp.mat33()
     if law == 0:

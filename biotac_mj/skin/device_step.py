@@ -16,11 +16,13 @@ the graph (CUDA 12.4 and later); worlds that are done idle inside them.
 import warp as wp
 
 from . import device_contact as contact
+from . import device_krylov as krylov
+from . import device_liquid as liquid
 from . import device_nodes as nodes
 from . import device_worlds as worlds
 from .contact import depth_in_core  # noqa: F401 - loads the module of the geoms' struct
 from .device_elasticity import device_elements
-from .device_preconditioner import DevicePreconditioner
+from .device_preconditioner import FEW, DevicePreconditioner
 from .types import mat33, real, vec3
 
 __all__ = ["DeviceStep", "prepare_device", "step_device"]
@@ -59,7 +61,7 @@ class _Memory:
     def __init__(self, model, data):
         n, w = model.nvert, data.nworld
         # few worlds need many short sums, many worlds few long ones
-        self.chunk = 16 if w < 32 else 32
+        self.chunk = 4 if w < 32 else 8 if w < 256 else 32
         self.nchunk = -(-n // self.chunk)
         inner = 0 if model.inner is None else len(model.inner.face)
         with wp.ScopedDevice(model.device):
@@ -69,13 +71,15 @@ class _Memory:
             self.part = wp.zeros((2, self.nchunk, w), dtype=real)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in (data.outer, data.core) if s]
             self.flags = wp.zeros(5, dtype=int)
+            shapes = [s.trial_geom.shape for s in (data.outer, data.core) if s and w <= FEW]
+            self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
             self.no_vector = wp.zeros((0, w), dtype=vec3)
             self.no_list = wp.zeros(0, dtype=int)
             self.no_flag = wp.zeros((0, w), dtype=int)
             self.no_face = wp.zeros(0, dtype=wp.vec3i)
             self.no_block = wp.zeros((0, w), dtype=mat33)
             self.face_chunks = -(-inner // self.chunk)
-            self.share = wp.zeros((self.face_chunks, w), dtype=real)
+            self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
             self.wet = wp.zeros((inner, w), dtype=vec3)
             self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
             implicit = model.options.dynamics == "implicit"
@@ -127,6 +131,10 @@ class DeviceStep:
     def _launch(self, kernel, dim, inputs, outputs=()):
         wp.launch(kernel, dim, inputs, list(outputs), device=self.m.device)
 
+    def _decide(self, kernel, inputs, outputs=()):
+        """A block of threads for each world."""
+        wp.launch_tiled(kernel, dim=[self.d.nworld], inputs=inputs, outputs=list(outputs), block_dim=worlds.BLOCK, device=self.m.device)
+
     def _warm_up(self):
         """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made, before anything is captured."""
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
@@ -146,7 +154,7 @@ class DeviceStep:
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         n, w = m.nvert, d.nworld
         if m.has_core and g.count:
-            chunk = 64
+            chunk = 8 if w < 32 else 64
             dim = (g.count, -(-len(m.core_vert) // chunk), w)
             self._launch(contact.contact_inside_core, dim, [chunk, m.options.max_core_depth, m.core_vert, g.struct], [st.deep])
         motion, touched_by, wrench = self._of_geoms
@@ -191,23 +199,22 @@ class DeviceStep:
             nodes.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, self._external(),
              self._gradient(), d.x, d.rest_vert, st.active],
-            [k.r, k.worth, self._newton_on],
+            [k.r, k.worth, k.preconditioner.any_touch, self._newton_on],
         )  # fmt: skip
         k.preconditioner.update(st, k.worth, k.r, self._gradient(), k.p, k.part)
-        self._launch(
-            worlds.judge_balance, d.nworld,
-            [m.options.tolerance, m.options.max_newton, int(m.has_liquid), k.part, k.worth, k.preconditioner.any_touch, st], [self._newton_on]
-        )  # fmt: skip
+        touch = k.preconditioner.any_touch
+        limits = [m.options.tolerance, m.options.max_newton, int(m.has_liquid)]
+        self._decide(worlds.judge_balance, [*limits, k.part, k.worth, touch, st], [self._newton_on])
 
     def _solve(self):
-        self._launch(nodes.begin_solve, self.d.nworld, [self.st, self._solve_on])
+        self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
         self._advance_solve(1)
 
     def _continue_solve(self):
         k, st = self.k, self.st
         k.preconditioner.apply(st, k.part, k.r, self._gradient(), k.z, k.part)
-        self._launch(nodes.choose_beta, self.d.nworld, [k.part, st])
-        self._launch(nodes.next_direction, self.d.x.shape, [k.z, st, k.p])
+        self._decide(krylov.choose_beta, [k.part, st])
+        self._launch(krylov.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)
 
     def _advance_solve(self, first):
@@ -219,34 +226,37 @@ class DeviceStep:
         if self.implicit:
             inertia = wp.vec3d(m.material.density, m.options.mass_damping, m.options.stiffness_damping)
         self._launch(
-            nodes.assemble_product, d.x.shape,
+            krylov.assemble_product, d.x.shape,
             [e.start, e.slot, e.corner, *self._blocks(m.outer, d.outer), *self._blocks(m.core_surface if d.core else None, d.core),
              *self._wet_faces(), m.free_mask, inertia, k.node_volume, d.dt, d.x, k.p, st],
             [k.q],
         )  # fmt: skip
         chunks, gradient = (k.nchunk, d.nworld), self._gradient()
-        self._launch(nodes.measure_product, chunks, [k.chunk, k.p, k.q, gradient, m.free_mask, st.running], [k.part, self._solve_on])
-        self._launch(nodes.choose_alpha, d.nworld, [m.options.max_cg, k.part, st], [self._solve_on])
-        self._launch(nodes.update_solution, chunks, [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r], [k.part])
+        self._launch(krylov.measure_product, chunks, [k.chunk, k.p, k.q, gradient, m.free_mask, st.running], [k.part, self._solve_on])
+        self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
+        self._launch(krylov.update_solution, chunks, [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r], [k.part])
 
     def _search(self):
         d, k = self.d, self.k
-        self._launch(nodes.first_length, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st, d.x], [k.base, k.part])
+        self._launch(krylov.first_length, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st, d.x], [k.base, k.part])
         self._look()
 
     def _continue_search(self):
-        self._launch(nodes.move, self.d.x.shape, [self.k.base, self.k.dx, self.st, self.d.x])
+        self._launch(krylov.move, self.d.x.shape, [self.k.base, self.k.dx, self.st, self.d.x])
         self._look()
 
     def _look(self):
         d, k = self.d, self.k
         self._evaluate(self.st.moving)
-        self._launch(nodes.measure_slope, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st], [k.part, self._search_on])
-        self._launch(worlds.choose_length, d.nworld, [k.part, self.st], [self._search_on])
+        self._launch(krylov.measure_slope, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st], [k.part, self._search_on])
+        self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
     def _finish(self, touched_by, wrench):
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         w, o = d.nworld, d.outer
+        if m.inner is not None and not m.has_liquid:
+            self._launch(worlds.all_on, w, [], [st.moving])
+            self._fill(st.moving)  # the cavity's volume is told all the same
         if g.ngroup:
             self._launch(
                 contact.partial_wrench, (self._wrench_chunks, w),
@@ -272,7 +282,7 @@ class DeviceStep:
         self._contact(d.outer, self.geoms, k.near[0], 0, on)
         if d.core:
             self._contact(d.core, m.core(d.nworld), k.near[1], 1, on)
-        if m.inner is not None:
+        if m.has_liquid:
             self._fill(on)
         none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
         core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner] if d.core else none
@@ -299,12 +309,17 @@ class DeviceStep:
         dim, nsample = state.touching.shape, len(m.sample)
         self._launch(contact.cull_faces, dim, [still, nsample, s.face, geoms.struct, d.x, on, state.seen, state.clearance, state.touching],
                      [near, state.trial_geom])  # fmt: skip
-        self._launch(
-            contact.near_contact, dim,
-            [still, s.face, s.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last, state.anchor_geom,
-             state.anchor, on, near, state.seen, state.clearance],
-            [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
-        )  # fmt: skip
+        law = [s.face, s.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
+        held, out = [state.anchor_geom, state.anchor, on, near], [state.trial_geom, state.trial_anchor, state.sample_force]
+        if d.nworld > FEW:
+            self._launch(contact.near_contact, dim, [still, *law, *held, state.seen, state.clearance],
+                         [state.corner, state.block, state.touching, *out])  # fmt: skip
+            return
+        gap, tangent = self.k.by_sample[still]
+        self._launch(contact.sample_contact, out[0].shape, [*law, *held], [*out, gap, tangent])
+        self._launch(contact.sum_samples, (dim[0], 3, dim[1]),
+                     [still, s.face, m.sample, d.x, on, near, state.trial_geom, state.sample_force, gap, tangent],
+                     [state.corner, state.block, state.touching, state.seen, state.clearance])  # fmt: skip
 
     def _fill(self, on):
         """The liquid's volume; with it, its pressure."""
@@ -315,13 +330,13 @@ class DeviceStep:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
         else:
             area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
-        self._launch(contact.wet_faces, (k.face_chunks, d.nworld),
+        self._launch(liquid.wet_faces, (k.face_chunks, d.nworld),
                      [k.chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
                      [k.share, k.wet, k.wet_corner])  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume
-        self._launch(contact.settle_pressure, d.nworld, [enclosed, k.share, st.offset, st.kappa, st.natural, on], [st.volume, st.pressure])
+        self._decide(liquid.settle_pressure, [enclosed, k.share, st.offset, st.kappa, st.natural, on], [st.volume, st.pressure])
         if m.has_liquid and c:
-            self._launch(contact.release_pressure, c.touching.shape, [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block])
+            self._launch(liquid.release_pressure, c.touching.shape, [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block])
 
     def _external(self):
         return self.k.no_vector if self.d.external is None else self.d.external_device

@@ -6,11 +6,13 @@ from .contact import Geoms
 from .types import mat33, real, vec3
 
 __all__ = [
+    "BLOCK",
     "CONVERGED",
     "INSIDE_CORE",
     "NOT_CONVERGED",
     "NOT_FINITE",
     "Worlds",
+    "all_on",
     "begin_worlds",
     "choose_length",
     "end_worlds",
@@ -18,6 +20,7 @@ __all__ = [
     "judge_balance",
     "release_geoms",
     "retry_worlds",
+    "total_of",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -73,6 +76,18 @@ class Worlds:
     side: wp.array(dtype=int)
     tries: wp.array(dtype=int)
     iterations_cg: wp.array(dtype=int)
+
+
+BLOCK = 128  # threads that share the sums of one world
+
+
+@wp.func
+def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
+    """Sum of part[k, :, w] by the threads t of a block, always in the same order; all of them get it."""
+    s = real(0.0)
+    for c in range(t, part.shape[1], wp.block_dim()):
+        s += part[k, c, w]
+    return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
 
 
 @wp.func
@@ -170,18 +185,15 @@ def judge_balance(
     go_on: wp.array(dtype=int),
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: squared residual, work of the loads."""
-    w = wp.tid()
+    w, t = wp.tid()
     if st.active[w] == 0:
         return
-    rr = real(0.0)
-    work = real(0.0)
-    rz = real(0.0)
-    gz = real(0.0)
-    for c in range(part.shape[1]):
-        rr += worth[0, c, w]
-        work += worth[1, c, w]
-        rz += part[0, c, w]
-        gz += part[1, c, w]
+    rr = total_of(worth, 0, w, t)
+    work = total_of(worth, 1, w, t)
+    rz = total_of(part, 0, w, t)
+    gz = total_of(part, 1, w, t)
+    if t > 0:
+        return
     if not wp.isfinite(rr + rz):
         st.active[w] = 0
         st.failed[w] = 1
@@ -226,20 +238,19 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
 
     part: force . direction after the step, and before it where this is the first try.
     """
-    w = wp.tid()
+    w, t = wp.tid()
     if st.moving[w] == 0:
         return
-    now = real(0.0)
-    for c in range(part.shape[1]):
-        now += part[0, c, w]
+    now = total_of(part, 0, w, t)
+    slope = total_of(part, 1, w, t)
+    if t > 0:
+        return
     if st.tries[w] == 0:
-        slope = real(0.0)
-        for c in range(part.shape[1]):
-            slope += part[1, c, w]
         st.slope[w] = slope
         st.slope_low[w] = slope
         st.slope_high[w] = slope
-    slope = st.slope[w]
+    else:
+        slope = st.slope[w]
     valid = int(0)
     if wp.isfinite(now) and st.inverted[w] == 0:
         valid = 1
@@ -332,3 +343,8 @@ def end_worlds(st: Worlds):
             st.reason[w] = NOT_CONVERGED
     else:
         st.last_pressure[w] = st.pressure[w]
+
+
+@wp.kernel
+def all_on(flag: wp.array(dtype=int)):
+    flag[wp.tid()] = 1

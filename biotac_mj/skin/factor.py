@@ -83,14 +83,24 @@ class DenseFactor:
         import torch
 
         self._torch, self._device = torch, wp.device_to_torch(device)
-        self.size = stiffness.shape[0]
-        matrix = torch.tensor(stiffness.toarray(), device=self._device)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix))
+        self.size, self._stiffness = stiffness.shape[0], stiffness
+        inverse = self._inverse()
         self.scale = float(inverse.abs().max())
         self.padded = -(-self.size // _ALIGN) * _ALIGN
         self.inverse = torch.zeros(self.padded, self.padded, dtype=torch.float16, device=self._device)
         self.inverse[: self.size, : self.size] = inverse / self.scale
         self._free = torch.as_tensor(free, device=self._device)
+
+    def _inverse(self):
+        matrix = self._torch.tensor(self._stiffness.toarray(), device=self._device)
+        return self._torch.cholesky_inverse(self._torch.linalg.cholesky(matrix))
+
+    def remainder(self, magnified):
+        """What rounding took from `inverse`, magnified, in half precision too: for materials to which it matters."""
+        out = self._torch.zeros_like(self.inverse)
+        inside = (slice(self.size), slice(self.size))
+        out[inside] = (self._inverse() / self.scale - self.inverse[inside]) * magnified
+        return out
 
     def solve(self, rhs):
         """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""

@@ -1,0 +1,205 @@
+"""The device step, kernel by kernel on the CPU: many worlds at once against each of them alone in the host's solver."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.device_step import prepare_device, step_device
+from biotac_mj.skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+
+pytest.importorskip("cholespy")  # the CPU's factor
+
+TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
+START = -0.00825 - 3.5e-3 + 2e-4  # y of the sphere's centre where it indents the pad by 0.2 mm [m]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True, tolerance=1e-5, max_newton=60))
+
+
+def geom_set(nworld, friction=0.5):
+    return GeomSet(TYPES, SIZES, friction=[friction, 0.2], rounding=[0, 5e-4], nworld=nworld)
+
+
+def poses(worlds, depth):
+    """Sphere pressed into the pad, a box far away or at the side of the tip: places and depths differ from world to world."""
+    return np.array([[[-0.014 + 1.5e-3 * w["place"], START + depth * w["depth"], 1e-3 * w["side"]], [0.1, 0.1, 0.1]] for w in worlds])
+
+
+def random_worlds(n, seed):
+    rng = np.random.default_rng(seed)
+    return [
+        dict(place=rng.uniform(0, 2), depth=rng.uniform(0.5, 1), side=rng.uniform(-1, 1), friction=rng.uniform(0, 0.8),
+             modulus=rng.uniform(0.7, 1.4), bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]), fill=rng.uniform(-3, 3) * 1e-9)
+        for _ in range(n)
+    ]  # fmt: skip
+
+
+def walk(model, worlds, resident, depths):
+    rubber = [dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus) for w in worlds]
+    data, geoms = SkinData(model, len(worlds), rubber, resident=resident), geom_set(len(worlds))
+    geoms.set_friction([[w["friction"], 0.2] for w in worlds])
+    data.set_liquid([w["bulk"] for w in worlds], [w["fill"] if w["bulk"] else 0.0 for w in worlds])
+    for depth in depths:
+        geoms.set_pose(poses(worlds, depth))
+        step(model, data, geoms)
+        assert data.converged.all()
+    return data, geoms
+
+
+DEPTHS = (0.0, 1e-4, 2e-4, 3e-4)
+
+
+def test_random_worlds_together_are_each_alone_on_the_host(model):
+    """Pose, friction, modulus, bulk modulus (none, soft, water, infinite) and fill differ. Both stop at an energy error of 1e-5."""
+    worlds = random_worlds(6, seed=3)
+    together, geoms = walk(model, worlds, True, DEPTHS)
+    tangent = together.tangent(geoms)
+    peak = abs(together.wrench[..., :3]).max()
+    assert peak > 0.1 and np.ptp(together.pressure) > 100
+    for i, world in enumerate(worlds):
+        alone, one = walk(model, [world], False, DEPTHS)
+        np.testing.assert_allclose(together.wrench[i, 0, :3], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * peak)
+        np.testing.assert_allclose(together.vert_xpos[i], alone.vert_xpos[0], rtol=0, atol=2e-7)
+        np.testing.assert_allclose(together.pressure[i], alone.pressure[0], rtol=0.01, atol=2.0)
+        np.testing.assert_allclose(together.volume[i], alone.volume[0], rtol=1e-6)
+        np.testing.assert_allclose(tangent[i], alone.tangent(one)[0], rtol=0, atol=0.02 * abs(tangent[i]).max())
+
+
+def test_more_worlds_than_are_solved_finely(model):
+    """Few and many worlds take other kernels (rows of the inverse or a product, samples or faces): the same answers."""
+    worlds = random_worlds(3, seed=5)
+    few, _ = walk(model, worlds, True, DEPTHS[:2])
+    many, _ = walk(model, worlds * 6, True, DEPTHS[:2])
+    for i in range(18):
+        np.testing.assert_allclose(many.wrench[i], few.wrench[i % 3], rtol=0, atol=1e-4 * abs(few.wrench).max())
+        np.testing.assert_allclose(many.vert_xpos[i], few.vert_xpos[i % 3], rtol=0, atol=2e-8)
+
+
+def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
+    """NaN pose, NaN modulus, a geom inside the core: last good state, a reason each, and bit for bit the same in the sound worlds."""
+    worlds = random_worlds(5, seed=7)
+    data, geoms = walk(model, worlds, True, DEPTHS[:2])
+    sound, others = walk(model, worlds, True, DEPTHS[:2])
+    good = data.vert_xpos, data.wrench
+    bad = poses(worlds, DEPTHS[2])
+    others.set_pose(bad)
+    bad[2, 0, 1] = START + 6e-3
+    geoms.set_pose(bad)
+    at = geoms.struct.pos.numpy().copy()
+    at[0, 0, 0] = np.nan
+    geoms.struct.pos.assign(at)
+    stiff = data.mu.numpy().copy()
+    data.mu.assign(np.where(np.arange(5) == 4, np.nan, stiff))
+    step_device(model, data, geoms)
+    step(model, sound, others)
+    assert data.worlds.reason.numpy().tolist() == [NOT_FINITE, CONVERGED, INSIDE_CORE, CONVERGED, NOT_FINITE]
+    assert data.nonconverged.tolist() == [1, 0, 1, 0, 1] and data.converged.tolist() == [False, True, False, True, False]
+    assert (data.vert_xpos[[1, 3]] == sound.vert_xpos[[1, 3]]).all() and (data.wrench[[1, 3]] == sound.wrench[[1, 3]]).all()
+    assert (data.vert_xpos[[0, 2, 4]] == good[0][[0, 2, 4]]).all()
+    np.testing.assert_allclose(data.wrench[[0, 2]], good[1][[0, 2]], rtol=0, atol=1e-6 * abs(good[1]).max())
+    # what was wrong is mended: the worlds go on to where the sound ones are
+    data.mu.assign(stiff)
+    geoms.set_pose(poses(worlds, DEPTHS[2]))
+    step(model, data, geoms)
+    assert data.converged.all() and data.nonconverged.tolist() == [1, 0, 1, 0, 1]
+    np.testing.assert_allclose(data.wrench[..., :3], sound.wrench[..., :3], rtol=0, atol=5e-3 * abs(sound.wrench[..., :3]).max())
+
+
+def test_a_step_that_does_not_converge():
+    hasty = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True, max_newton=1))
+    data, geoms = SkinData(hasty, 2, resident=True), geom_set(2)
+    geoms.set_pose([poses([dict(place=1, depth=1, side=0)], d)[0] for d in (6e-4, -1e-2)])
+    step(hasty, data, geoms)
+    assert data.worlds.reason.numpy().tolist() == [NOT_CONVERGED, CONVERGED]
+    assert (data.vert_xpos[0] == hasty.geometry.vert).all()
+
+
+def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, monkeypatch):
+    worlds = random_worlds(1, seed=9)
+    enough, _ = walk(model, worlds, True, DEPTHS)
+    monkeypatch.setattr(SkinData, "contact_capacity", 3)
+    tight, _ = walk(model, worlds, True, DEPTHS)
+    assert tight.device_memory.preconditioner.full.numpy()[0] > 3 and enough.device_memory.preconditioner.full.numpy()[0] == 0
+    np.testing.assert_allclose(tight.wrench, enough.wrench, rtol=0, atol=2e-3 * abs(enough.wrench).max())
+
+
+@pytest.mark.parametrize("law, poisson", [("neo_hookean", 0.45), ("svk", 0.3), ("neo_hookean", 0.49)])
+def test_other_laws_and_elements(law, poisson):
+    """Laws with inverted tetrahedra to refuse; above 0.45 the inverse is kept as two halves."""
+    from biotac_mj.skin import Material
+
+    model = SkinModel(load_skin("coarse"), Material(law, 2.8e5, poisson, 0.2, element="linear"), SkinOptions(tolerance=1e-5, max_newton=60))
+    results = []
+    for resident in (False, True):
+        data, geoms = SkinData(model, resident=resident), geom_set(1)
+        for depth in DEPTHS:
+            geoms.set_pose(poses([dict(place=1, depth=1, side=0)], depth)[0])
+            step(model, data, geoms)
+            assert data.converged.all()
+        results.append((data.wrench, data.vert_xpos, data.iterations))
+    (wrench, x, _), (other, y, _) = results
+    np.testing.assert_allclose(other, wrench, rtol=0, atol=1e-3 * abs(wrench).max())
+    np.testing.assert_allclose(y, x, rtol=0, atol=1e-7)
+
+
+def test_dynamics():
+    """Backward Euler with both dampings, on a core that is shaken: positions and velocities of the host."""
+    options = SkinOptions(liquid=False, dynamics="implicit", mass_damping=5.0, stiffness_damping=1e-4, tolerance=1e-6, max_newton=60)
+    model = SkinModel(load_skin("coarse"), "default", options)
+    results = []
+    for resident in (False, True):
+        data, geoms = SkinData(model, 2, resident=resident), geom_set(2)
+        geoms.set_pose(np.full((2, 3), 0.1))
+        for k in range(1, 5):
+            step(model, data, geoms, 1e-3, core_pos=[[0, 2e-4 * np.sin(k), 0], [0, 0, 1e-4 * k]], core_mat=np.tile(np.eye(3), (2, 1, 1)))
+        results.append((data.vert_xpos, data.velocity.numpy()))
+    (x, v), (y, u) = results
+    assert abs(x - model.geometry.vert).max() > 1e-6
+    np.testing.assert_allclose(y, x, rtol=0, atol=1e-3 * abs(x - model.geometry.vert).max())
+    np.testing.assert_allclose(u, v, rtol=0, atol=1e-3 * abs(v).max())
+
+
+def test_loads_reset_and_reading_a_state(model):
+    data, geoms = SkinData(model, resident=True), geom_set(1)
+    load = np.zeros((1, model.nvert, 3))
+    load[0, model.outer.face_np[0], 1] = 1e-3
+    data.set_external(load)
+    geoms.set_pose([[0.1, 0.1, 0.1]] * 2)
+    step(model, data, geoms)
+    np.testing.assert_allclose(data.reaction[0] + data.liquid_force[0].sum(0) * 0, [0, 3e-3, 0], atol=2e-5)
+    data.reset()
+    assert (data.vert_xpos[0] == model.rest.vert).all() and not data.wrench.any()
+    step(model, data, geoms)
+    assert abs(data.vert_xpos[0] - model.rest.vert).max() < 1e-9
+    world = dict(place=1, depth=1, side=0)
+    for depth in DEPTHS[:2]:
+        geoms.set_pose(poses([world], depth)[0])
+        step(model, data, geoms)
+    again, other = SkinData(model, resident=True), geom_set(1)
+    prepare_device(model, again, other)
+    again.load(data.vert_xpos[0], data.increment.numpy()[:, 0], data.motion[0], data.contacts(), data.liquid.last_pressure[0])
+    other.set_pose(poses([world], DEPTHS[1])[0])
+    for d, g in ((data, geoms), (again, other)):
+        g.set_pose(poses([world], DEPTHS[2])[0])
+        step(model, d, g)
+    np.testing.assert_allclose(again.wrench, data.wrench, rtol=0, atol=1e-9 * abs(data.wrench).max())
+
+
+def test_what_is_refused(model):
+    with pytest.raises(ValueError, match=r"this data is stepped from the host: make it with SkinData\(model, nworld, resident=True\)"):
+        prepare_device(model, SkinData(model), geom_set(1))
+    with pytest.raises(ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"):
+        step_device(model, SkinData(model, resident=True), geom_set(2))
+    data = SkinData(model, 2)
+    with pytest.raises(ValueError, match="bulk moduli must be numbers >= 0"):
+        data.set_liquid(bulk_modulus=[-1.0, 1e6])
+    with pytest.raises(ValueError, match="fill volumes finite and not less than minus what there is"):
+        data.set_liquid(fill_volume=-1.0)
+    dry = SkinModel(model.geometry, "default", SkinOptions(liquid=False))
+    with pytest.raises(ValueError, match=r"this model has no liquid: make it with SkinOptions\(liquid=True\)"):
+        SkinData(dry).set_liquid(1e6)
