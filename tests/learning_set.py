@@ -31,7 +31,7 @@ def log_change(geometry, u):
 
 
 def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labelled=None, gain=1.0):
-    """Writes one shard and returns its folder; `labelled` of the interactions have measured counts, and the simulated ones are 0.8 as large."""
+    """Writes shards and returns their folder. The first `labelled` interactions are labelled; simulated changes are 0.8 as large."""
     geometry = load_skin(skin)
     rng = np.random.default_rng(seed)
     outer = np.unique(geometry.outer_face)
@@ -53,10 +53,11 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
         bell = np.exp(-0.5 * ((geometry.vert[outer] - centre) ** 2).sum(1) / radius**2)
         force = (depth[:, None] * 1e3 * np.where(bell > 0.4, bell, 0) / bell.sum())[..., None] * [0.0, 1.0, 0.0]
         flag = labelled is None or k < labelled
+        zeros = {"wrench": np.zeros((steps, 6)), "pressure": np.zeros(steps), "indenter_pos": np.zeros((steps, 3))}
         one = dict(
             id=f"t{seed}-{k}", object=name, kind="press", split="train", seed=k, parameters={}, time=0.05 * np.arange(steps),
-            displacement=u, wrench=np.zeros((steps, 6)), contact_force=force, pressure=np.zeros(steps), impedance=np.ones((steps, 19)),
-            counts=counts, indenter_pos=np.zeros((steps, 3)), indenter_quat=np.tile([1.0, 0, 0, 0], (steps, 1)), converged=np.ones(steps, bool),
+            displacement=u, contact_force=force, impedance=np.ones((steps, 19)), **zeros,
+            counts=counts, indenter_quat=np.tile([1.0, 0, 0, 0], (steps, 1)), converged=np.ones(steps, bool),
         )  # fmt: skip
         if flag:
             measured = counts.copy()

@@ -50,7 +50,7 @@ class Arrays:
           ValueError: there are none.
         """
         wanted = torch.zeros(len(self.objects), dtype=torch.bool, device=self.device)
-        wanted[torch.as_tensor(np.asarray(interactions), device=self.device)] = True
+        wanted[torch.as_tensor(np.asarray(interactions, dtype=np.int64), device=self.device)] = True
         mask = wanted[self.owner]
         if labelled:
             mask &= torch.isfinite(self.counts).all(1) & (torch.arange(len(mask), device=self.device) != self.first)

@@ -5,7 +5,7 @@ from torch import nn
 
 from .electrode_vae import mlp
 
-__all__ = ["LocalHead", "PodHead", "averages", "next_average"]
+__all__ = ["LocalHead", "PodHead", "averages", "next_average", "steady"]
 
 
 class PodHead(nn.Module):
@@ -25,7 +25,7 @@ class PodHead(nn.Module):
 
     def forward(self, local, pod):
         """local is not used; pod (n, modes)."""
-        return self.net(pod * self.damp) - self.net(torch.zeros_like(pod[:1]))
+        return self.net(pod * self.damp) - steady(self.net, torch.zeros_like(pod[:1]))
 
 
 class LocalHead(nn.Module):
@@ -51,12 +51,23 @@ class LocalHead(nn.Module):
     def forward(self, local, pod):
         """(n, 19) of local (n, 19, features) and pod (n, modes)."""
         x = local / self.scale
-        return self._raw(x, pod) - self._raw(torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
+        own = (x * self.own).sum(-1)
+        return self._curved(_plain, x, pod * self.damp) + own - self._curved(steady, torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
 
-    def _raw(self, x, pod):
+    def _curved(self, apply, x, pod):
         embedding = self.embedding.expand(len(x), -1, -1)
-        shared = self.shared(torch.cat([x, embedding], -1))[..., 0]
-        return shared + (x * self.own).sum(-1) + self.residual(pod * self.damp)
+        return apply(self.shared, torch.cat([x, embedding], -1))[..., 0] + apply(self.residual, pod)
+
+
+def _plain(net, x):
+    return net(x)
+
+
+def steady(net, x):
+    """The network without its dropout: what a head gives at rest must not shake while it is trained."""
+    for layer in net:
+        x = x if isinstance(layer, nn.Dropout) else layer(x)
+    return x
 
 
 def next_average(average, value, dt, tau):

@@ -7,6 +7,7 @@ from torch import nn
 from .electrode_vae import mlp
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
+from .heads import steady
 from .recording import log_impedance
 
 __all__ = ["InverseHead", "contact_centre", "field_errors", "log_change_of", "patch_overlap", "train_inverse"]
@@ -32,7 +33,7 @@ class InverseHead(nn.Module):
 
     def codes(self, log_change):
         """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z (n, 19)."""
-        out = self.net(log_change / self.scale) - self.net(torch.zeros_like(log_change[:1]))
+        out = self.net(log_change / self.scale) - steady(self.net, torch.zeros_like(log_change[:1]))
         return out.split([self.modes, self.force_basis.shape[1]], 1)
 
     def forward(self, log_change):

@@ -1,0 +1,176 @@
+"""Graph convolutions, hierarchy, VAEs, PointNet++, features: against dense algebra, closed forms and finite differences."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from learning_set import dent  # noqa: E402
+from scipy.sparse import csr_matrix  # noqa: E402
+
+from biotac_mj.geometry import load_skin  # noqa: E402
+from biotac_mj.learning.config import LearningConfig  # noqa: E402
+from biotac_mj.learning.electrode_vae import ElectrodeVAE  # noqa: E402
+from biotac_mj.learning.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
+from biotac_mj.learning.graph import ChebConv, SparseMatrix  # noqa: E402
+from biotac_mj.learning.heads import LocalHead, PodHead, averages, next_average  # noqa: E402
+from biotac_mj.learning.hierarchy import build_hierarchy  # noqa: E402
+from biotac_mj.learning.mesh_vae import MeshVAE  # noqa: E402
+from biotac_mj.learning.pointnet import PointNet  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return load_skin("coarse")
+
+
+@pytest.fixture(scope="module")
+def levels(skin):
+    return build_hierarchy(skin.vert, skin.tets)
+
+
+def random_laplacian(n=23, seed=0):
+    rng = np.random.default_rng(seed)
+    a = (rng.random((n, n)) < 0.3) * rng.random((n, n))
+    a = a + a.T
+    return csr_matrix(-a / np.abs(np.linalg.eigvalsh(a)).max())
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(3, 7), (7, 3)])  # forward recurrence and Clenshaw's
+def test_chebyshev_convolution_is_the_dense_polynomial(inputs, outputs):
+    matrix = random_laplacian()
+    torch.manual_seed(0)
+    conv = ChebConv(SparseMatrix(matrix, symmetric=True), inputs, outputs, order=6)
+    x = torch.randn(23, 4, inputs)
+    value, vector = np.linalg.eigh(matrix.toarray())
+    wanted = np.zeros((23, 4, outputs))
+    for k in range(6):  # T_k(cos t) = cos(k t)
+        polynomial = vector @ np.diag(np.cos(k * np.arccos(np.clip(value, -1, 1)))) @ vector.T
+        wanted += np.einsum("nm,mbi,io->nbo", polynomial, x.numpy(), conv.weight[k].detach().numpy())
+    np.testing.assert_allclose(conv(x).detach().numpy(), wanted, atol=2e-5)
+    keep = torch.tensor([3, 20, 5])
+    np.testing.assert_allclose(conv(x, keep).detach().numpy(), wanted[[3, 20, 5]], atol=2e-5)
+
+
+def test_sparse_product_has_the_right_gradient():
+    matrix = csr_matrix(np.random.default_rng(1).normal(size=(5, 8)) * (np.random.default_rng(2).random((5, 8)) < 0.5))
+    x = torch.randn(8, 3, requires_grad=True)
+    weight = torch.randn(5, 3)
+    (SparseMatrix(matrix)(x) * weight).sum().backward()
+    np.testing.assert_allclose(x.grad.numpy(), matrix.toarray().T @ weight.numpy(), atol=1e-6)
+
+
+def test_hierarchy_reproduces_linear_fields_and_keeps_the_walls_apart(skin, levels):
+    sizes = [level.laplacian.shape[0] for level in levels]
+    assert sizes == [skin.nvert, *(int(np.ceil(skin.nvert / f)) for f in (4, 16, 64, 128))]
+    here = skin.vert
+    for level in levels[:-1]:
+        np.testing.assert_allclose(level.up @ np.ones(len(level.keep)), 1, atol=1e-12)
+        np.testing.assert_allclose(level.up @ here[level.keep], here, atol=2e-6)  # [m], from a small ridge where neighbours lie in a plane
+        here = here[level.keep]
+    for level in levels:
+        eigenvalue = np.linalg.eigvalsh(level.laplacian.toarray()) if level.laplacian.shape[0] < 800 else None
+        assert eigenvalue is None or (eigenvalue.min() >= -1 - 1e-9 and eigenvalue.max() <= 1 + 1e-9)
+
+
+def test_mesh_vae_learns_and_has_the_papers_sizes(skin, levels):
+    full = MeshVAE(levels)
+    assert full.latent == 128 and full.order == 6
+    assert [conv.weight.shape[2] for conv in full.encode_convs] == [128, 128, 128, 256, 64, 64]
+    torch.manual_seed(0)
+    small = MeshVAE(levels, first=8, channels=(8, 8, 8, 8), last=8, hidden=32, latent=4)
+    bases = torch.tensor(np.stack([1e3 * dent(skin, [x, -7e-3, 0], 1e-3, 3e-3, 0) for x in (-12e-3, -6e-3)]), dtype=torch.float32)
+    x = torch.einsum("bk,kni->bni", torch.rand(8, 2), bases)
+    optimizer = torch.optim.Adam(small.parameters(), 1e-2)
+    first = None
+    for _ in range(25):
+        loss = (small(x)[0] - x).square().sum((1, 2)).mean()
+        optimizer.zero_grad(), loss.backward(), optimizer.step()
+        first = first or loss.item()
+    assert loss.item() < 0.4 * first
+
+
+def test_electrode_vae_with_linear_start_begins_near_principal_components():
+    torch.manual_seed(0)
+    x = torch.randn(500, 8) @ torch.randn(8, 19) + 0.01 * torch.randn(500, 19)
+    axes = torch.linalg.svd(x, full_matrices=False).Vh[:8]
+    net = ElectrodeVAE(linear=axes).eval()
+    plain = ElectrodeVAE().eval()
+    error = lambda n: ((n(x)[0] - x).square().mean() / x.square().mean()).item()  # noqa: E731
+    assert error(net) < 0.1 < error(plain)
+    with pytest.raises(ValueError, match="needs that shape"):
+        ElectrodeVAE(linear=axes[:5])
+
+
+def test_pod_is_the_truncated_singular_value_decomposition():
+    torch.manual_seed(0)
+    field = (torch.randn(60, 5) * torch.tensor([5.0, 3, 2, 1, 0.5])) @ torch.randn(5, 33)
+    pod = Pod.fit(field.view(60, 11, 3), torch.arange(60), modes=3)
+    u, s, v = np.linalg.svd(field.numpy(), full_matrices=False)
+    wanted = u[:, :3] * s[:3] @ v[:3]
+    np.testing.assert_allclose(pod.decode(pod(field.view(60, 11, 3))).numpy().reshape(60, 33), wanted, atol=1e-4)
+    np.testing.assert_allclose(pod(field.view(60, 11, 3)).square().mean(0), 1, rtol=1e-3)
+
+
+def test_film_features_of_a_uniform_approach(skin):
+    features = FilmFeatures(skin)
+    rest = features(torch.zeros(1, skin.nvert, 3))
+    assert rest.abs().max() < 1e-6
+    u = torch.zeros(1, skin.nvert, 3)
+    depth = 0.1
+    u[0, features.node] = -depth * features.away  # [mm] every inner node goes straight towards the core
+    got = features(u)[0]
+    gap = features.gap.numpy()
+    thinner = np.log(np.maximum(gap - depth, 0.05) / gap)
+    np.testing.assert_allclose(got[:, :3].numpy().T.ravel(), (features.patch.numpy() @ thinner).reshape(3, 19).ravel(), atol=1e-4)
+    assert (got[:, 3:6] >= -got[:, :3] - 1e-5).all()  # Jensen: ln of the mean of 1/h is at least the mean of ln 1/h
+
+
+def test_mirrored_touch_is_seen_by_the_mirrored_electrodes(skin):
+    features, matrix = FilmFeatures(skin), mirror_matrix(skin)
+    np.testing.assert_allclose(np.asarray(matrix.sum(1)).ravel(), 1, atol=1e-12)
+    np.testing.assert_allclose(skin.electrode_pos[ELECTRODE_MIRROR], skin.electrode_pos * [1, 1, -1], atol=1e-5)
+    u = 1e3 * dent(skin, [-9e-3, -6e-3, 3.5e-3], 0.8e-3, 3e-3, 0.2e-3)
+    flipped = matrix @ u * [1, 1, -1]
+    a, b = (features(torch.tensor(x, dtype=torch.float32)[None])[0].numpy() for x in (u, flipped))
+    side = np.abs(skin.electrode_pos[:, 2]) > 5e-4
+    error = np.abs(b[side] - a[ELECTRODE_MIRROR][side]).max()
+    assert error < 0.1 * np.abs(a).max()  # the mesh itself is symmetric to a few hundredths of a millimetre only
+
+
+def test_heads_are_zero_at_rest_and_averages_are_causal():
+    torch.manual_seed(0)
+    for head in (PodHead(6).eval(), LocalHead(5, 6).eval()):
+        assert head(torch.zeros(2, 19, 5), torch.zeros(2, 6)).abs().max() < 1e-6
+        assert head(torch.randn(2, 19, 5), torch.randn(2, 6)).abs().max() > 1e-3
+    value, time, first = torch.randn(5, 3), torch.arange(5) * 0.1, torch.zeros(5, dtype=torch.long)
+    got = averages(value, first, time, (0.2,))
+    mean = torch.zeros(1, 3)
+    for k in range(1, 5):
+        mean = next_average(mean, value[k], 0.1, (0.2,))
+        np.testing.assert_allclose(got[k], value[k] - mean[0], atol=1e-6)
+    value[4] += 1
+    np.testing.assert_array_equal(averages(value, first, time, (0.2,))[:4], got[:4])
+
+
+def test_pointnet_reads_only_its_nodes(skin):
+    free = np.setdiff1d(np.arange(skin.nvert), skin.fixed)
+    net = PointNet(skin.vert, free).eval()
+    assert len(set(net.sample.tolist())) == 128
+    u = torch.randn(2, skin.nvert, 3)
+    out = net(u)
+    other = u.clone()
+    rest = np.setdiff1d(np.arange(skin.nvert), net.sample.numpy())
+    other[:, rest] = 0
+    assert out.shape == (2, 19) and torch.equal(out, net(other)) and not torch.equal(out, net(2 * u))
+    with pytest.raises(ValueError, match="cannot be sampled"):
+        PointNet(skin.vert, free[:50])
+
+
+def test_config_names_what_is_wrong():
+    with pytest.raises(ValueError, match="projection_loss is 'pixels': choose from latent, decoded"):
+        LearningConfig(projection_loss="pixels")
+    with pytest.raises(ValueError, match="must not be negative"):
+        LearningConfig(steps=-1)
+    with pytest.raises(ValueError, match="equally many"):
+        LearningConfig(mesh_factors=(4, 4))

@@ -1,0 +1,150 @@
+"""`biotac evaluate --electrodes`: synthetic logs with known answers, leakage, and whatever files people have."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from biotac_mj.cli import main
+from biotac_mj.learning.force import causal_average, fit_force, ridge, shared_gain, walk_forward
+from biotac_mj.learning.real import evaluate_recording
+from biotac_mj.learning.recording import counts_of, load_counts, load_recording, log_impedance
+from biotac_mj.sensor.channels import REST_COUNTS
+
+PRESS = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
+
+
+def synthetic_log(n=3000, drift=-0.2, seed=0):
+    """Counts (n, 19) and force (n, 3): ln Z is linear in the force, and all electrodes drift together in ln Z."""
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(rng.normal(size=(n, 3)), axis=0)
+    force = walk - causal_average(walk, 200.0)
+    force /= force.std(0)
+    log_z = log_impedance(REST_COUNTS["1"]) + force @ (0.05 * rng.normal(size=(3, 19)))
+    log_z += (drift * (1 - np.exp(-np.arange(n) / n)))[:, None]
+    return np.rint(np.clip(counts_of(log_z) + rng.normal(size=(n, 19)), 0, 4095)), force
+
+
+def write(folder, counts, force=None, delimiter=" "):
+    np.savetxt(folder / "e.txt", counts, "%d", delimiter=delimiter)
+    if force is not None:
+        np.savetxt(folder / "f.txt", force)
+    return folder / "e.txt", folder / "f.txt"
+
+
+def test_log_impedance_and_back():
+    counts = np.array([1.0, 500, 2047.5, 4000])
+    np.testing.assert_allclose(counts_of(log_impedance(counts)), counts)
+    assert log_impedance(2047.5) == 0
+    assert np.isfinite(log_impedance(np.array([0.0, 4095]))).all()
+
+
+def test_ridge_is_least_squares_and_leaves_constant_features_alone():
+    rng = np.random.default_rng(0)
+    x = np.column_stack([rng.normal(size=(100, 4)), np.ones(100)])
+    y = x[:, :4] @ rng.normal(size=(4, 2)) + 3
+    w, b = ridge(x, y, 1e-12)
+    np.testing.assert_allclose(x @ w + b, y, atol=1e-8)
+    assert (w[4] == 0).all()
+
+
+def test_shared_gain_is_found_beside_the_force():
+    counts, force = synthetic_log(drift=-0.2)
+    assert shared_gain(log_impedance(counts), force, len(counts)) == pytest.approx(-0.2, abs=0.01)
+
+
+def test_walk_forward_never_looks_ahead():
+    for train, test in walk_forward(1000):
+        assert train.start == 0 and train.stop == test.start < test.stop <= 1000
+
+
+def test_drift_is_handled_where_plain_regression_fails():
+    counts, force = synthetic_log()
+    model = fit_force(counts, force, 2100, network=False)
+    w, b = ridge(counts[:2100], force[:2100], 1e-4)
+    plain = np.sqrt(((counts @ w + b - force)[2100:] ** 2).mean(0))
+    ours = np.sqrt(((model.prediction - force)[2100:] ** 2).mean(0))
+    assert (ours < plain).all() and ours.max() < 0.15
+
+
+def test_nothing_of_the_test_part_and_nothing_later_is_used():
+    counts, force = synthetic_log()
+    whole = fit_force(counts, force, 2100, network=False).prediction
+    changed = force.copy()
+    changed[2100:] = 99  # its answers
+    np.testing.assert_array_equal(fit_force(counts, changed, 2100, network=False).prediction, whole)
+    np.testing.assert_allclose(fit_force(counts[:2500], force[:2500], 2100, network=False).prediction, whole[:2500], atol=1e-12)
+
+
+def test_evaluation_of_a_log_with_and_without_force(tmp_path):
+    counts, force = synthetic_log()
+    counts[:, 5] = 4095  # a dead channel
+    e, f = write(tmp_path, counts, force, ",")
+    result = evaluate_recording(e, f, tmp_path / "r.json", network=False, progress=False)
+    assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 2100
+    assert (tmp_path / "r.png").stat().st_size > 20_000
+    # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less what eight components take up
+    assert result["reconstruction"]["models"]["pca8"]["test"]["rms"] < 1.2
+    assert result["force_regression"]["models"]["drift_aware"]["rmse"][0] < 0.2
+    assert any("e6 reads 0 or 4095 in 100.0 %" in note for note in result["notes"])
+    result = evaluate_recording(e, None, tmp_path / "r2.json", network=False, progress=False)
+    assert "force_regression" not in result and any("no force file" in note for note in result["notes"])
+
+
+def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("torch")
+    import biotac_mj.learning.real as real
+
+    monkeypatch.setattr(real, "_STEPS", (20, 20))
+    counts, force = synthetic_log(800)
+    e, f = write(tmp_path, counts, force)
+    assert main(["evaluate", "--electrodes", str(e), "--force", str(f), "--json", str(tmp_path / "o.json"), "--quiet"]) == 0
+    text = capsys.readouterr().out
+    assert "electrode_vae_linear_start" in text and "drift_aware" in text
+    assert set(json.loads((tmp_path / "o.json").read_text())["reconstruction"]["models"]) >= {"pca8", "electrode_vae"}
+
+
+def test_bad_files_are_named(tmp_path, capsys):
+    counts, force = synthetic_log(600)
+    e, f = write(tmp_path, counts, force)
+
+    def refused(text, edit, force_file=None):
+        rows = edit(e.read_text().splitlines())
+        bad = tmp_path / "bad.txt"
+        bad.write_text("\n".join(rows))
+        with pytest.raises(ValueError, match=text):
+            load_recording(bad, force_file)
+
+    refused(r"line 3 has 18 columns: electrode counts e1..e19 need 19", lambda r: [*r[:2], " ".join(r[2].split()[:18]), *r[3:]])
+    refused(r"line 4 column 1 is nan", lambda r: [*r[:3], "nan " + " ".join(r[3].split()[1:]), *r[4:]])
+    refused(r"counts of e1 \(\S+5000\) are outside 0..4095", lambda r: ["5000 " + " ".join(r[0].split()[1:]), *r[1:]])
+    refused("holds text that is no number", lambda r: ["x " + " ".join(r[0].split()[1:]), *r[1:]])
+    refused("has 100 rows: at least 400", lambda r: r[:100])
+    refused("is empty", lambda r: ["# nothing"])
+    refused("no channel changes", lambda r: [r[0]] * 600)
+    refused("600 rows|has 599 rows and the force file 600", lambda r: r[:-1], f)
+    with pytest.raises(FileNotFoundError, match="no file"):
+        load_recording(tmp_path / "none.txt")
+    with pytest.raises(ValueError, match="fraction 0.99"):
+        evaluate_recording(e, None, tmp_path / "x.json", fraction=0.99)
+    assert main(["evaluate"]) == 2 and "nothing to evaluate" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path)]) == 2 and "run `biotac train SET" in capsys.readouterr().err
+
+
+def test_counts_of_a_press_are_read(tmp_path):
+    path = tmp_path / "readings.csv"
+    path.write_text("time_s," + ",".join(f"e{i}" for i in range(1, 20)) + "\n0.0," + ",".join(str(100 + i) for i in range(19)) + "\n")
+    np.testing.assert_array_equal(load_counts(path), [np.arange(100, 119)])
+    path.write_text("time_s,e1\n0,1\n")
+    with pytest.raises(ValueError, match="no columns e2, e3"):
+        load_counts(path)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PRESS.is_dir(), reason="real recording ../shared/data/epfl_flat_press is not here")
+def test_real_press_beats_the_bars(tmp_path):
+    result = evaluate_recording(PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json", progress=False)
+    models = result["reconstruction"]["models"]
+    assert models["electrode_vae"]["test"]["rms"] < 14.1 and models["electrode_vae_linear_start"]["test"]["rms"] < 10
+    assert (np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]).all()

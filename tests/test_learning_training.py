@@ -1,0 +1,220 @@
+"""Training on a small set whose rule is known, files of weights, use in MuJoCo, and everything that can be wrong with the input."""
+
+import json
+import shutil
+
+import h5py
+import mujoco
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("safetensors")
+
+from learning_set import dent, log_change, make_set  # noqa: E402
+
+import biotac_mj  # noqa: E402
+from biotac_mj.data import TactileSet  # noqa: E402
+from biotac_mj.geometry import load_skin  # noqa: E402
+from biotac_mj.learning.arrays import load_arrays  # noqa: E402
+from biotac_mj.learning.config import LearningConfig  # noqa: E402
+from biotac_mj.learning.experiment import train_all  # noqa: E402
+from biotac_mj.learning.few_shot import adapt, evaluate_new_sensor  # noqa: E402
+from biotac_mj.learning.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
+from biotac_mj.learning.patch import contact_patch  # noqa: E402
+from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
+from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
+from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
+from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
+
+SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return make_set(tmp_path_factory.mktemp("set"), count=80, labelled=60)
+
+
+@pytest.fixture(scope="module")
+def trained(folder, tmp_path_factory):
+    """One training of three models on both kinds of split."""
+    out = tmp_path_factory.mktemp("trained")
+    torch.set_num_threads(1)
+    train_all(folder, out, (0,), ("trajectory", "ring_7mm"), SMALL, paper=False, only=("local_taught", "local_window"), progress=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def weights(trained):
+    return trained / "forward-ring_7mm.safetensors"
+
+
+def test_local_head_recovers_the_rule_on_an_unseen_object(trained):
+    result = evaluate_models(trained)
+    rows = result["splits"]["ring_7mm"]["models"]
+    assert rows["local_taught"]["median"] < 3.0  # counts; the noise of this set is 1, its touches are tens
+    assert rows["tare"]["median"] > 5 * rows["local_taught"]["median"]
+    assert result["default"] in ("local_taught", "local_window", "ensemble")
+    assert 0.8 <= rows["local_taught"]["interval_coverage"] <= 1
+    text = table(result)
+    assert "unseen object: ring_7mm" in text and "local_taught against" in text or "ensemble against" in text
+    for picture in result["figures"]:
+        assert (trained / picture.split("/")[-1]).stat().st_size > 10_000
+    with TactileSet(result["set"]) as data:
+        ring = np.flatnonzero((data.object == "ring_7mm") & data.labelled)
+    with np.load(trained / "ring_7mm-0.npz") as file:
+        assert set(file["owner"][file["test"]]) == set(ring)
+        assert not set(file["owner"][~file["test"]]) & set(ring)
+
+
+def test_training_goes_on_where_it_was_interrupted(trained, folder):
+    stamp = (trained / "trajectory-0.json").stat().st_mtime_ns
+    train_all(folder, trained, (0,), ("trajectory",), SMALL, paper=False, progress=False)
+    assert (trained / "trajectory-0.json").stat().st_mtime_ns == stamp
+
+
+@pytest.mark.slow
+def test_the_papers_networks_train_too(folder, tmp_path):
+    config = LearningConfig(
+        steps=60, batch=64, mesh_steps=6, mesh_batch=4, mesh_first=8, mesh_channels=(8, 8, 8, 8), mesh_last=8, pod=16, members=1
+    )
+    train_all(folder, tmp_path, (0,), ("trajectory",), config, only=("pod_log",), progress=False)
+    report = json.loads((tmp_path / "trajectory-0.json").read_text())
+    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {"pod_inverse", "latent_inverse"} == set(report["inverse"])
+    assert {"latent_projection", "pointnet", "electrode_vae"} <= set(evaluate_models(tmp_path)["splits"]["trajectory"]["models"])
+
+
+def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
+    skin = load_skin("coarse")
+    model = load_forward(weights, skin)
+    u = dent(skin, [-9e-3, -7e-3, 1e-3], 0.8e-3, 2e-3, 0)
+    d = model.log_change(torch.tensor(1e3 * u[None], dtype=torch.float32))[0][0].numpy()
+    wanted = log_change(skin, u)
+    assert np.abs(d - wanted).max() < 0.15 * np.abs(wanted).max()
+    with pytest.raises(ValueError, match=r"trained on skin 'coarse' with .* cannot read skin 'default'"):
+        load_forward(weights, load_skin("default"))
+    with pytest.raises(ValueError, match="holds no inverse model"):
+        load_inverse(weights, skin)
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        load_forward(weights.with_name("none.safetensors"), skin)
+    with pytest.raises(ValueError, match=r"reads \(n, 2741, 3\)|this model reads"):
+        model.log_change(torch.zeros(1, 5, 3))
+    bad = torch.zeros(1, skin.nvert, 3)
+    bad[0, 3, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        model.log_change(bad)
+
+
+def test_damaged_weights_are_named(weights, tmp_path):
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(weights.read_bytes()[:2000])
+    with pytest.raises(ValueError, match="not a readable safetensors file"):
+        load_forward(broken, load_skin("coarse"))
+
+
+def test_channels_in_another_order_are_named(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "set")
+    for path in copy.glob("*.h5"):
+        with h5py.File(path, "a") as file:
+            names = list(file.attrs["channels"])
+            file.attrs["channels"] = [names[1], names[0], *names[2:]]
+    with pytest.raises(ValueError, match="order"):
+        load_arrays(copy)
+
+
+def test_an_empty_part_is_named(folder):
+    arrays = load_arrays(folder)
+    unlabelled = np.flatnonzero(~arrays.labelled)
+    with pytest.raises(ValueError, match="no labelled time steps"):
+        arrays.rows(unlabelled, labelled=True)
+    with pytest.raises(ValueError, match="no time steps"):
+        arrays.rows([])
+
+
+def test_network_counts_in_a_step_of_mujoco(weights):
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><site name="tip"/>
+        <body name="ball" mocap="true" pos="-0.009 -0.0130 0"><geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>"""
+    )
+    sensor = biotac_mj.SensorBioTac(signal="latent_projection", weights=str(weights), noise=False)
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings())
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(handle.read(data, "electrodes"), REST_COUNTS["1"], atol=1)
+    for k in range(6):
+        data.mocap_pos[0, 1] = -0.0115 + 2e-4 * k
+        mujoco.mj_step(model, data)
+    u = handle.vert_xpos(model, data) - load_skin("coarse").vert
+    assert np.abs(u).max() > 3e-4
+    network = sensor.readings(load_skin("coarse"))
+    state = np.zeros(network.nstate)
+    network.reset(state)
+    for k in range(6):
+        network.advance(state, 0.01 * k, 0.01, load_skin("coarse").vert + u, 0.0)
+    got = handle.read(data, "electrodes")
+    assert np.abs(got - REST_COUNTS["1"]).max() > 20
+    change = np.abs(network.readings(state)["electrodes"] - got)
+    assert change.max() <= 0.15 * np.abs(got - REST_COUNTS["1"]).max() + 1  # the held last step against a motion: nearly the same skin
+    with pytest.raises(ValueError, match="unknown signal"):
+        biotac_mj.SensorBioTac(signal="telepathy")
+    with pytest.raises(ValueError, match="weights"):
+        biotac_mj.SensorBioTac(weights="a")
+
+
+def test_a_batch_gives_what_single_sensors_give(weights):
+    import warp as wp
+
+    skin = load_skin("coarse")
+    u = np.stack([dent(skin, [x, -7e-3, 0], 0.6e-3, 2e-3, 0) for x in (-12e-3, -9e-3, -5e-3)])
+    film = LearnedBatchFilm(skin, 3, "cpu", weights=weights, sensor="2")
+    x = wp.array(np.ascontiguousarray((skin.vert + u).transpose(1, 0, 2)), dtype=wp.vec3d)
+    film.solve(x, wp.array(np.array([1, 0, 1], np.int32), dtype=int))
+    one = NetworkReadings(skin, weights=weights, sensor="2", noise=False)
+    got = film.impedance.numpy()
+    np.testing.assert_allclose(got[1], film.rest)
+    average = torch.zeros(3, *one.model.memory) if one.model.window else None
+    change = one.model.log_change(torch.tensor(1e3 * u, dtype=torch.float32), average, 0.01)[0].double().numpy()
+    np.testing.assert_allclose(got[[0, 2]], (film.rest * np.exp(change))[[0, 2]], rtol=1e-5)
+
+
+def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(200, 19))
+    gain = rng.uniform(0.5, 1.5, 19)
+    np.testing.assert_allclose(adapt(p, gain * p, strength=1e-9), gain, atol=1e-6)
+    other = make_set(tmp_path / "other", count=24, seed=5, gain=1.4)
+    result = evaluate_new_sensor(other, weights, tmp_path / "new.json", touches=(0, 5), draws=3)["median_rms_counts_after_touches"]
+    assert result["5"] < 0.5 * result["0"] < result["tare"]
+    with pytest.raises(ValueError, match="the same rows"):
+        adapt(p, p[:3])
+
+
+def test_contact_patch_finds_the_touch(trained, tmp_path):
+    skin = load_skin("coarse")
+    rest = REST_COUNTS["2"]
+    z0 = np.log(4095 / rest - 1)
+    places = np.array([[-12e-3, -6.5e-3, 0], [-6e-3, -6.5e-3, 3e-3]])
+    rows = [rest] + [4095 / (1 + np.exp(z0 + log_change(skin, dent(skin, p, 0.8e-3, 2.5e-3, 0)))) for p in places]
+    source = tmp_path / "counts.txt"
+    np.savetxt(source, rows, "%.3f")
+    one = contact_patch(source, tmp_path / "out", skin="coarse", weights=trained / "inverse-trajectory.safetensors", row=2)
+    saved = json.loads((tmp_path / "out/contact.json").read_text())
+    centre = np.array(saved["centre_mm"][1:]) * 1e-3
+    assert np.linalg.norm(centre - places, axis=1).max() < 4e-3 and centre[0, 0] < centre[1, 0] and centre[1, 2] > centre[0, 2]
+    assert one["row"] == 2 and (tmp_path / "out/contact.png").stat().st_size > 20_000
+    with pytest.raises(ValueError, match="--row 9"):
+        contact_patch(source, tmp_path / "out", row=9)
+    with pytest.raises(ValueError, match="pass raw counts"):
+        log_change_of(np.full((1, 19), np.nan), rest)
+    with pytest.raises(ValueError, match="19 electrodes"):
+        log_change_of(np.zeros((1, 18)), rest)
+
+
+def test_patch_measures():
+    place = np.array([[0.0, 0, 0], [1e-3, 0, 0], [5e-3, 0, 0]])
+    force = np.array([[1.0, 1.0, 0.1], [0, 0, 0]])
+    centre = contact_centre(force, place)
+    np.testing.assert_allclose(centre[0], [0.5e-3, 0, 0])  # the weak node is no part of the patch
+    assert np.isnan(centre[1]).all()
+    np.testing.assert_allclose(patch_overlap(np.array([[1.0, 0, 0]]), np.array([[1.0, 1.0, 0]])), [0.5])
