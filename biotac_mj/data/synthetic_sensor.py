@@ -102,9 +102,7 @@ class SyntheticSensor:
         from ..skin.material import Material
 
         if importlib.util.find_spec("skfem") is None:
-            raise ValueError(
-                "the synthetic measured sensor needs scikit-fem: pip install 'biotac-mj[data]', or make a set with --labelled 0"
-            )
+            raise ValueError("the synthetic measured sensor needs scikit-fem: pip install 'biotac-mj[data]', or take --labelled 0")
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
         options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
