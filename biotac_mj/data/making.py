@@ -72,7 +72,7 @@ class Maker:
         from . import readings, simulate, synthetic_sensor
 
         o = self.options
-        gc.collect()  # models and graphs refer to each other: the device memory of the last batch goes back now
+        self._free()
         clock = time.perf_counter()
         motions = plan_motions(self.geometry, batch.name, [[o.seed, i] for i in batch.members], o.steps, o.kinds, self.model.device)
         running = _Running(batch, motions)
@@ -87,6 +87,7 @@ class Maker:
                 for k in range(len(motions))
             ]
         if batch.measured:
+            self._free()
             answer = running.answer = self.measured.simulate(batch.name, motions, bar.update)
             self._count("measured skin", clock)
             # each contact of the session begins some seconds after the last one, while the sensor warms up
@@ -95,6 +96,14 @@ class Maker:
                 for k, i in enumerate(batch.members)
             ]
         return running
+
+    def _free(self):
+        """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch keeps what it once had."""
+        gc.collect()
+        if self.model.device.is_cuda:
+            import torch
+
+            torch.cuda.empty_cache()
 
     def _count(self, stage, since):
         now = time.perf_counter()
