@@ -58,14 +58,14 @@ def _verb(verbs, name, run, text):
     return verb
 
 
-def _add_skin(verb):
+def _add_skin(verb, seed="of the sensor's noise"):
     verb.add_argument("--skin", default="default", help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`")
     verb.add_argument("--tier", default="full", choices=TIERS, help="full finite elements, or the condensed skin for real time on one core")
     verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)"
     )
-    verb.add_argument("--seed", type=int, default=0, help="of the sensor's noise")
+    verb.add_argument("--seed", type=int, default=0, help=seed)
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
 
 
@@ -146,6 +146,10 @@ def _add_view(verbs):
     _add_skin(verb)
     verb.add_argument("--render", metavar="FILE", help="write a picture of the ball lying on the pad instead of opening a window")
     verb.add_argument("--seconds", type=float, default=0.3, help="how long to simulate before --render")
+    verb.add_argument("--hand", metavar="FILE", help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead")
+    verb.add_argument("--web", action="store_true", help="a page in the browser with skin, electrodes and traces (extra web)")
+    verb.add_argument("--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation")
+    verb.add_argument("--port", type=int, default=8080, help="of the page")
 
 
 def _view(args):
@@ -161,6 +165,10 @@ def _view(args):
         device=args.device,
         render=args.render,
         seconds=args.seconds,
+        hand=args.hand,
+        web=args.web,
+        recording=args.recording,
+        port=args.port,
     )
 
 
@@ -267,7 +275,7 @@ def _add_generate(verbs):
     verb.add_argument("--measured-seed", type=int, default=0, help="number of the synthetic measured sensor")
     verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
     verb.add_argument("--workers", type=int, help="processes that compute electrode readings (default: one per core)")
-    _add_skin(verb)
+    _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
     verb.add_argument("--out", default="out/set", metavar="DIR", help="folder of the set")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
