@@ -10,6 +10,7 @@ import torch
 
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
 from ..press_record import replacing
+from ..sensor.channels import FULL_SCALE
 from .arrays import load_arrays
 from .config import LearningConfig
 from .features import Pod
@@ -150,7 +151,7 @@ def _linear(arrays, now, fit, check, both):
     """Ridge from components to tared counts; its strength is chosen on the validation rows."""
     x, y = now[fit].double().cpu().numpy(), arrays.change(fit).double().cpu().numpy()
     xc, yc = now[check].double().cpu().numpy(), arrays.change(check).double().cpu().numpy()
-    fits = [ridge(x, y, s) for s in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
+    fits = [ridge(x, y, s) for s in (1e-3, 1e-2, 1e-1, 1.0, 10.0)]
     w, b = min(fits, key=lambda f: ((xc @ f[0] + f[1] - yc) ** 2).mean())
     return torch.as_tensor(now[both].double().cpu().numpy() @ w + b, dtype=torch.float32, device=arrays.device)
 
@@ -220,7 +221,9 @@ def _write(out, name, arrays, check, rows, both, truth, predictions, report):
         "truth": truth, "tare": arrays.tare[both], "time": arrays.time[both], "owner": owner, "object": arrays.objects[owner].astype("S32"),
         "test": np.arange(len(both)) >= len(check),
     }  # fmt: skip
-    content |= {f"predicted_{k}": v.half() for k, v in predictions.items()}
+    tare = arrays.tare[both]
+    # no reading lies outside 0..4095, whatever a model says
+    content |= {f"predicted_{k}": torch.minimum(torch.maximum(v, -tare), FULL_SCALE - tare).half() for k, v in predictions.items()}
     content = {k: v.detach().cpu().numpy() if torch.is_tensor(v) else v for k, v in content.items()}
     with replacing(out / f"{name}.npz") as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **content)

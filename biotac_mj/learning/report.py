@@ -98,7 +98,10 @@ def _split(folder, split, reports):
         for key in (k for k in data if k.startswith("predicted_")):
             name = key[len("predicted_") :]
             got = data[key].astype(float)
-            which, value = interaction_errors(got[test], truth, owner)
+            try:
+                which, value = interaction_errors(got[test], truth, owner)
+            except ValueError as error:
+                raise ValueError(f"{folder}/{split}-{report['seed']}.npz, {name}: {error}") from error
             errors.setdefault(name, {}).setdefault("seed", []).append(float(np.median(value)))
             for k, v in zip(which.tolist(), value.tolist()):
                 errors[name].setdefault("each", {}).setdefault(k, []).append(v)
