@@ -11,7 +11,7 @@ from . import approach, plugin
 from .press import see_through
 from .press_record import replacing
 
-__all__ = ["build_scene", "view"]
+__all__ = ["build_hand", "build_scene", "view"]
 
 _PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])  # turns the pad, -y of the BioTac, to the world's +z
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
@@ -55,30 +55,81 @@ def build_scene(skin="default", **attach_options):
     return spec, handle
 
 
-def view(skin="default", material="default", liquid=None, seed=0, device="cpu", tier="full", render=None, seconds=0.3):
-    """Opens the viewer and steps in real time as far as the machine goes; or renders.
+def build_hand(path, skin="coarse", **attach_options):
+    """A Shadow Hand of MuJoCo Menagerie, palm up, with five BioTacs and a ball that lies on its fingers.
+
+    Args:
+      path: its right_hand.xml or left_hand.xml.
+      skin: name, file or SkinGeometry; attach_options: see `biotac_mj.attach`.
+
+    Returns:
+      spec, and {finger: handle} of `biotac_mj.attach_to_hand`.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: it is no Shadow Hand.
+    """
+    import pathlib
+
+    from .tasks.hands import attach_to_hand
+
+    if not pathlib.Path(path).is_file():
+        raise FileNotFoundError(f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand")
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.visual.headlight.ambient[:] = 0.3
+    ball = spec.worldbody.add_body(name="ball", pos=[0.425, 0.0, 0.06])
+    ball.add_freejoint(name="ball")
+    ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[0.85, 0.45, 0.15, 1])
+    return spec, attach_to_hand(spec, "shadow_hand", skin=skin, **attach_options)
+
+
+def view(
+    skin="default", material="default", liquid=None, seed=0, device="cpu", tier="full", render=None, seconds=0.3, hand=None, web=False,
+    recording=None, port=8080,
+):  # fmt: skip
+    """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
 
     Args:
       skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's choice.
       render: path of a picture to write after `seconds` [s] instead.
+      hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
+      web: serve a page in the browser (`web_view`) at `port`, of the simulation or of the file `recording`.
 
     Raises:
       ValueError: no display for a window, or no GL library to render with.
     """
     from .skin.material import material as preset
 
-    if render is None and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ValueError("no display to open a window on: use `biotac view --render FILE.png`, or set DISPLAY")
+    if recording and not web:
+        raise ValueError("a recording is shown in the browser: add --web")
+    if recording:
+        from .web_view import play_file
+
+        return play_file(recording, port=port)
+    linux = sys.platform.startswith("linux")
+    if render is None and not web and linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ValueError("no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY")
     liquid = preset(material).liquid if liquid is None else liquid
-    spec, _ = build_scene(skin, material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device, tier=tier)
+    settings = dict(material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device)
+    if hand is None:
+        spec, handle = build_scene(skin, tier=tier, **settings)
+        handles, aim = {"biotac": handle}, _aim
+    else:
+        spec, handles = build_hand(hand, tier="condensed", **settings)
+        aim = _aim_at_hand
     model = spec.compile()
     data = mujoco.MjData(model)
     if render is not None:
-        return _render(model, data, render, seconds)
+        return _render(model, data, render, seconds, aim)
+    if web:
+        from .web_view import play_model
+
+        return play_model(model, data, handles, port=port)
     from mujoco import viewer
 
     with viewer.launch_passive(model, data) as window:
-        _aim(window.cam)
+        aim(window.cam)
         while window.is_running():
             begin = time.perf_counter()
             mujoco.mj_step(model, data)
@@ -93,7 +144,12 @@ def _aim(camera):
     camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
-def _render(model, data, path, seconds):
+def _aim_at_hand(camera):
+    camera.lookat[:] = [0.38, 0, 0.02]
+    camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
+
+
+def _render(model, data, path, seconds, aim):
     from matplotlib.image import imsave
 
     from .offscreen import Offscreen, find_gl
@@ -103,7 +159,7 @@ def _render(model, data, path, seconds):
             mujoco.mj_step(model, data)
             plugin.check()
         camera = mujoco.MjvCamera()
-        _aim(camera)
+        aim(camera)
         picture = screen.render(data, camera)
     with replacing(path) as temporary:
         imsave(temporary, picture)

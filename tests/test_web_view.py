@@ -1,0 +1,139 @@
+"""The page in the browser: what an HTTP client and a websocket client get from it. (No browser can be had where this is tested.)"""
+
+import asyncio
+import urllib.request
+
+import numpy as np
+import pytest
+
+viser = pytest.importorskip("viser", reason="needs viser (extra web)")
+
+# ruff: noqa: E402
+import zstandard
+
+from biotac_mj import cli, web_view
+from biotac_mj.press_record import write_skin
+
+
+def messages(page, seconds=1.0):
+    """All messages a new client gets from a page, unpacked."""
+    import msgspec
+    import websockets
+
+    async def listen():
+        frames = []
+        address = page.url.replace("http", "ws")
+        async with websockets.connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as socket:
+            try:
+                while True:
+                    frames.append(await asyncio.wait_for(socket.recv(), seconds))
+            except TimeoutError:
+                return frames
+
+    out = []
+    for frame in asyncio.run(listen()):
+        # two lengths, a compressed msgpack, then the arrays it refers to, each aligned to 8 bytes (viser/infra/_infra.py)
+        size = int.from_bytes(frame[8:16], "little")
+        content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size]))
+        arrays, at = [], 16 + size
+        for length in content["binaryBufferLengths"]:
+            at += -at % 8
+            arrays.append(frame[at : at + length])
+            at += length
+        out += [(message, arrays) for message in content["messages"]]
+    return out
+
+
+def vertices(found, name):
+    """Last vertices sent for a mesh."""
+    last = None
+    for message, arrays in found:
+        if message.get("name") == name:
+            sent = message.get("props", message.get("updates", {})).get("vertices")
+            last = arrays[sent["__binary_index"]] if sent is not None else last
+    return np.frombuffer(last, np.float32).reshape(-1, 3)
+
+
+@pytest.fixture
+def page(shell):
+    made = web_view.Page({"left": web_view.Finger.of(shell, np.full(19, 3000.0))}, port=8931)
+    yield made
+    made.close()
+
+
+def test_page_is_served_and_carries_the_finger(page, shell):
+    html = urllib.request.urlopen(page.url, timeout=5).read()
+    assert html.lstrip().lower().startswith(b"<!doctype html") and b"<script" in html
+    finger = page.fingers["left"]
+    moved = shell.vert[finger.node] + [0, 1e-3, 0]
+    counts = np.full(19, 3000.0)
+    counts[4] -= 300
+    for time in (0.1, 0.2):
+        page.update(time, {"left": (moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]), np.array([1.0, 0, 0, 0]))})
+    found = messages(page)
+    names = {m.get("name") for m, _ in found}
+    assert {"/left", "/left/skin", "/left/core", *(f"/left/e{i}" for i in range(1, 20))} <= names
+    np.testing.assert_allclose(vertices(found, "/left/skin"), moved, atol=1e-7)
+    text = repr([m for m, _ in found])
+    assert "t = 0.200 s" in text and "force [N]" in text and "'e19'" in text
+    # the electrode whose counts fell is red, the others are grey
+    assert tuple(page._scene["left"][2][4].color) == (204, 38, 25) and tuple(page._scene["left"][2][5].color) == (216, 216, 216)
+    rows = page._gui["left"][1].data
+    np.testing.assert_allclose(rows[0], [0.1, 0.2])
+    np.testing.assert_allclose(rows[5], [-300, -300])
+
+
+def test_electrode_map_shows_each_electrode_at_its_place():
+    position = np.array([[-16e-3, -5e-3, 0], [0.0, -3.5e-3, -3.5e-3]])
+    picture = web_view.electrode_map(position, np.array([-300.0, 300.0])).astype(int)
+    red = np.argwhere((picture[..., 0] > 180) & (picture[..., 2] < 60))
+    blue = np.argwhere((picture[..., 2] > 180) & (picture[..., 0] < 60))
+    assert len(red) > 50 and len(blue) > 50
+    assert red[:, 1].mean() < blue[:, 1].mean() - 100  # the tip is on the left
+    assert red[:, 0].mean() == pytest.approx(75, abs=1) and blue[:, 0].mean() < 60
+
+
+def test_a_recorded_press_is_played(synthetic_press, tmp_path):
+    write_skin(synthetic_press, tmp_path / "skin.h5")
+    page = web_view.play_file(tmp_path / "skin.h5", speed=1e3, rounds=1, port=8932)
+    try:
+        finger = page.fingers["biotac"]
+        np.testing.assert_allclose(vertices(messages(page), "/biotac/skin"), synthetic_press.vert_xpos[-1][finger.node], atol=1e-7)
+        rows = page._gui["biotac"][2].data
+        np.testing.assert_allclose(rows[1], np.linalg.norm(synthetic_press.force, axis=1), atol=1e-9)
+    finally:
+        page.close()
+
+
+def test_a_model_is_shown_while_it_steps():
+    import mujoco
+    import spring_skin
+
+    import biotac_mj
+
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.01"/><worldbody><body mocap="true" pos="-.01 -.0175 0"><geom size=".01"/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(spec, skin=spring_skin.pad_geometry(), stepper="springs", readings="sum")
+    model = spec.compile()
+    page = web_view.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
+    try:
+        rows = page._gui["finger"][2].data
+        assert len(rows[0]) == 5 and rows[0][0] == pytest.approx(0.01) and np.ptp(np.diff(rows[0])) < 1e-9
+        assert rows[1][-1] > 0  # the ball pushes
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize(
+    "arguments, text",
+    [
+        (["view", "--recording", "x.h5"], "a recording is shown in the browser: add --web"),
+        (["view", "--web", "--recording", "/no/such.h5"], "no recording at /no/such.h5: make one with `biotac press --out DIR`"),
+        (["view", "--web", "--recording", __file__], "is no recorded press"),
+        (["view", "--web", "--hand", "/no/hand.xml"], "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand"),
+    ],
+)
+def test_bad_input(arguments, text, capsys):
+    assert cli.main(arguments) == 2
+    assert text in capsys.readouterr().err
