@@ -50,7 +50,8 @@ def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figur
         biotac = batch.attach(
             mjm, m, d, skin=skin, material=[{**rubber, "youngs_modulus": e} for e in youngs_modulus], friction=rng.uniform(0.3, 1.0, nworld)
         )  # fmt: skip
-        print(f"{nworld} worlds take {biotac.nbytes / nworld / 1e6:.2f} MB each")
+        size = biotac.nbytes / nworld
+        print(f"{nworld} worlds take {size / 1e6:.2f} MB each: about {80e9 / size:.0f} fit into 80 GB")
         d.mocap_pos.assign(start[:, None].astype(np.float32))
         inwards = wp.array(-outwards * depth / steps, dtype=wp.vec3)
 

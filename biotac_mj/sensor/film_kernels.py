@@ -208,7 +208,7 @@ def cover_discs(
     local_out[e, w] = local  # zero where no film is left over the disc
 
 
-@wp.kernel
+@wp.kernel(module="unique", enable_backward=False)  # launched with blocks of its own size: else all kernels here were compiled for both
 def solve_band(
     # In:
     due: wp.array(dtype=int),
