@@ -56,7 +56,7 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
         zeros = {"wrench": np.zeros((steps, 6)), "pressure": np.zeros(steps), "indenter_pos": np.zeros((steps, 3))}
         one = dict(
             id=f"t{seed}-{k}", object=name, kind="press", split="train", seed=k, parameters={}, time=0.05 * np.arange(steps),
-            displacement=u, contact_force=force, impedance=np.ones((steps, 19)), **zeros,
+            displacement=u, contact_force=force, impedance=1e4 * np.exp(z0 + 0.8 * d), **zeros,
             counts=counts, indenter_quat=np.tile([1.0, 0, 0, 0], (steps, 1)), converged=np.ones(steps, bool),
         )  # fmt: skip
         if flag:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import CHANNELS, counts_from_impedance
 from .recording import log_impedance
 
 __all__ = ["Arrays", "load_arrays"]
@@ -20,7 +20,7 @@ class Arrays:
       owner: (n,) number of the interaction; first: (n,) row of its first step; time: (n,) seconds since then.
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
       counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the interaction's first row.
-      simulated: (n, 19) counts of the simulation's own film.
+      simulated: (n, 19) counts of the simulation's own film, without noise where the set has its impedances.
       force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N] on labelled rows, 0 elsewhere.
       geometry: SkinGeometry. path: of the set.
     """
@@ -113,6 +113,7 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         for a in range(0, len(rows), 2048):
             force[rows[a : a + 2048]] = np.linalg.norm(data["contact_force"][keep[rows[a : a + 2048]]], axis=2)
         time = data["time"][keep]
+        simulated = counts_from_impedance(data["impedance"][keep]) if "impedance" in data.columns else data["counts"][keep][:, :19]
         tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731
         return Arrays(
             field=tensor(field, torch.float16),
@@ -123,7 +124,7 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
             labelled=labelled,
             counts=tensor(measured, torch.float32),
             tare=tensor(measured[first], torch.float32),
-            simulated=tensor(data["counts"][keep][:, :19], torch.float32),
+            simulated=tensor(simulated, torch.float32),
             force=tensor(force, torch.float16),
             outer=np.unique(data.geometry.outer_face),
             geometry=data.geometry,

@@ -68,7 +68,7 @@ def table(result) -> str:
             spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
             lines.append(
                 f"  {name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}{row['interval_coverage']:>9.2f}"
-                f"{row['interval_half_width']:>8.1f}{PAPER[kind].get(name, ''):>8}"
+                f"{'-' if row['interval_half_width'] is None else round(row['interval_half_width'], 1):>8}{PAPER[kind].get(name, ''):>8}"
             )
         lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")
         for name, test in found["tests"].items():
@@ -123,7 +123,8 @@ def _split(folder, split, reports):
         inside, width = np.mean(intervals[name], axis=0)
         models[name] = {
             "median": q50, "quartiles": [q25, q75], "median_2048": q50 / UNIT, "seed_medians": e["seed"],
-            "median_row": float(np.median(np.concatenate(pooled[name]))), "interval_coverage": inside, "interval_half_width": width,
+            "median_row": float(np.median(np.concatenate(pooled[name]))), "interval_coverage": inside,
+            "interval_half_width": float(width) if np.isfinite(width) else None,
             "coverage_area": float(np.mean(np.mean(coverage[name], axis=0))),
         }  # fmt: skip
     found = {
