@@ -1,8 +1,22 @@
 """Finds where simulation and measurement disagree, names the missing effect, adds it, and shows that the gap shrinks."""
 
-__all__ = ["RecordedEffect", "Recording", "diagnose_recording", "read_recording"]
+_HOME = {
+    "CATALOGUE": "catalogue",
+    "Effect": "effect",
+    "Param": "effect",
+    "RecordedEffect": "recorded_effect",
+    "Recording": "recording",
+    "Report": "workflow",
+    "Simulator": "simulator",
+    "Trajectory": "trajectories",
+    "diagnose": "workflow",
+    "diagnose_recording": "plain",
+    "load_simulator": "simulator",
+    "read_recording": "recording",
+    "read_trajectories": "trajectories",
+}
 
-_HOME = {"diagnose_recording": "plain", "Recording": "recording", "read_recording": "recording", "RecordedEffect": "recorded_effect"}
+__all__ = list(_HOME)
 
 
 def __getattr__(name):

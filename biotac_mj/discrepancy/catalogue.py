@@ -1,0 +1,384 @@
+"""The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up.
+
+Bounds and sources are those of the literature named; "generic" marks silicone in general. C effects act on what the rubber bears: with a
+displacement-controlled object and an elastic field that keeps its form, a separable law leaves the field and changes force and pressure
+(correspondence principle, Lee and Radok 1960; exact for linear materials while the contact grows).
+"""
+
+import numpy as np
+
+from .effect import Effect, Param
+from .noises import electrode_positions
+
+__all__ = ["CATALOGUE", "by_id"]
+
+
+def _memory(run, x, tau):
+    """(n, ...) x less its exponential memory: what has changed within about tau."""
+    out = np.zeros_like(x)
+    for i in range(1, len(x)):
+        a = np.exp(-(run.time[i] - run.time[i - 1]) / tau)
+        h = (1 - a) * tau / max(run.time[i] - run.time[i - 1], 1e-12)  # exact for x linear in between
+        out[i] = a * out[i - 1] + h * (x[i] - x[i - 1])
+    return out
+
+
+def _smooth(run, x, tau):
+    """First-order low-pass of rows, exact for x linear in between."""
+    return x - _memory(run, x, tau)
+
+
+class Relaxation(Effect):
+    id, name, stage = "relax", "stress relaxation (Prony)", "C"
+    physics = "G(t) = G (1 + g exp(-t / tau)): stress follows strain at once and relaxes"
+    params = {
+        "g": Param("1", 0.0, 0.8, "0.02-0.3 (Kunzemann 2024; Liao 2020)", 0.1),
+        "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
+    }
+    grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
+    confusable = {"hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed", "creep": "a hold of 100 s"}
+
+    def apply(self, run, theta):
+        run.force = run.force + theta["g"] * _memory(run, run.force, theta["tau"])
+        run.pressure = run.pressure + theta["g"] * _memory(run, run.pressure, theta["tau"])
+
+
+class PowerCreep(Effect):
+    id, name, stage = "creep", "power-law relaxation (springpot)", "C"
+    physics = "G(t) ~ (t + t0)^-n: no plateau"
+    params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04)}
+    confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
+
+    def apply(self, run, theta):
+        # A power law over three decades as the sum of exponentials a factor of three apart (each takes the slope n ln 3).
+        for tau in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0):
+            weight = theta["n"] * np.log(10**0.5)
+            run.force = run.force + weight * _memory(run, run.force, tau)
+            run.pressure = run.pressure + weight * _memory(run, run.pressure, tau)
+
+
+class Hysteresis(Effect):
+    id, name, stage = "hyster", "rate-independent hysteresis", "C"
+    physics = "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, whatever the speed"
+    params = {"fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1)}
+    confusable = {"relax": "the same depth at ten times the speed", "mullins": "a third cycle to the same depth"}
+
+    def apply(self, run, theta):
+        z, width = np.zeros(len(run.depth)), 0.2e-3
+        for i in range(1, len(z)):
+            z[i] = np.clip(z[i - 1] + run.depth[i] - run.depth[i - 1], -width, width)
+        run.scale_load(1 + theta["fraction"] * z / width)
+
+
+class Mullins(Effect):
+    id, name, stage = "mullins", "Mullins softening", "C"
+    physics = "Ogden-Roxburgh in the work of the contact: softer below the largest load seen before at that place"
+    params = {"softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15)}
+    confusable = {"hyster": "a third cycle to the same depth", "adhesion": "talc on the skin"}
+
+    def apply(self, run, theta):
+        seen = run.session.setdefault("mullins", [])
+        before = max((d for p, d in seen if np.linalg.norm(p - run.place) < 4e-3), default=0.0)
+        depth = np.maximum(run.depth, 0)
+        largest = np.maximum(before, np.maximum.accumulate(depth))
+        ratio = np.where(largest > 1e-6, depth / np.maximum(largest, 1e-6), 1.0)
+        run.scale_load(1 - theta["softening"] * np.clip(1 - ratio**2, 0, 1))
+        seen.append((run.place, float(depth.max())))
+
+
+class Stiffening(Effect):
+    id, name, stage = "stiffen", "hyperelastic stiffening", "C"
+    physics = "the rubber's modulus rises with strain: Yeoh's second term in the mean strain depth / 1.5 mm"
+    params = {"c2": Param("1", -0.5, 1.5, "c2/c1 0-1", 0.15)}
+    confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
+
+    def apply(self, run, theta):
+        run.scale_load(1 + theta["c2"] * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
+
+
+class Inhomogeneity(Effect):
+    id, name, stage = "inhomog", "modulus varies with place", "C"
+    physics = "stiffer towards the tip or the clamp, one side or the other"
+    params = {
+        "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
+        "across": Param("1/cm", -1, 1, "the same", 0.15),
+    }
+    confusable = {"misalign": "mount the fingertip again: misalignment changes, the material's map moves with the sensor"}
+
+    def apply(self, run, theta):
+        x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
+        run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
+
+
+class Bubble(Effect):
+    id, name, stage = "bubble", "air bubble in the liquid", "B"
+    physics = "p (V0 + dV) = const: the liquid gives way, the pressure and the far electrodes answer less"
+    params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
+    confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
+
+    def apply(self, run, theta):
+        run.bubble = run.bubble + theta["volume"]
+
+
+class FluidLoss(Effect):
+    id, name, stage = "fluidloss", "liquid lost over the session", "T"
+    physics = "the film gets thinner with the session's clock: every impedance rises in proportion"
+    params = {"rate": Param("1/h", 0.0, 2.0, "0-15 % a day from permeability; leaks more", 0.1)}
+    confusable = {"warmup": "log TDC; wait an hour", "gain": "the same probe at the beginning and the end of the session"}
+
+    def apply(self, run, theta):
+        run.log_z = run.log_z - np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))[:, None]
+
+
+class Friction(Effect):
+    id, name, stage = "friction", "friction level", "K"
+    physics = "Coulomb's coefficient times a factor"
+    params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
+    confusable = {"fric_load": "slides at three normal loads with two radii"}
+
+    def applicable(self, trajectories):
+        slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
+        return None if slide > 0.3e-3 else "no slides"
+
+    def apply(self, run, theta):
+        run.log_friction = run.log_friction + theta["log_mu"]
+
+
+class FrictionLoad(Effect):
+    id, name, stage = "fric_load", "friction that saturates with load", "K"
+    physics = "tangential force tau0 A rather than mu F: its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
+    params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
+    confusable = {"friction": "slides at three normal loads"}
+    applicable = Friction.applicable
+
+    def apply(self, run, theta):
+        normal = -np.outer(run.force @ run.heading, run.heading)
+        tangential = run.force + normal
+        run.force = run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
+
+
+class Adhesion(Effect):
+    id, name, stage = "adhesion", "adhesion (JKR)", "K"
+    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
+    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
+    confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
+
+    def apply(self, run, theta):
+        radius, modulus = 3.5e-3, 1e6
+        a = np.sqrt(radius * np.maximum(run.depth, 0))
+        out = np.gradient(run.depth, run.time) < -1e-9
+        W = theta["W"] * np.where(out, 3.0, 1.0)
+        run.force = run.force + np.outer(np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading)
+
+
+class Radius(Effect):
+    id, name, stage = "radius", "radius of the tool", "S"
+    physics = "the sphere is larger or smaller than it says"
+    params = {"log_radius": Param("1", -0.4, 0.4, "+-25 %", 0.1)}
+    confusable = {"mount": "light load", "stiffen": "another tool"}
+
+    def applicable(self, trajectories):
+        return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
+
+    def apply(self, run, theta):
+        if "sphere" in run.tool:
+            run.log_radius = run.log_radius + theta["log_radius"]
+
+
+class Misalignment(Effect):
+    id, name, stage = "misalign", "constant misalignment of the sensor", "S"
+    physics = "all poses are shifted across the press by the same vector"
+    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")}
+    confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
+
+    def apply(self, run, theta):
+        run.offset = run.offset + np.array([theta["x"], 0, theta["z"]])
+
+
+class DepthZero(Effect):
+    id, name, stage = "depth0", "zero of the depth", "S"
+    physics = "the object touches earlier or later than its pose says, everywhere alike"
+    params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
+    confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
+
+    def apply(self, run, theta):
+        run.offset = run.offset + theta["dz"] * run.heading
+
+
+class Mount(Effect):
+    id, name, stage = "mount", "compliance of mount or robot", "B"
+    physics = "the object gives way in proportion to the force: d - F / k"
+    params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
+    confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
+
+    def apply(self, run, theta):
+        run.offset = run.offset - np.outer(theta["compliance"] * run.normal_force, run.heading)
+
+
+class Rocking(Effect):
+    id, name, stage = "rocking", "rocking of the fingertip", "B"
+    physics = "the sensor moves sideways in proportion to the force, always in one direction"
+    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in ("x", "z")}
+    confusable = {"misalign": "light load", "mount": "camera on the clamp"}
+
+    def apply(self, run, theta):
+        run.offset = run.offset + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))
+
+
+class Thermal(Effect):
+    id, name, stage = "thermal", "temperature dependence of conductivity", "T"
+    physics = "ln Z = ... - alpha (T - T0), T from TDC"
+    params = {"alpha": Param("1/K", -0.05, 0.15, "0.014-0.028 of salt solutions; 0.064-0.078 over five sensors", 0.02)}
+    confusable = {"warmup": "heater on and off"}
+
+    def applicable(self, trajectories):
+        tdc = [t.tdc for t in trajectories if t.tdc is not None]
+        return None if tdc and np.ptp(np.concatenate(tdc)) > 8 else "no TDC, or it does not change"
+
+    def apply(self, run, theta):
+        if run.temperature is not None:
+            run.log_z = run.log_z - theta["alpha"] * run.temperature[:, None]
+
+
+class WarmUp(Effect):
+    id, name, stage = "warmup", "shared impedance gain (warm-up)", "T"
+    physics = "every impedance times exp(a (1 - exp(-t / tau))), t the session's clock"
+    params = {
+        "a": Param("ln Z", -1.0, 1.0, "-0.23 over 190 s measured; 10-17 % of full scale (Mongeon 2015)", 0.1),
+        "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
+    }
+    grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
+    confusable = {"thermal": "log TDC", "fluidloss": "wait an hour", "drift": "free segments: one electrode or all"}
+
+    def apply(self, run, theta):
+        run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
+
+
+class Asperities(Effect):
+    id, name, stage = "asper", "sensitivity of impedance to the film", "T"
+    physics = "conductance ~ gap^p: the change of ln Z from rest is multiplied by p"
+    params = {"log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)}
+    confusable = {"gain": "one electrode or all", "saturate": "depth ladder"}
+
+    def apply(self, run, theta):
+        run.log_z = run.rest_log_z + np.exp(theta["log_p"]) * (run.log_z - run.rest_log_z)
+
+
+class Gain(Effect):
+    id, name, stage = "gain", "gain of single electrodes", "A"
+    physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
+    params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
+    confusable = {"asper": "one electrode or all", "crosstalk": "drive one electrode alone", "saturate": "depth ladder"}
+
+    def apply(self, run, theta):
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))
+
+
+class CrossTalk(Effect):
+    id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
+    physics = "V = (I + kappa K) U with K falling off with distance"
+    params = {"kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05), "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True)}
+    grid = ({"length": 2.0}, {"length": 4.0})
+    confusable = {
+        "gain": "drive one electrode alone",
+        "rocking": "another place",
+        "base": "a footprint or mesh that is a little off looks alike",
+    }
+
+    def apply(self, run, theta):
+        p = electrode_positions()
+        K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        run.counts = run.counts + theta["kappa"] * (run.counts - rest) @ K.T
+
+
+class Saturation(Effect):
+    id, name, stage = "saturate", "saturation of the change", "A"
+    physics = "changes from rest bend beyond a knee: soft clip"
+    params = {"strength": Param("1", 0.0, 1.0, "none to hard", 0.3), "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True)}
+    grid = ({"knee": 120.0}, {"knee": 400.0}, {"knee": 900.0})
+    confusable = {"gain": "depth ladder at one place"}
+
+    def apply(self, run, theta):
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        change = run.counts - rest
+        over = np.sign(change) * np.maximum(np.abs(change) - theta["knee"], 0)
+        run.counts = run.counts - theta["strength"] * over
+
+
+class LowPass(Effect):
+    id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
+    physics = "tau dV/dt + V = U"
+    params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
+    confusable = {"latency": "two speeds a decade apart and a tap"}
+
+    def apply(self, run, theta):
+        if theta["tau"] > 1e-4:
+            run.counts = _smooth(run, run.counts, theta["tau"])
+
+
+class Latency(Effect):
+    id, name, stage = "latency", "latency of the electrodes", "A"
+    physics = "V(t - d)"
+    params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
+    confusable = {"lowpass": "two speeds a decade apart and a tap"}
+
+    def apply(self, run, theta):
+        at = run.time - theta["delay"]
+        run.counts = np.stack([np.interp(at, run.time, c) for c in run.counts.T], axis=1)
+
+
+class Drift(Effect):
+    id, name, stage = "drift", "drift of offsets within a trajectory", "A"
+    physics = "counts + v t from the trajectory's beginning, the same for all electrodes"
+    params = {"rate": Param("counts/s", -60, 60, "0-20 counts in 10 s", 2.0)}
+    confusable = {"warmup": "free segments over the session", "relax": "free segments"}
+
+    def apply(self, run, theta):
+        run.counts = run.counts + theta["rate"] * (run.time - run.time[0])[:, None]
+
+
+class PressureGain(Effect):
+    id, name, stage = "pdc_gain", "gain of the pressure channel", "A"
+    physics = "PDC's change from rest is multiplied by a factor"
+    params = {"gain": Param("1", -0.7, 2.0, "transducer 10 %", 0.15)}
+    confusable = {"bubble": "electrodes far from the contact", "relax": "holds"}
+
+    def applicable(self, trajectories):
+        return None if any(t.pdc is not None for t in trajectories) else "no PDC"
+
+    def apply(self, run, theta):
+        run.pdc = 2000 + (run.pdc - 2000) * (1 + theta["gain"])
+
+
+class ForceZero(Effect):
+    id, name, stage = "force_cross", "cross-axis sensitivity of the force sensor", "A"
+    physics = "part of the normal force shows in the tangential components"
+    params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
+    confusable = {"misalign": "turn the force sensor by 180 degrees", "friction": "press without slides"}
+
+    def applicable(self, trajectories):
+        return None if any(t.force is not None for t in trajectories) else "no force"
+
+    def apply(self, run, theta):
+        run.force = run.force + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))
+
+
+CATALOGUE = (
+    Relaxation(), PowerCreep(), Hysteresis(), Mullins(), Stiffening(), Inhomogeneity(), Bubble(), FluidLoss(), Friction(), FrictionLoad(),
+    Adhesion(), Radius(), Misalignment(), DepthZero(), Mount(), Rocking(), Thermal(), WarmUp(), Asperities(), Gain(), CrossTalk(), Saturation(),
+    LowPass(), Latency(), Drift(), PressureGain(), ForceZero(),
+)  # fmt: skip
+
+
+def by_id(name: str, extra=()) -> Effect:
+    """The effect of that id.
+
+    Raises:
+      ValueError: unknown; the text lists the ids.
+    """
+    for effect in (*extra, *CATALOGUE):
+        if effect.id == name:
+            return effect
+    raise ValueError(f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}, or pass your own Effect")

@@ -1,0 +1,110 @@
+"""An effect that a simulator can have or miss: one class, one stage, parameters with units, bounds and source.
+
+Your own in ten lines:
+
+    class Sag(Effect):
+        id, name, stage = "sag", "sagging arm", "S"
+        physics = "the arm sinks while the session lasts"
+        params = {"rate": Param("m/s", -1e-6, 1e-6, "my robot's manual", scale=2e-7)}
+        confusable = {"depth0": "repeat the first trajectory at the end"}
+
+        def apply(self, run, theta):
+            run.offset += theta["rate"] * run.clock[:, None] * run.heading
+
+    diagnose(sim, data, effects=[*CATALOGUE, Sag()])
+"""
+
+import dataclasses
+
+import numpy as np
+
+__all__ = ["STAGES", "Effect", "Param", "Run"]
+
+# In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
+STAGES = {"S": "set-up", "B": "boundary", "K": "contact", "C": "constitutive", "T": "transduction", "A": "acquisition"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Param:
+    """unit; bounds; source of the bounds; scale: a realistic size, with which signatures are taken and the prior is made."""
+
+    unit: str
+    low: float
+    high: float
+    source: str
+    scale: float
+    start: float = 0.0
+    shape: bool = False  # True: does nothing by itself (a time constant, a knee); several values are tried
+
+
+@dataclasses.dataclass
+class Run:
+    """One trajectory on its way through the stages. n rows; effects change it in place.
+
+    Attributes:
+      time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m]; order: number in the session.
+      offset (n, 3): of the object beyond where it was meant to be [m]; log_radius, log_friction: of the tool and the contact.
+      bubble: volume of trapped air [m3].
+      force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is solved those without effects.
+      counts (n, 19), pdc (n,): after the converter, before rounding. temperature: (n,) above the first row of the session [C], or None.
+      session: dict that the effects of one simulation share from trajectory to trajectory.
+    """
+
+    time: np.ndarray
+    clock: np.ndarray
+    tool: str
+    heading: np.ndarray
+    depth: np.ndarray
+    place: np.ndarray
+    order: int
+    offset: np.ndarray
+    force: np.ndarray
+    pressure: np.ndarray
+    log_z: np.ndarray
+    temperature: np.ndarray | None
+    session: dict
+    log_radius: float = 0.0
+    log_friction: float = 0.0
+    bubble: float = 0.0
+    rest_log_z: np.ndarray | None = None
+    counts: np.ndarray | None = None
+    pdc: np.ndarray | None = None
+
+    @property
+    def normal_force(self) -> np.ndarray:
+        """(n,) against the heading, positive while pressed [N]."""
+        return np.maximum(-self.force @ self.heading, 0)
+
+    def scale_load(self, factor):
+        """Multiplies what the rubber bears: force and the liquid's pressure (n,)."""
+        factor = np.broadcast_to(factor, self.time.shape)
+        self.force = self.force * factor[:, None]
+        self.pressure = self.pressure * factor
+
+
+class Effect:
+    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values of shape parameters) and `apply`.
+
+    apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no effect) at `Param.start`.
+    """
+
+    id = name = stage = physics = ""
+    params: dict = {}
+    confusable: dict = {}
+    grid: tuple = ({},)
+
+    def apply(self, run: Run, theta: dict) -> None:
+        raise NotImplementedError
+
+    def applicable(self, trajectories) -> str | None:
+        """Why the data cannot show the effect, or None."""
+        return None
+
+    @property
+    def free(self) -> list[str]:
+        """Names of the parameters that are fitted; shape parameters come from `grid`, then are polished."""
+        return [n for n, p in self.params.items() if not p.shape]
+
+    def default(self) -> dict:
+        """Parameters without effect, shape parameters from the first entry of the grid."""
+        return {**{n: p.start for n, p in self.params.items()}, **self.grid[0]}

@@ -1,0 +1,125 @@
+"""Fits of effects: nuisance parameters always with them, trajectories weighted so that none decides alone, evidence by trajectory."""
+
+import dataclasses
+
+import numpy as np
+from scipy.optimize import least_squares
+
+__all__ = ["Fit", "evidence", "fit_effects", "mean_square"]
+
+_NUISANCE = ("log_modulus", "log_friction")
+_PRIOR = np.array([0.4, 0.4])
+
+
+@dataclasses.dataclass
+class Fit:
+    """Effects with their parameters and the nuisance fitted with them.
+
+    Attributes:
+      effects: list of (Effect, theta). log_modulus, log_friction. covariance: of the free parameters, by trajectory (sandwich).
+      names: of the free parameters: (effect id, name); cost.
+    """
+
+    effects: list
+    log_modulus: float
+    log_friction: float
+    names: list
+    covariance: np.ndarray
+    cost: float
+
+    def residuals(self, comparison, exact=False):
+        return comparison.residuals(self.effects, float(np.exp(self.log_modulus)), self.log_friction, exact)
+
+    def raw(self, comparison, exact=False):
+        return comparison.raw(self.effects, float(np.exp(self.log_modulus)), self.log_friction, exact)
+
+    def interval(self, k):
+        """95 % interval of free parameter k, from the covariance by trajectory."""
+        effect, name = self.names[k]
+        value = next(th for e, th in self.effects if e.id == effect)[name]
+        half = 1.96 * float(np.sqrt(max(self.covariance[k, k], 0)))
+        return value - half, value + half
+
+
+def mean_square(residuals) -> np.ndarray:
+    """(trajectories,) c_i = |r|^2 / n."""
+    return np.array([float((r**2).mean()) for r in residuals])
+
+
+def evidence(residuals) -> np.ndarray:
+    """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share their causes [nats]."""
+    return np.array([-0.5 * len(r) * np.log(max(float((r**2).mean()), 0.05)) for r in residuals])
+
+
+def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
+    """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
+
+    Args:
+      keep: trajectories to use (indices), None all. start: Fit whose parameters to start from. shapes: polish shape parameters too.
+    """
+    keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
+    names, scale, low, high, x0 = [], [], [], [], []
+    for effect, theta in effects:
+        free = effect.free + ([n for n, p in effect.params.items() if p.shape] if shapes else [])
+        for name in free:
+            p = effect.params[name]
+            names.append((effect.id, name))
+            scale.append(p.scale if not p.shape else 1.0)
+            value = theta[name]
+            if p.shape:  # in the logarithm
+                low.append(np.log(p.low)), high.append(np.log(p.high)), x0.append(np.log(np.clip(value, p.low * 1.001, p.high * 0.999)))
+            else:
+                (
+                    low.append(p.low / p.scale),
+                    high.append(p.high / p.scale),
+                    x0.append(np.clip(value / p.scale, low[-1] + 1e-6, high[-1] - 1e-6)),
+                )
+    scale = np.array(scale)
+    nuisance = np.zeros(2) if start is None else np.array([start.log_modulus, start.log_friction])
+    sliding = any(e.id == "friction" for e, _ in effects)
+    x = np.concatenate([nuisance, x0])
+    bounds = (np.concatenate([[-1.5, -1.5], low]), np.concatenate([[1.5, 1.5], high]))
+    prior = np.array([2.5 if not e.params[n].shape else 1.0 for i, (eid, n) in enumerate(names) for e, _ in effects if e.id == eid])
+    centre = np.array(
+        [0.0 if not _param(effects, nm).shape else np.log(dict((e.id, th) for e, th in effects)[nm[0]][nm[1]]) for nm in names]
+    )
+
+    def unpack(v):
+        filled = [(e, dict(th)) for e, th in effects]
+        table = {e.id: th for e, th in filled}
+        for (eid, name), value, s in zip(names, v[2:], scale):
+            table[eid][name] = float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
+        return filled, float(v[0]), 0.0 if sliding else float(v[1])
+
+    weight = None
+
+    def function(v):
+        filled, log_modulus, log_friction = unpack(v)
+        r = comparison.residuals(filled, float(np.exp(log_modulus)), log_friction)
+        parts = [r[i].ravel() * np.sqrt(weight[i] / r[i].shape[1]) for i in keep]
+        penalty = np.concatenate([v[:2] / _PRIOR, (v[2:] - centre) / prior]) if len(names) else v[:2] / _PRIOR
+        return np.concatenate([*parts, penalty])
+
+    weight = np.ones(len(comparison.trajectories))
+    for round_ in range(2):
+        c = mean_square(comparison.residuals(unpack(x)[0], float(np.exp(x[0])), unpack(x)[2]))
+        weight = 1 / np.maximum(c, 0.5)
+        out = least_squares(function, x, bounds=bounds, method="trf", diff_step=1e-3, max_nfev=8 if round_ == 0 else 6, x_scale="jac")
+        x = out.x
+    filled, log_modulus, log_friction = unpack(x)
+    # Sandwich by trajectory: bread of Gauss-Newton, meat of the trajectories' own scores.
+    sizes = [comparison.measured[i].size for i in keep]
+    edges = np.concatenate([[0], np.cumsum(sizes)])
+    J, r = out.jac, out.fun
+    bread = np.linalg.pinv(J.T @ J)
+    score = np.array([J[a:b].T @ r[a:b] for a, b in zip(edges[:-1], edges[1:])])
+    n = len(keep)
+    sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
+    covariance = np.maximum(np.diag(sandwich)[2:], np.diag(bread)[2:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)))
+    jacobian = np.array([1.0 if not _param(effects, nm).shape else dict((e.id, th) for e, th in filled)[nm[0]][nm[1]] for nm in names])
+    covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
+    return Fit(filled, log_modulus, log_friction, names, covariance, float(out.cost))
+
+
+def _param(effects, name):
+    return next(e for e, _ in effects if e.id == name[0]).params[name[1]]
