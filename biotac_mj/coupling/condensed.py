@@ -11,6 +11,7 @@ from .stepper import SkinResult
 __all__ = ["CondensedStepper"]
 
 _MAX_FORCES, _MAX_CONTACTS = 1024, 2048
+_CLEAR = 1e-3  # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms [m]
 
 
 class CondensedStepper(FemStepper):
@@ -67,6 +68,16 @@ class CondensedStepper(FemStepper):
             residual=out.error,
             measured=out.measured,
         )
+
+    def clear(self, state, geom_pos, geom_mat) -> bool:
+        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they come in a step [BioTac frame]."""
+        return not self._part(state, "forces")[0] and self._skin.clear(geom_pos, geom_mat, _CLEAR)
+
+    def key(self, state) -> bytes:
+        """All that a solve depends on: a state is mostly unused."""
+        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
+        head = state[: self._slices["forces"].start]
+        return head.tobytes() + forces[: 1 + 3 * int(forces[0])].tobytes() + contacts[: 1 + 5 * int(contacts[0])].tobytes()
 
     def _read(self, state) -> Memory:
         head = self._part(state, "head")

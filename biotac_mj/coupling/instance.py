@@ -182,6 +182,15 @@ class Instance:
         """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
         return getattr(self.setup.skin.stepper, "inertial", False)
 
+    def clear(self, pos, mat):
+        """Whether a skin at rest is clear of bodies at (ngroup, 3), (ngroup, 3, 3) by so much that they do not reach it within the step."""
+        stepper = self.setup.skin.stepper
+        if self.inertial or not hasattr(stepper, "clear"):
+            return False
+        pose = self.touching.geom_pose(pos, mat)
+        with self.setup.skin.lock:
+            return stepper.clear(self.setup.parts(self.state)[2], *pose)
+
     def solve(self, pos, mat, core=()):
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings.
 
@@ -189,7 +198,7 @@ class Instance:
         """
         self._pose = pos, mat
         dt = self.model.opt.timestep
-        key = (pos.tobytes(), mat.tobytes(), dt, self.state.tobytes(), *(c.tobytes() for c in core))
+        key = (pos.tobytes(), mat.tobytes(), dt, self._key(), *(c.tobytes() for c in core))
         result = self._solved.get(key)  # solving is a function of the key, so a second mj_forward costs nothing
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
@@ -206,6 +215,12 @@ class Instance:
             self._solved[key] = result
         self._result, self._reading = result, None
         return result
+
+    def _key(self):
+        """Bytes of all in the plugin state that a solve depends on."""
+        _, models, skin, _ = self.setup.parts(self.state)
+        stepper = self.setup.skin.stepper
+        return models.tobytes(), stepper.key(skin) if hasattr(stepper, "key") else skin.tobytes()
 
     def _counts(self):
         if self._reading is None:

@@ -37,6 +37,7 @@ class Metric:
                 "attach it after adding the objects, pass attach(slots=...), or name the geoms that may touch with attach(geoms=[...])"
             )
         self.root = roots
+        self._layout = None
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
@@ -62,8 +63,13 @@ class Metric:
         if not self.slot:
             return
         ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
+        layout = ids.tobytes(), kinds.tobytes()
+        if layout != self._layout:  # it rarely changes
+            self._layout = layout
+            self._first = {slot: np.flatnonzero((ids == slot) & (kinds == _EQUALITY)) for slot in self.slot.values()}
+        position, impedance = data.efc_pos, data.efc_KBIP
         for root, slot in self.slot.items():
-            index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
+            index = self._first[slot]
             if len(index) != 6:
                 raise ValueError(
                     "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, "
@@ -71,8 +77,8 @@ class Metric:
                 )
             here = slice(int(index[0]), int(index[0]) + 6)
             self._rows[root] = here, data.map_efc2iefc[here] if data.nisland else None
-            data.efc_pos[here] = 0.0
-            data.efc_KBIP[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
+            position[here] = 0.0
+            impedance[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
         self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
         if data.nisland:
             self._island_weight, self._island_regular = data.iefc_D, data.iefc_R

@@ -68,6 +68,12 @@ class World:
     def _newton(self, skins, outside):
         moving = skins[0].horizon > 0 and self.model.nv > 0
         self._damped = None
+        for skin in skins:
+            if skin.idle:
+                skin.rest()
+        skins = [skin for skin in skins if not skin.idle]
+        if not skins:
+            return
         for _ in range(MAX_ROUNDS):
             acceleration = self._accelerations(skins, outside) if moving else np.zeros(self.model.nv)
             solved = [skin.follow(acceleration) for skin in skins]
@@ -128,17 +134,26 @@ class _Coupled:
 
     def __init__(self, instance, data):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
-        self.jacobian = instance.metric.jacobians(data)
         instance.metric.begin(data)
         self.pose = instance.touching.predict(data, self.horizon)
-        self.core = ()
+        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
+        # nothing touched, and what comes is too far for this step's accelerations to matter: the skin rests, where exactly does not matter
+        self.idle = not (self.wrench0.any() or self.tangent.any()) and instance.clear(*self.pose)
+        self.core, self.jacobian = (), None
+        if self.idle:
+            return
+        self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.correction = np.zeros((len(self.wrench0), 6))
         self.solved = self.written = False
         self.converged = True
+
+    def rest(self):
+        """Solves a skin that nothing reaches, and takes its rows away."""
+        self.instance.solve(*self.pose)
+        self.let_go()
 
     def follow(self, acceleration):
         """Solves the skin where its bodies go, unless it has been solved there; returns whether it did."""

@@ -20,82 +20,17 @@ from scipy.spatial import cKDTree
 from . import liquid
 from .condensed_correction import correction
 from .condensed_faces import CandidateFaces
+from .condensed_search import NearSearch
 from .condensed_step import Memory, Outcome, Step
-from .contact import Geoms
 from .core_contact import CoreContact
 from .geoms import GeomSet
 from .rest_tangent import rest_tangent
-from .shapes import distance_bound
 from .surface_compliance import SurfaceCompliance
 from .types import real, vec3
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
 wp.set_module_options({"enable_backward": False})
-
-_NONE = np.zeros(0, int)
-_REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
-
-
-@wp.kernel
-def _near(
-    # In:
-    count: wp.array(dtype=int),
-    number: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    reach: wp.array(dtype=real),
-    # Out:
-    near_out: wp.array(dtype=int),
-):
-    """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach; count[1] of them."""
-    found = int(0)
-    for i in range(count[0]):
-        f = number[i]
-        t = face[f]
-        x0 = x[t[0], 0]
-        x1 = x[t[1], 0]
-        x2 = x[t[2], 0]
-        center = (x0 + x1 + x2) / real(3.0)
-        radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
-        near = int(0)
-        for g in range(geoms.count):
-            if near == 0:
-                R = wp.transpose(geoms.mat[g, 0])
-                y = R * (center - geoms.pos[g, 0])
-                bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                if bound < radius + reach[0]:
-                    for s in range(sample.shape[0]):
-                        if near == 0:
-                            b = sample[s]
-                            y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
-                            bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                            if bound < reach[0]:
-                                near = 1
-        if near == 1:
-            near_out[found] = f
-            found += 1
-    count[1] = found
-
-
-@wp.kernel
-def _core_clearance(
-    # In:
-    core_vert: wp.array(dtype=vec3),
-    geoms: Geoms,
-    # Out:
-    clearance_out: wp.array(dtype=real),
-):
-    """Distance of each geom to the nearest vertex of the core, negative where it is inside the geom."""
-    g = wp.tid()
-    least = real(1.0)
-    R = wp.transpose(geoms.mat[g, 0])
-    for i in range(core_vert.shape[0]):
-        y = R * (core_vert[i] - geoms.pos[g, 0])
-        least = wp.min(least, distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y))
-    clearance_out[g] = least
 
 
 @wp.kernel
@@ -190,13 +125,10 @@ class CondensedSkin:
         self._number = np.full(model.nvert, -1)
         self._number[self._outer] = np.arange(len(self._outer))
         self.rest = model.rest.vert.astype(float)
-        self._prepare_search()
+        self._prepare_positions()
         self.faces = CandidateFaces(model, geoms, self._x_wp, self._last_wp, self._slot_wp)
         self._core = CoreContact(model, self.rest, self._x_wp, self._x) if model.has_core else None
-        if self._core and geoms.count:
-            clearance = wp.zeros(geoms.count, dtype=real, device="cpu")
-            self._clearance = clearance.numpy()
-            self._clearances = self._record(_core_clearance, [model.core_vert, geoms.struct], [clearance], geoms.count)
+        self.search = NearSearch(model, geoms, self.rest, self._x_wp, self._x)
         self._inner = self._core.node if self._core else np.zeros(0, int)
         self._away = self._core.direction if self._core else np.zeros((0, 3))
         self.compliance = _compliance(model, self._outer, self._inner, self._away, cache)
@@ -207,7 +139,7 @@ class CondensedSkin:
 
     # --- preparation -------------------------------------------------------------------------------------------------------------
 
-    def _prepare_search(self):
+    def _prepare_positions(self):
         m = self.model
 
         def zeros(shape, dtype):
@@ -217,13 +149,7 @@ class CondensedSkin:
         self._x_wp, self._x = zeros((m.nvert, 1), vec3)
         self._last_wp, self._last = zeros((m.nvert, 1), vec3)
         self._slot_wp, self.slot = zeros(m.nvert, int)
-        near, self._near = zeros(len(self._face), int)
-        number, self._asked = zeros(len(self._face), int)
-        count, self._count = zeros(2, int)
-        reach, self._reach = zeros(1, real)
         self._x[:, 0] = self._last[:, 0] = self.rest
-        self._detect = self._record(_near, [count, number, m.outer.face, m.sample, self.geoms.struct, self._x_wp, reach], [near])
-        self._region = None
 
     def _record(self, kernel, inputs, outputs, dim=1):
         return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
@@ -293,9 +219,9 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         if not len(memory.force):  # at rest: what no sample touches changes nothing
             self._x[:, 0] = self.rest
-            if not len(self.faces_near(0.0, 0.0, (geom_pos, geom_mat))):
+            if not len(self.search.faces(0.0, 0.0, geom_pos, geom_mat)):
                 return self._at_rest(geom_pos, geom_mat, geom_pos - last[0])
-        self._refuse_core(self._travel(geom_pos, geom_mat))
+        self.search.refuse_core(geom_pos, geom_mat)
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self.rest + u
         step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
@@ -307,66 +233,16 @@ class CondensedSkin:
         self._keep(out.memory, step.u)
         return out
 
+    def clear(self, geom_pos, geom_mat, margin) -> bool:
+        """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
+        return self.search.clear(geom_pos, geom_mat, margin)
+
     def _at_rest(self, pos, mat, motion):
         memory = Memory.rest(self.geoms.count)
         memory.started, memory.geom_pos, memory.geom_mat, memory.motion = True, np.array(pos), np.array(mat), motion
         n = self.geoms.ngroup
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0)
-
-    def _refuse_core(self, travel):
-        """Raises ValueError for a geom deep inside the core; `travel` is how far geoms have moved since the region was chosen."""
-        if self._core is None or not self.geoms.count:
-            return
-        # a bound may change a little faster than the geom moves: grids are trilinear
-        if self._region is not None and self._region[-1] is not None and self._region[-1] - 2 * travel > -self.model.options.max_core_depth:
-            return
-        self._clearances()
-        if -self._clearance.min() > self.model.options.max_core_depth:
-            g = int(self._clearance.argmin())
-            raise ValueError(
-                f"geom {g} ({self.geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid core: no skin fits between them; "
-                "move it out, press less deep or take smaller steps"
-            )
-
-    def _travel(self, pos, mat):
-        """How far points of geoms near the skin may have moved since the region around them was chosen [m]."""
-        if self._region is None:
-            return math.inf
-        _, pos0, mat0, lever, *_ = self._region
-        dp, dm = pos - pos0, (mat - mat0).reshape(-1, 9)
-        turned = np.sqrt(np.einsum("ij,ij->i", dm, dm)) * lever
-        return float((turned + np.sqrt(np.einsum("ij,ij->i", dp, dp))).max())
-
-    def faces_near(self, reach, moved, pose):
-        """Faces with a sample nearer to a geom than the reach; `moved` bounds how far the nodes are from rest.
-
-        Only a region around the geoms is searched, wider than what they and the skin can have moved since it was chosen.
-        """
-        if not self.geoms.count:
-            return _NONE
-        travel = self._travel(*pose)
-        if self._region is None or moved + reach + travel > self._region[4]:
-            self._asked[:] = np.arange(len(self._face))
-            here = self._x.copy()
-            self._x[:, 0] = self.rest
-            width = moved + reach + _REGION
-            faces = self._look(len(self._face), width)
-            self._x[:] = here
-            pos, mat = np.array(pose[0]), np.array(pose[1])
-            clearance = None
-            if self._core:
-                self._clearances()
-                clearance = float(self._clearance.min())
-            self._region = faces, pos, mat, np.sqrt((pos * pos).sum(1)) + 0.05, width, clearance
-            self._asked[: len(faces)] = faces
-        count = len(self._region[0])
-        return self._look(count, reach) if count else self._region[0]
-
-    def _look(self, count, reach):
-        self._reach[0], self._count[0] = reach, count
-        self._detect()
-        return self._near[: self._count[1]].astype(np.int64)
 
     def displacement(self, memory: Memory) -> np.ndarray:
         """(nvert, 3) of a memory [m]."""
@@ -376,7 +252,7 @@ class CondensedSkin:
         return self._fields[key]
 
     def _keep(self, memory, u):
-        if len(self._fields) > 4:
+        if len(self._fields) > 16:
             self._fields.clear()
         self._fields[_key(memory)] = u
 

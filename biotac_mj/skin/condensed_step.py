@@ -94,7 +94,7 @@ class Step:
     def _choose(self):
         """Candidates: faces that are near a geom or the core; whether there are more than before."""
         s = self.skin
-        near = s.faces_near(self.reach, np.sqrt(3) * max(self.u.max(), -self.u.min()), self.pose)
+        near = s.search.faces(self.reach, np.sqrt(3) * max(self.u.max(), -self.u.min()), *self.pose)
         count = len(self.faces) + len(self.inner)
         if len(self.faces):
             chosen = np.zeros(len(s._face), bool)

@@ -1,0 +1,195 @@
+"""Which faces of the condensed skin a geom may touch, and whether one is inside the core.
+
+Only a region around the geoms is searched, wider than what they and the skin can have moved since it was chosen. A few regions are kept:
+BioTacs of one model share a skin. Which one is used changes nothing but the time.
+"""
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from .contact import Geoms
+from .shapes import distance_bound
+from .types import real, vec3
+
+__all__ = ["NearSearch"]
+
+wp.set_module_options({"enable_backward": False})
+
+_REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
+_REGIONS = 16
+
+
+@wp.kernel
+def _near(
+    # In:
+    count: wp.array(dtype=int),
+    number: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    reach: wp.array(dtype=real),
+    # Out:
+    near_out: wp.array(dtype=int),
+):
+    """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach; count[1] of them."""
+    found = int(0)
+    for i in range(count[0]):
+        f = number[i]
+        t = face[f]
+        x0 = x[t[0], 0]
+        x1 = x[t[1], 0]
+        x2 = x[t[2], 0]
+        center = (x0 + x1 + x2) / real(3.0)
+        radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+        near = int(0)
+        for g in range(geoms.count):
+            if near == 0:
+                R = wp.transpose(geoms.mat[g, 0])
+                y = R * (center - geoms.pos[g, 0])
+                bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                if bound < radius + reach[0]:
+                    for s in range(sample.shape[0]):
+                        if near == 0:
+                            b = sample[s]
+                            y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
+                            bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                            if bound < reach[0]:
+                                near = 1
+        if near == 1:
+            near_out[found] = f
+            found += 1
+    count[1] = found
+
+
+@wp.kernel
+def _core_clearance(
+    # In:
+    core_vert: wp.array(dtype=vec3),
+    geoms: Geoms,
+    # Out:
+    clearance_out: wp.array(dtype=real),
+):
+    """Distance of each geom to the nearest vertex of the core, negative where it is inside the geom."""
+    g = wp.tid()
+    least = real(1.0)
+    R = wp.transpose(geoms.mat[g, 0])
+    for i in range(core_vert.shape[0]):
+        y = R * (core_vert[i] - geoms.pos[g, 0])
+        least = wp.min(least, distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y))
+    clearance_out[g] = least
+
+
+@dataclasses.dataclass(frozen=True)
+class _Region:
+    """Faces (n,) of the resting skin nearer than `width` to the geoms; the geoms' clearance from the core [m]."""
+
+    faces: np.ndarray
+    width: float
+    clearance: float
+
+
+class NearSearch:
+    """Searches the outer faces of a skin.
+
+    Args:
+      model: SkinModel. geoms: GeomSet of one world, posed before each search.
+      rest: (nvert, 3) nodes at rest [m]. x_wp, x: (nvert, 1) present nodes, as Warp array and as its view.
+    """
+
+    def __init__(self, model, geoms, rest, x_wp, x):
+        self._model, self._geoms, self._rest, self._x = model, geoms, rest, x
+        self._nface = len(model.outer.face)
+
+        def zeros(shape, dtype):
+            array = wp.zeros(shape, dtype=dtype, device="cpu")
+            return array, array.numpy()
+
+        near, self._near = zeros(self._nface, int)
+        number, self._asked = zeros(self._nface, int)
+        count, self._count = zeros(2, int)
+        reach, self._reach = zeros(1, real)
+        clearance, self._clearance = zeros(max(geoms.count, 1), real)
+        self._detect = self._record(_near, 1, [count, number, model.outer.face, model.sample, geoms.struct, x_wp, reach], [near])
+        if model.has_core and geoms.count:
+            self._clearances = self._record(_core_clearance, geoms.count, [model.core_vert, geoms.struct], [clearance])
+        g = geoms.count
+        self._regions, self._loaded, self._next = [], None, 0
+        self._pos, self._mat, self._lever = np.zeros((_REGIONS, g, 3)), np.zeros((_REGIONS, g, 9)), np.zeros((_REGIONS, g))
+
+    @staticmethod
+    def _record(kernel, dim, inputs, outputs):
+        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+
+    def faces(self, reach, moved, pos, mat) -> np.ndarray:
+        """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest [m]."""
+        if not self._geoms.count:
+            return np.zeros(0, int)
+        region = self._region(moved + reach, pos, mat)
+        if not len(region.faces):
+            return region.faces
+        if self._loaded is not region:
+            self._asked[: len(region.faces)], self._loaded = region.faces, region
+        return self._look(len(region.faces), reach)
+
+    def clear(self, pos, mat, margin) -> bool:
+        """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
+        if not self._geoms.count:
+            return True
+        struct = self._geoms.struct
+        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+        if not len(self._region(margin, pos, mat).faces):
+            return True
+        self._x[:, 0] = self._rest
+        return not len(self.faces(margin, 0.0, pos, mat))
+
+    def refuse_core(self, pos, mat):
+        """Raises ValueError for a geom deep inside the core."""
+        if not (self._model.has_core and self._geoms.count):
+            return
+        limit = self._model.options.max_core_depth
+        # a bound may change a little faster than the geom moves: grids are trilinear
+        if any(r.clearance - 2 * t > -limit for r, t in zip(self._regions, self._travel(pos, mat))):
+            return
+        self._clearances()
+        if -self._clearance.min() > limit:
+            g = int(self._clearance.argmin())
+            raise ValueError(
+                f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid core: "
+                "no skin fits between them; move it out, press less deep or take smaller steps"
+            )
+
+    def _travel(self, pos, mat):
+        """How far points of geoms near the skin may have moved since each region was chosen [m]."""
+        n = len(self._regions)
+        dp, dm = pos - self._pos[:n], mat.reshape(-1, 9) - self._mat[:n]
+        turned = np.sqrt(np.einsum("kij,kij->ki", dm, dm)) * self._lever[:n]
+        return (turned + np.sqrt(np.einsum("kij,kij->ki", dp, dp))).max(1).tolist()
+
+    def _region(self, reach, pos, mat):
+        """A region that holds all faces nearer than the reach [m] to geoms at these poses."""
+        for region, travel in zip(self._regions, self._travel(pos, mat)):
+            if reach + travel <= region.width:
+                return region
+        self._asked[:], self._loaded = np.arange(self._nface), None
+        here = self._x.copy()
+        self._x[:, 0] = self._rest
+        faces = self._look(self._nface, reach + _REGION)
+        self._x[:] = here
+        clearance = -1.0
+        if self._model.has_core:
+            self._clearances()
+            clearance = float(self._clearance.min())
+        region, place = _Region(faces, reach + _REGION, clearance), self._next
+        self._pos[place], self._mat[place] = pos, mat.reshape(-1, 9)
+        self._lever[place] = np.sqrt((pos * pos).sum(1)) + 0.05
+        self._regions[place : place + 1] = [region]
+        self._next = (place + 1) % _REGIONS
+        return region
+
+    def _look(self, count, reach):
+        self._reach[0], self._count[0] = reach, count
+        self._detect()
+        return self._near[: self._count[1]].astype(np.int64)
