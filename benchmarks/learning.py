@@ -51,7 +51,6 @@ def main(argv=None):
     parser.add_argument("--json")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    torch.set_float32_matmul_precision("high")
     geometry, config = load_skin(args.skin), LearningConfig()
     model = load_forward(args.weights or shipped("forward"), geometry).to(args.device)
     networks = {f"default ({model.meta['model']}, {model.meta['members']} members)": lambda u, a: model.log_change(u, a, 0.01)}

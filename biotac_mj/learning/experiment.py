@@ -50,7 +50,6 @@ def train_all(path, out, seeds=(0, 1, 2, 3, 4), splits=("trajectory", "ring_7mm"
     config = config or LearningConfig()
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    torch.set_float32_matmul_precision("high")
     jobs = [(s, k) for s in splits for k in seeds if not (out / f"{s}-{k}.json").exists()]
     if not jobs:
         return

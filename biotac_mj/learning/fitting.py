@@ -1,10 +1,22 @@
 """One loop for all networks: minibatches from tensors on the device, one cycle of the learning rate, the best state on validation kept."""
 
+import contextlib
 import copy
 
 import torch
 
-__all__ = ["cycle", "root_mean_square"]
+__all__ = ["cycle", "fast_products", "root_mean_square"]
+
+
+@contextlib.contextmanager
+def fast_products():
+    """TF32 for matrix products on a GPU: good enough inside a network, not for features and components, whose small parts it would blur."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def root_mean_square(error):

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from .electrode_vae import ElectrodeVAE, mlp
-from .fitting import cycle, root_mean_square
+from .fitting import cycle, fast_products, root_mean_square
 from .hierarchy import build_hierarchy
 from .mesh_vae import MeshVAE
 from .pointnet import PointNet
@@ -35,6 +35,7 @@ class LatentProjection(nn.Module):
         return self.mesh.decode(self.to_mesh(self.electrode.encode(y)[0]))
 
 
+@fast_products()
 def train_latent_projection(arrays, train, validation, config, seed=0, progress=None) -> LatentProjection:
     """Trains both VAEs, freezes them, trains the projections.
 
@@ -110,6 +111,7 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
     return model.eval()
 
 
+@fast_products()
 def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> PointNet:
     """Trains the baseline on labelled interactions alone; input displacements / mesh_scale, output tared counts / 2048."""
     torch.manual_seed(seed)
