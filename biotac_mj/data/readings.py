@@ -7,6 +7,7 @@ import os
 from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
@@ -105,7 +106,8 @@ def readings_pool(geometry: SkinGeometry, sensor: str | None, workers: int, star
     args = (geometry, sensor) if start_args is None else start_args
     if not workers:
         start(*args)
-        yield _Now()
+        with threadpool_limits(1, "blas"):  # as in the workers, so that the numbers are the same to the last bit
+            yield _Now()
         return
     kept = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # workers inherit them: one core each
