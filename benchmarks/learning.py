@@ -7,6 +7,7 @@ paper's network is timed with random weights: they do not change its time.
 """
 
 import argparse
+import functools
 import json
 import pathlib
 import statistics
@@ -40,6 +41,11 @@ def measure(work, device, repeats):
     return statistics.median(wall), (time.process_time() - begun) / repeats
 
 
+def in_parts(work, u, average, parts):
+    for i in range(0, len(u), parts):
+        work(u[i : i + parts], average)
+
+
 @torch.no_grad()
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -65,7 +71,7 @@ def main(argv=None):
             u = 0.05 * torch.randn(n, geometry.nvert, 3, device=args.device)
             average = torch.zeros(n, *model.memory, device=args.device) if model.window else None
             parts = 256 if name.startswith("paper") else n  # what fits beside its activations
-            wall, cpu = measure(lambda: [work(u[i : i + parts], average) for i in range(0, n, parts)], args.device, 50 if n == 1 else 20)
+            wall, cpu = measure(functools.partial(in_parts, work, u, average, parts), args.device, 50 if n == 1 else 20)
             rows.append({"network": name, "sensors": n, "us_per_sensor": 1e6 * wall / n, "processor_us_per_sensor": 1e6 * cpu / n})
             print(f"{name:<44}{n:>8}{1e6 * wall / n:>15.1f}{1e6 * cpu / n:>14.1f}")
     if args.json:

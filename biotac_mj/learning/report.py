@@ -15,7 +15,7 @@ __all__ = ["PAPER", "evaluate_models", "table"]
 PAPER = {"trajectory": {"latent_projection": 0.010, "pointnet": 0.012}, "object": {"latent_projection": 0.015, "pointnet": 0.016}}
 UNIT = 2048.0
 _REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")  # rows to compare with: nothing that a user would serve
-_LEVELS = np.linspace(0, 150, 151)
+_LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
 def evaluate_models(folder, out=None) -> dict:
@@ -161,6 +161,7 @@ def _average(reports):
 
 
 def _figures(result, drawn, out):
+    import matplotlib
     from matplotlib.figure import Figure
 
     splits = list(result["splits"])
@@ -178,9 +179,10 @@ def _figures(result, drawn, out):
         axis.set_xlabel("RMS error per interaction [counts]")
         axis.set_title(f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor")
         axis.legend(fontsize=7, loc="lower right")
-        for name in names:
+        for k, name in enumerate(names):
             heavy = name in ("latent_projection", "pointnet", "tare", result["default"])
-            below.plot(_LEVELS, drawn[split]["coverage"][name], lw=1.8 if heavy else 0.7, label=name, alpha=1 if heavy else 0.6)
+            below.plot(_LEVELS, drawn[split]["coverage"][name], lw=1.8 if heavy else 0.7, label=name, alpha=1 if heavy else 0.7,
+                       color=matplotlib.colormaps["tab20"](k % 20), ls="--" if name == "tare" else "-")  # fmt: skip
         below.set_xlabel("absolute error at most [counts]")
         below.set_ylabel("share of all readings")
         below.legend(fontsize=7)
