@@ -2,6 +2,7 @@
 
     python benchmarks/condensed.py --json out/condensed.json [--skins coarse,default] [--materials default,rubber]
                                    [--indenters sphere_7mm,cube_14mm] [--markdown]
+    python benchmarks/condensed.py --json out/condensed_time.json --time [--indenters sphere_7mm,cube_14mm]
     python benchmarks/condensed.py --json out/condensed_fit.json --fit [--materials default]
 
 The same press is made with both tiers: along the inward normal at the location, to 2.4 mm, without noise of its own in the comparison
@@ -34,11 +35,12 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from accuracy import write_json
 
 from biotac_mj.coupling import fem, instance
+from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.skin import PRESETS, condensed_correction
 
-__all__ = ["compare", "fit", "main", "run"]
+__all__ = ["compare", "fit", "main", "run", "time_steps"]
 
 DEPTHS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4)  # [mm]
 INDENTERS = ("sphere_7mm", "cube_14mm", "cylinder_short_7mm")
@@ -50,7 +52,7 @@ def run(tier: str, skin: str, indenter: str, location, material: str = "default"
     results, seconds = [], []
     stepper = fem.FemStepper
     if tier == "condensed":
-        from biotac_mj.coupling.condensed import CondensedStepper as stepper
+        stepper = CondensedStepper
     solve = stepper.solve
 
     def timed(self, *arguments):
@@ -170,6 +172,19 @@ def _curves(cases):
                   + " | ".join(rows.get(d, "") for d in DEPTHS[1::2]) + f" | {beyond} |")  # fmt: skip
 
 
+def time_steps(skin: str, material: str, indenter: str, location, increment: float, again: int = 4) -> dict:
+    """Processor time of the skin's solve in steps of a press [ms]: in the first press, and least of `again` more for each step."""
+    first, *more = (
+        1e3 * run("condensed", skin, indenter, location, material, timestep=increment / 10e-3)[2][:, 1] for _ in range(again + 1)
+    )
+    least = np.min(more, axis=0)
+    shallow = len(least) * 10 // 24
+    numbers = np.median(first), np.median(least), np.median(least[:shallow]), np.median(least[shallow:]), least.max()
+    names = ("first_press", "again", "to_1mm", "beyond_1mm", "slowest_step")
+    return {"skin": skin, "material": material, "indenter": indenter, "increment_mm": 1e3 * increment,
+            **{f"{n}_ms": float(v) for n, v in zip(names, numbers, strict=True)}}  # fmt: skip
+
+
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
@@ -179,10 +194,21 @@ def main(arguments=None) -> int:
     parser.add_argument("--depth", type=float, default=2.4, help="of the presses [mm]")
     parser.add_argument("--locations", type=int, default=2, help="how many of the two locations")
     parser.add_argument("--markdown", action="store_true", help="tables for docs/condensed.md")
+    parser.add_argument("--time", action="store_true", help="processor time of steps instead, without the full tier")
     parser.add_argument("--fit", action="store_true", help="fit the correction of the first skin and each material instead")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     skins, materials, indenters = (getattr(options, n).split(",") for n in ("skins", "materials", "indenters"))
+    if options.time:
+        out = [
+            time_steps(skin, material, indenter, LOCATIONS[0], increment)
+            for skin, material, indenter, increment in itertools.product(skins, materials, indenters, (2e-5, 4e-5))
+        ]
+        print("| skin | material | indenter | step mm | first press | again | to 1 mm | beyond | slowest |\n" + "|---" * 9 + "|")
+        for row in out:
+            print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else v for v in row.values()) + " |")
+        write_json(options.json, {"times": out})
+        return 0
     if options.fit:
         write_json(options.json, {"fits": [fit(skins[0], material, indenters, 1e-3 * options.depth) for material in materials]})
         return 0
