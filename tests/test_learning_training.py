@@ -218,3 +218,24 @@ def test_patch_measures():
     np.testing.assert_allclose(centre[0], [0.5e-3, 0, 0])  # the weak node is no part of the patch
     assert np.isnan(centre[1]).all()
     np.testing.assert_allclose(patch_overlap(np.array([[1.0, 0, 0]]), np.array([[1.0, 1.0, 0]])), [0.5])
+
+
+def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
+    pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    import warp as wp
+
+    from biotac_mj.batch.attach import _readings
+
+    skin = load_skin("coarse")
+    film, acquisition = _readings(biotac_mj.SensorBioTac("latent_projection", weights=str(weights), noise=False).batch(), skin, 2, 0, "cpu")
+    u = dent(skin, [-9e-3, -7e-3, 0], 0.6e-3, 2e-3, 0)
+    x = wp.array(np.stack([skin.vert, skin.vert + u], axis=1), dtype=wp.vec3d)
+    pressure = wp.zeros(2, dtype=wp.float64)
+    for _ in range(3):
+        film.solve(x, acquisition.find_due(0.01))
+        acquisition.advance(0.01, film.impedance, film.valid, pressure)
+    got = acquisition.state.numpy()[:, 25:44]  # the held counts of the electrodes
+    np.testing.assert_allclose(got[0], REST_COUNTS["1"], atol=1)
+    z = film.impedance.numpy()
+    np.testing.assert_allclose(got[1], 4095 / (z[1] / 1e4 + 1), atol=1)
+    assert np.abs(got[1] - REST_COUNTS["1"]).max() > 20

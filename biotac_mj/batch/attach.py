@@ -120,7 +120,7 @@ def attach(
       friction: of the skin, one number or (nworld,); None takes the material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a dict of `PhysicsReadings`'
-        settings: noise, sensor, film_every_step, temperature.
+        settings: noise, sensor, film_every_step, temperature; or what `SensorBioTac(...).batch()` gives.
       options: {"skin": {...}} settings of SkinOptions.
 
     Raises:
@@ -277,5 +277,10 @@ def _readings(choice, geometry, nworld, seed, device):
     from ..sensor.film import FilmConduction
 
     settings = {} if choice is True else dict(choice)
+    if settings.pop("signal", "physics") != "physics":
+        from ..learning.serve import LearnedBatchFilm
+
+        film = LearnedBatchFilm(geometry, nworld, device, settings.pop("weights", None), settings.pop("sensor", "1"))
+        return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)
     film = BatchFilm(FilmConduction(geometry, sensor=settings.pop("sensor", "1")), nworld, device)
     return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)

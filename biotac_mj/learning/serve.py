@@ -119,20 +119,26 @@ class LearnedBatchFilm:
         self._average = torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
 
+    @torch.no_grad()
     def solve(self, x, due):
         """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,) wp.array of int."""
+        import contextlib
+
         import warp as wp
 
-        wanted = wp.to_torch(due) != 0
-        if not bool(wanted.any()):
-            return
-        place = wp.to_torch(x).view(*x.shape, 3).transpose(0, 1)
-        u = (1e3 * (place - self._vert)).float()
+        cuda = self.device.is_cuda
+        # on Warp's stream: what it has launched before must be done, and what it launches next must wait
+        with torch.cuda.stream(wp.stream_to_torch(wp.get_stream(self.device))) if cuda else contextlib.nullcontext():
+            wanted = wp.to_torch(due) != 0
+            if bool(wanted.any()):
+                self._solve(wp.to_torch(x).view(*x.shape, 3), wanted, wp.to_torch(self.impedance), wp.to_torch(self.valid))
+
+    def _solve(self, x, wanted, impedance, valid):
+        u = (1e3 * (x.transpose(0, 1) - self._vert)).float()
         finite = torch.isfinite(u).all(dim=2).all(dim=1)
         change, average = self.model.log_change(torch.where(finite[:, None, None], u, 0), self._average, self._dt)
         now = wanted & finite
         if self._average is not None:
             self._average = torch.where(now[:, None, None, None], average, self._average)
-        z = wp.to_torch(self.impedance)
-        z.copy_(torch.where(now[:, None], self._rest * change.double().exp(), z))
-        wp.to_torch(self.valid).copy_(torch.where(wanted, finite.int(), wp.to_torch(self.valid)))
+        impedance.copy_(torch.where(now[:, None], self._rest * change.double().exp(), impedance))
+        valid.copy_(torch.where(wanted, finite.int(), valid))
