@@ -100,7 +100,7 @@ class SkinData:
     nonconverged = _Scalar("nonconverged", lambda count: count.astype(int))
     iterations = _Scalar("iterations", lambda count: count.astype(int))
     error = _Scalar("error")
-    contact_capacity = 63  # nodes; with the liquid as many rows as a block of threads holds in its registers
+    contact_capacity = None  # touching nodes in a world's small system; None: 63, all that a block of threads holds, but 127 on fine skins
 
     def __init__(self, model: SkinModel, nworld: int = 1, material=None, resident: bool | None = None):
         materials = [model.material] * nworld if material is None else list(material)

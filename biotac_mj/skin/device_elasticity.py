@@ -20,19 +20,34 @@ _INVERTED = 0.02  # det F below which a step of the line search is refused where
 
 
 @wp.func
+def turn_towards(F: wp.mat33):
+    """The rotation with the largest trace of R^T F, turned there step by step (Mueller et al. 2016): F may be inverted or flat.
+
+    As `material.polar_rotation`'s SVD, in fewer registers: the rare case must not slow the usual one.
+    """
+    q = wp.quat_identity(float)
+    for _ in range(60):
+        R = wp.quat_to_matrix(q)
+        turn = wp.vec3()
+        along = float(1.0e-9)
+        for c in range(3):
+            r = wp.vec3(R[0, c], R[1, c], R[2, c])
+            f = wp.vec3(F[0, c], F[1, c], F[2, c])
+            turn += wp.cross(r, f)
+            along += wp.dot(r, f)
+        turn = turn / wp.abs(along)
+        angle = wp.length(turn)
+        if angle < 1.0e-7:
+            break
+        q = wp.normalize(wp.quat_from_axis_angle(turn / angle, angle) * q)
+    return wp.quat_to_matrix(q)
+
+
+@wp.func
 def polar_single(F: wp.mat33):
-    """Rotation of the polar decomposition in single precision (Newton's iteration; by SVD where F is inverted or nearly flat)."""
+    """Rotation of the polar decomposition in single precision, by Newton's iteration where that is safe."""
     if wp.determinant(F) < 1.0e-3:
-        U = wp.mat33()
-        s = wp.vec3()
-        V = wp.mat33()
-        wp.svd3(F, U, s, V)
-        R = U * wp.transpose(V)
-        if wp.determinant(R) < 0.0:
-            c = wp.vec3(U[0, 2], U[1, 2], U[2, 2])
-            d = wp.vec3(V[0, 2], V[1, 2], V[2, 2])
-            R = R - 2.0 * wp.outer(c, d)
-        return R
+        return turn_towards(F)
     X = F
     for _ in range(12):
         Y = 0.5 * (X + wp.transpose(wp.inverse(X)))
@@ -92,6 +107,36 @@ def write_single(H: wp.mat33, e: int, w: int, corner_out: wp.array2d(dtype=wp.ve
     corner_out[4 * e + 3, w] = f3
 
 
+# the corotational law has kernels of its own: what other laws need would take registers from it
+
+
+@wp.kernel
+def corotational_force(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    corner_out: wp.array2d(dtype=wp.vec3),
+    inverted_out: wp.array(dtype=int),
+):
+    e, w = wp.tid()
+    if on[w] == 0:
+        return
+    B = inverse_edges[e]
+    F = edge_matrix(x, elem[e], w) * B
+    R = polar_mixed(F)
+    m = mu[w]
+    P = (m + m) * (F - R) + (lam[w] * (wp.ddot(R, F) - real(3.0))) * R
+    H = -volume[e] * P * wp.transpose(B)
+    write_single(narrow(H), e, w, corner_out)
+
+
 @wp.kernel
 def linear_force(
     # In:
@@ -112,14 +157,46 @@ def linear_force(
         return
     B = inverse_edges[e]
     F = edge_matrix(x, elem[e], w) * B
-    R = mat33()
-    if law == 0:
-        R = polar_mixed(F)
-    elif law == 2:
+    if law == 2:
         if not (wp.determinant(F) > real(_INVERTED)):
             inverted_out[w] = 1
-    H = -volume[e] * stress(law, mu[w], lam[w], F, R) * wp.transpose(B)
+    H = -volume[e] * stress(law, mu[w], lam[w], F, mat33()) * wp.transpose(B)
     write_single(narrow(H), e, w, corner_out)
+
+
+@wp.kernel
+def corotational_product(
+    # In:
+    law: int,
+    mu: wp.array(dtype=real),
+    lam: wp.array(dtype=real),
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    volume: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    p: wp.array2d(dtype=wp.vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    corner_out: wp.array2d(dtype=wp.vec3),
+):
+    e, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = elem[e]
+    B = narrow(inverse_edges[e])
+    F = narrow(edge_matrix(x, t, w)) * B
+    dF = edges_single(p, t, w) * B
+    m = float(mu[w])
+    l = float(lam[w])
+    R = polar_single(F)
+    Rt = wp.transpose(R)
+    S = Rt * F
+    A = Rt * dF
+    trace_s = wp.trace(S)
+    turn = wp.vec3(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+    dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=float) - S) * turn)
+    dP = 2.0 * m * (dF - dR) + l * (wp.trace(A) * R + (trace_s - 3.0) * dR)
+    write_single(float(volume[e]) * dP * wp.transpose(B), e, w, corner_out)
 
 
 @wp.kernel
@@ -144,20 +221,7 @@ def linear_product(
     B = narrow(inverse_edges[e])
     F = narrow(edge_matrix(x, t, w)) * B
     dF = edges_single(p, t, w) * B
-    dP = wp.mat33()
-    if law == 0:
-        m = float(mu[w])
-        l = float(lam[w])
-        R = polar_single(F)
-        Rt = wp.transpose(R)
-        S = Rt * F
-        A = Rt * dF
-        trace_s = wp.trace(S)
-        turn = wp.vec3(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
-        dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=float) - S) * turn)
-        dP = 2.0 * m * (dF - dR) + l * (wp.trace(A) * R + (trace_s - 3.0) * dR)
-    else:
-        dP = narrow(stress_derivative(law, mu[w], lam[w], widen(F), mat33(), widen(dF)))
+    dP = narrow(stress_derivative(law, mu[w], lam[w], widen(F), mat33(), widen(dF)))
     write_single(float(volume[e]) * dP * wp.transpose(B), e, w, corner_out)
 
 
@@ -194,10 +258,12 @@ class _Linear:
         self._dim = (len(elem), nworld)
 
     def force(self, mu, lam, x, on, inverted):
-        wp.launch(linear_force, self._dim, [self.law, mu, lam, *self._mesh, x, on], [self.corner, inverted], device=self.device)
+        kernel = corotational_force if self.law == 0 else linear_force
+        wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, on], [self.corner, inverted], device=self.device)
 
     def product(self, mu, lam, x, p, on):
-        wp.launch(linear_product, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device)
+        kernel = corotational_product if self.law == 0 else linear_product
+        wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device)
 
 
 class DeviceElements:

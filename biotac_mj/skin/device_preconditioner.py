@@ -10,11 +10,13 @@ import warp as wp
 
 from . import device_sides as sides
 from . import device_small as small
+from . import device_touch as touch
 from .device_worlds import BLOCK
 from .types import mat33, real
 
 __all__ = ["FEW", "DevicePreconditioner"]
 
+_LISTED = 512
 FEW = 16  # worlds that do not fill the device: work is split finer there
 
 
@@ -37,7 +39,8 @@ class DevicePreconditioner:
         self._chunks, self._nodes = (nchunk, nworld), (n, nworld)
         index = np.full(n, -1, np.int32)
         index[model.free] = np.arange(len(model.free))
-        self._inverse = _Inverse(model)
+        self._inverse = model.__dict__.setdefault("_device_inverse", None) or _Inverse(model)
+        model._device_inverse = self._inverse  # made once for each model
         rows, size = self._inverse.padded, self.liquid + 3 * capacity
         with wp.ScopedDevice(self.device):
             self._free, self._free_nodes = wp.array(index, dtype=int), wp.array(model.free, dtype=int)
@@ -51,6 +54,13 @@ class DevicePreconditioner:
             self._largest = wp.zeros(nworld, dtype=float)
             self._along = wp.zeros(self._nodes if self.liquid else (0, nworld), dtype=wp.vec3)
             self._part = wp.zeros((2, *self._chunks), dtype=real)
+            # nodes that touch in any world: as long as they are few, their rows of the inverse are enough for a first look
+            few = 3 * min(_LISTED, n) if nworld > FEW else 0
+            self._wanted, self._place = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+            self._listed, self._count_listed, self._fits = wp.zeros(few // 3, dtype=int), wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
+            kept = few if len(self._inverse.rest) else 0
+            self._rows = [wp.zeros((k, rows), dtype=wp.float16) for k in (few, kept)]
+            self._few = wp.zeros((few, 2 * nworld), dtype=float), wp.zeros((kept, nworld), dtype=float)
             self._count = wp.zeros((nworld, capacity), dtype=int)
             self._link = wp.zeros((nworld, capacity, small.LINKS), dtype=int)
             self._spring = wp.zeros((nworld, capacity, small.LINKS), dtype=wp.mat33)
@@ -86,8 +96,12 @@ class DevicePreconditioner:
         on, m, w, inverse = st.active, self.capacity, self.nworld, self._inverse
         entries = [inverse.half, inverse.rest, inverse.scale]
         outer, core = self._surfaces
-        self._launch(small.find_touched, self._nodes, [self._free, *outer[1:4], *core[1:4], on], [self.slot, self.any_touch])
-        self._by_block(small.survey, [w], [m, part, st, self.slot], [self.node, self.size, self._norm, self.full])
+        self._launch(touch.find_touched, self._nodes, [self._free, *outer[1:4], *core[1:4], on], [self.slot, self.any_touch, self._wanted])
+        self._by_block(touch.survey, [w], [m, part, st, self.slot], [self.node, self.size, self._norm, self.full])
+        if w > FEW:
+            self._by_block(touch.list_wanted, [1], [self._wanted], [self._place, self._listed, self._count_listed, self._fits])
+            for source, rows in zip((inverse.half, inverse.rest), self._rows):
+                self._launch(touch.copy_rows, rows.shape, [source, self._free, self._listed, self._count_listed], [rows])
         if self.liquid:
             self._launch(sides.load_gradient, self._nodes, [self._free, gradient, self._norm, on], [self._side])
             inverse.multiply(self._side, *self._answer)
@@ -123,9 +137,19 @@ class DevicePreconditioner:
                            [self._u, self._largest])  # fmt: skip
             return
         self._launch(sides.load_residual, self._nodes, [self._free, r, self._norm, on], [self._side])
-        inverse.multiply(self._side, *self._answer)
+        wp.capture_if(self._fits, self._read_rows, self._read_all, st=st, on=on)
+
+    def _read_rows(self, st, on):
+        self._inverse.multiply_rows(self._rows, self._side, self._few)
+        self._read(self._place, self._few, st, on)
+
+    def _read_all(self, st, on):
+        self._inverse.multiply(self._side, *self._answer)
+        self._read(self._free, self._answer, st, on)
+
+    def _read(self, row, answer, st, on):
         self._launch(sides.small_side, (self.capacity, self.nworld),
-                     [self.liquid, self._free, self.node, self.size, *self._answer, self._norm, inverse.scale, st, on],
+                     [self.liquid, row, self.node, self.size, *answer, self._norm, self._inverse.scale, st, on],
                      [self._u, self._largest])  # fmt: skip
 
     def _invert(self, on):
@@ -174,24 +198,33 @@ class _Inverse:
             rest = ((inverse - half) * sides.LOW).astype(np.float16)[: None if two else 0]
             self.half, self.rest = (wp.array(a, dtype=wp.float16, ndim=2, device="cpu") for a in (half, rest))
             self._matrix, self._rest = half.astype(np.float32), rest.astype(np.float32)
-        self._views = None
+        self._views = {}
 
     def multiply(self, side, answer, third):
         """answer = inverse times side, (padded, 2 nworld) half -> single; third = remainder times its first columns."""
-        nworld = third.shape[1]
-        if not side.device.is_cuda:
-            b = side.numpy().astype(np.float32)
-            np.matmul(self._matrix, b, out=answer.numpy())
-            if len(third):
-                np.matmul(self._rest, b[:, :nworld], out=third.numpy())
-            return
-        import torch
+        self._multiply((self._matrix, self._rest), side, (answer, third))
 
-        if self._views is None:  # made once, not while a graph is recorded
-            self._views = [wp.to_torch(a) for a in (side, answer, third)]
-        b, x, y = self._views
-        stream = torch.cuda.ExternalStream(side.device.stream.cuda_stream, device=b.device)
-        with torch.cuda.stream(stream):
-            torch.mm(self._matrix, b, out_dtype=torch.float32, out=x)
-            if len(y):
-                torch.mm(self._rest, b[:, :nworld], out_dtype=torch.float32, out=y)
+    def multiply_rows(self, rows, side, answer):
+        """The same for some rows of the inverse and of its remainder, given as arrays."""
+        self._multiply([self._view(a) for a in rows], side, answer)
+
+    def _view(self, array):
+        if not array.device.is_cuda:
+            return array.numpy().astype(np.float32) if array.dtype is wp.float16 else array.numpy()
+        if array.ptr not in self._views:  # made once, not while a graph is recorded
+            self._views[array.ptr] = wp.to_torch(array)
+        return self._views[array.ptr]
+
+    def _multiply(self, matrices, side, answers):
+        b = self._view(side)
+        for matrix, answer, columns in zip(matrices, answers, (side.shape[1], side.shape[1] // 2)):
+            if not len(matrix):
+                continue
+            if not side.device.is_cuda:
+                np.matmul(matrix, b[:, :columns], out=self._view(answer))
+                continue
+            import torch
+
+            x = self._view(answer)
+            with torch.cuda.stream(torch.cuda.ExternalStream(side.device.stream.cuda_stream, device=x.device)):
+                torch.mm(matrix, b[:, :columns], out_dtype=torch.float32, out=x)

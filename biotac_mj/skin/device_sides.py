@@ -200,7 +200,7 @@ def small_rows(
 def small_side(
     # In:
     has_liquid: int,
-    free_index: wp.array(dtype=int),
+    row: wp.array(dtype=int),
     node: wp.array2d(dtype=int),
     size: wp.array(dtype=int),
     answer: wp.array2d(dtype=float),
@@ -220,7 +220,7 @@ def small_side(
     if s == 0:
         largest_out[w] = 0.0
     if s < size[w]:
-        y = read_halves(answer, rest, 3 * free_index[node[s, w]], w, on.shape[0]) * (norm[0, w] * scale * float(st.softness[w]))
+        y = read_halves(answer, rest, 3 * row[node[s, w]], w, on.shape[0]) * (norm[0, w] * scale * float(st.softness[w]))
         for a in range(3):
             u_out[w, has_liquid + 3 * s + a] = y[a]
 

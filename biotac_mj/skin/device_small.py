@@ -7,13 +7,12 @@ import warp as wp
 
 from .device_contact import block_index
 from .device_elasticity import narrow
-from .device_sides import STIFF, TINY, entry, pull_of_liquid
+from .device_sides import STIFF, entry, pull_of_liquid
 from .device_worlds import Worlds, total_of
 from .types import mat33, real
 
 __all__ = [
     "LINKS",
-    "find_touched",
     "invert_serial",
     "small_answer",
     "small_compliance",
@@ -21,86 +20,11 @@ __all__ = [
     "small_stiffness",
     "small_system",
     "sum_liquid",
-    "survey",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 LINKS = wp.constant(24)  # touching nodes that a touching node's faces can have; more are left to conjugate gradients
-
-
-@wp.kernel
-def find_touched(
-    # In:
-    free_index: wp.array(dtype=int),
-    outer_start: wp.array(dtype=int),
-    outer_slot: wp.array(dtype=int),
-    outer_touching: wp.array2d(dtype=int),
-    core_start: wp.array(dtype=int),
-    core_slot: wp.array(dtype=int),
-    core_touching: wp.array2d(dtype=int),
-    on: wp.array(dtype=int),
-    # Out:
-    slot_out: wp.array2d(dtype=int),
-    any_out: wp.array(dtype=int),
-):
-    """Marks the free nodes of touching faces."""
-    i, w = wp.tid()
-    if on[w] == 0:
-        return
-    here = int(0)
-    for k in range(outer_start[i], outer_start[i + 1]):
-        here = wp.max(here, outer_touching[outer_slot[k] // 3, w])
-    if core_start.shape[0] > 0:
-        for k in range(core_start[i], core_start[i + 1]):
-            here = wp.max(here, core_touching[core_slot[k] // 3, w])
-    if here == 1:
-        any_out[w] = 1
-    if free_index[i] < 0:
-        here = 0
-    slot_out[i, w] = here
-
-
-@wp.kernel
-def survey(
-    # In:
-    capacity: int,
-    part: wp.array3d(dtype=real),
-    st: Worlds,
-    # In and out:
-    slot: wp.array2d(dtype=int),
-    # Out:
-    node_out: wp.array2d(dtype=int),
-    size_out: wp.array(dtype=int),
-    norm_out: wp.array2d(dtype=float),
-    full_out: wp.array(dtype=int),
-):
-    """Numbers the touching nodes of each world; norms of the residual and of the liquid's gradient."""
-    w, t = wp.tid()
-    if st.active[w] == 0:
-        return
-    rr = total_of(part, 0, w, t)
-    gg = total_of(part, 2, w, t)
-    n = slot.shape[0]
-    share = (n + wp.block_dim() - 1) // wp.block_dim()
-    mine = int(0)
-    for i in range(t * share, wp.min((t + 1) * share, n)):
-        mine += slot[i, w]
-    at = wp.untile(wp.tile_scan_exclusive(wp.tile(mine)))
-    for i in range(t * share, wp.min((t + 1) * share, n)):
-        here = int(-1)
-        if slot[i, w] == 1:
-            if at < capacity:
-                here = at
-                node_out[at, w] = i
-            at += 1
-        slot[i, w] = here
-    if t == wp.block_dim() - 1:
-        size_out[w] = wp.min(at, capacity)
-        if at > capacity:  # the rest is left to conjugate gradients
-            full_out[0] = wp.max(full_out[0], at)
-        norm_out[0, w] = wp.max(float(wp.sqrt(rr)), TINY)
-        norm_out[1, w] = wp.max(float(wp.sqrt(gg)), TINY)
 
 
 @wp.kernel

@@ -13,6 +13,8 @@ A world whose input is not finite, that has a geom deep inside the core or that 
 the graph (CUDA 12.4 and later); worlds that are done idle inside them.
 """
 
+import weakref
+
 import warp as wp
 
 from . import device_contact as contact
@@ -87,7 +89,8 @@ class _Memory:
             self.node_volume = wp.array(model.elasticity.node_volume, dtype=real)
             self.damped = device_elements(model.elasticity, w) if implicit and model.options.stiffness_damping else None
         self.elements = device_elements(model.elasticity, w)
-        self.preconditioner = DevicePreconditioner(model, (data.outer, data.core), w, self.chunk, data.contact_capacity)
+        capacity = data.contact_capacity or (63 if n <= 8000 else 127)
+        self.preconditioner = DevicePreconditioner(model, (data.outer, data.core), w, self.chunk, capacity)
 
 
 class DeviceStep:
@@ -98,7 +101,8 @@ class DeviceStep:
     """
 
     def __init__(self, model, data, geoms):
-        self.m, self.d, self.geoms = model, data, geoms
+        # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
+        self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
         if data.device_memory is None:
             data.device_memory = _Memory(model, data)
         self.k, self.st = data.device_memory, data.worlds
@@ -302,7 +306,7 @@ class DeviceStep:
                 k.damped.force(d.mu, d.lam, d.x, on, st.inverted)
                 k.damped.product(d.mu, d.lam, d.x, k.q, on)
                 e = k.damped
-                self._launch(nodes.add_damping, d.x.shape, [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force])
+                self._launch(nodes.add_damping, d.x.shape, [e.start, e.slot, e.corner, real(o.stiffness_damping), d.dt, on, d.force])
 
     def _contact(self, state, geoms, near, still, on):
         m, d, s = self.m, self.d, state.surface
