@@ -18,7 +18,7 @@ from biotac_mj.press_record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_linear, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed_correction import correction
 from biotac_mj.skin.contact import face_samples
@@ -270,6 +270,36 @@ def test_two_bodies_share_the_skin(coarse):
     assert all(np.trace(out.tangent[k, :3, :3]) > 100 for k in range(2))
 
 
+def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse, monkeypatch):
+    start, direction = touch(coarse.geometry)
+    box = GeomSet(["box"], [(7e-3, 7e-3, 7e-3)], [0.783])
+    across = np.linalg.svd(direction[None])[2][1:]
+    mat = np.stack([*across, direction], axis=1)[None]
+    top = ((coarse.geometry.vert[coarse.geometry.outer_face] - start) @ direction).min()
+    path = [start + (top - 7e-3 + depth) * direction for depth in (4e-4, 8e-4, 1.2e-3, 1.6e-3)]
+    found = []
+    for direct in (0, 10000):
+        monkeypatch.setattr(condensed_linear, "_DIRECT", direct)
+        skin, memory = CondensedSkin(coarse, box), Memory.rest(1)
+        for pos in path:
+            out = skin.solve(memory, pos[None], mat)
+            assert out.converged
+            memory = out.memory
+        found.append(out)
+    assert len(found[0].memory.coordinate) > 120
+    force = np.abs(found[1].wrench).max()
+    assert np.abs(found[0].wrench - found[1].wrench).max() < 3e-3 * force
+    assert np.abs(found[0].vert_xpos - found[1].vert_xpos).max() < 3e-6
+    assert np.abs(found[0].tangent - found[1].tangent).max() < 0.02 * np.abs(found[1].tangent).max()
+
+
+def test_what_is_clear_of_the_skin(coarse):
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    for away in (5e-4, 9e-4, 1.2e-3, 1e-2, 5e-4):
+        assert skin.clear((start - away * direction)[None], EYE, 1e-3) == (away > 1e-3)
+
+
 # --- a function of its arguments
 
 
@@ -327,6 +357,40 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
 
 
 # --- in MuJoCo
+
+
+def test_balls_fall_on_skins_that_share_a_solver():
+    """Falling from afar, where the skin is not sought, makes no difference to when and how it is met."""
+    geometry = load_skin("coarse")
+    top, _ = surface_point(geometry, -10e-3, 0.0)
+    quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
+    forces = []
+    for clear in (1e-3, 1e3):  # the second: always sought
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.option.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        handles = []
+        for i, height in enumerate((3e-3, 4e-3)):
+            ball = spec.worldbody.add_body(name=f"ball{i}", pos=[0.1 * i + top[0], -top[2], -top[1] + 5e-3 + height])
+            ball.mass, ball.inertia, ball.explicitinertial = 0.02, [1e-6] * 3, True
+            ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+            ball.add_geom(name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[5e-3, 0, 0])
+        for i in range(2):
+            spec.worldbody.add_body(name=f"finger{i}", pos=[0.1 * i, 0, 0])
+            settings = dict(skin="coarse", geoms=["ball0", "ball1"], tier="condensed", readings="none")
+            handles.append(biotac_mj.attach(spec, body=f"finger{i}", prefix=f"b{i}_", quat=quat, **settings))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("biotac_mj.coupling.condensed._CLEAR", clear)
+            model = spec.compile()
+            data = mujoco.MjData(model)
+            force = []
+            for _ in range(25):
+                mujoco.mj_step(model, data)
+                force.append([handle.read(data, "contact_force")[1] for handle in handles])
+        biotac_mj.plugin.check()
+        forces.append(np.array(force))
+    touched = (np.abs(forces[0]) > 0).argmax(0)
+    assert (touched > 8).all() and touched[0] < touched[1]
+    assert np.abs(forces[0] - forces[1]).max() < 1e-3 * np.abs(forces[1]).max()
 
 
 def test_a_ball_rests_with_its_weight():
