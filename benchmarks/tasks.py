@@ -81,7 +81,7 @@ def main(arguments=None) -> int:
     for task in options.tasks.split(","):
         if task not in known:
             raise ValueError(f"no task {task!r}: choose from {', '.join(known)}")
-        todo = [(p, s) for p in options.policies.split(",") for s in range(options.seeds) if (task, p, s) not in done]
+        todo = [(p, s) for s in range(options.seeds) for p in options.policies.split(",") if (task, p, s) not in done]
         if not todo:
             continue
         env = suite.load(known[task], task)

@@ -11,8 +11,13 @@ __all__ = ["FollowEdge"]
 _PAD = 8.2e-3  # [m]
 _REFERENCE = -9e-3  # x of the pad's point that is to stay on the edge, BioTac frame [m]
 _RADII = (0.03, 0.045, 0.07)  # [m]
+_EDGE = 1e-3  # rounding of the rim [m]
 _SPEED = 8e-3  # along the rim [m/s]
 _FORCES = (0.15, 3.0)  # [N]
+
+
+def _name(radius):
+    return f"disc_{1e3 * radius:.0f}mm"
 
 
 class FollowEdge(TouchTask):
@@ -24,10 +29,11 @@ class FollowEdge(TouchTask):
 
     def __init__(self, **settings):
         gantry = Gantry(yaw=True)
-        super().__init__(gantry, [gantry.mount], **settings)
+        rounding = {_name(radius): _EDGE for radius in _RADII}
+        super().__init__(gantry, [gantry.mount], **settings | {"biotac": {"rounding": rounding, **(settings.get("biotac") or {})}})
         self._discs = []
         for radius in _RADII:
-            disc = self._arena.mjcf_model.worldbody.add("body", name=f"disc_{1e3 * radius:.0f}mm", mocap=True, pos=AWAY)
+            disc = self._arena.mjcf_model.worldbody.add("body", name=_name(radius), mocap=True, pos=AWAY)
             disc.add("geom", name=disc.name, type="cylinder", size=[radius, 4e-3], pos=[0, 0, -4e-3], rgba=[0.75, 0.6, 0.4, 1])
             self._discs.append(disc)
         self._center, self._radius = np.zeros(2), _RADII[0]

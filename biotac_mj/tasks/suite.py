@@ -23,9 +23,12 @@ def environment(task, environment_kwargs=None, random=None, time_limit=None, **s
     made = task(**settings)
     # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the forces that act in it
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
-    return composer.Environment(
-        made, time_limit=made.seconds if time_limit is None else time_limit, random_state=random, **options | (environment_kwargs or {})
-    )
+    limit = (made.seconds if time_limit is None else time_limit) - 1e-6  # sums of time steps may fall short of it by rounding
+    env = composer.Environment(made, time_limit=limit, random_state=random, **options | (environment_kwargs or {}))
+    state = env.random_state.get_state()
+    env.reset()  # the first one compiles and draws noise that later ones do not: done here, so that a seed means one episode
+    env.random_state.set_state(state)
+    return env
 
 
 def _domain(name):

@@ -1,0 +1,103 @@
+"""The tasks in Gymnasium: its own checker is content, episodes repeat with their seed, several run side by side."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium (extra gymnasium)")
+pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
+
+# ruff: noqa: E402
+from gymnasium.utils.env_checker import check_env
+
+import biotac_mj.tasks
+from biotac_mj.tasks.environments import IDS, BioTacEnv
+
+ids = biotac_mj.tasks.register()
+
+
+def test_every_task_is_registered():
+    assert ids == list(IDS) and "BioTac/Press-v0" in ids and "BioTac/FollowEdge-v0" in ids
+    assert set(IDS.values()) == set(biotac_mj.tasks.tasks())
+    assert biotac_mj.tasks.register() == ids  # twice does no harm
+
+
+def checked(name):
+    env = gymnasium.make(name, time_limit=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for harmless in (
+            ".*Overriding environment.*",
+            ".*precision lowered.*",
+            ".*Box observation space.*infinity.*",
+            ".*render.*",
+            ".*glfw.*",
+        ):
+            warnings.filterwarnings("ignore", message=harmless)
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_checker_is_content():
+    checked("BioTac/Press-v0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [i for i in IDS if i != "BioTac/Press-v0"])
+def test_checker_is_content_with(name):
+    checked(name)
+
+
+def test_episode_ends_with_its_time_and_repeats_with_its_seed():
+    env = gymnasium.make("BioTac/Press-v0", time_limit=0.05)
+    action = np.array([0.3, -0.2, -1.0], np.float32)
+    runs = []
+    for _ in range(2):
+        observation, info = env.reset(seed=5)
+        rows, over = [observation["target"]], False
+        while not over:
+            observation, reward, terminated, over, info = env.step(action)
+            assert observation in env.observation_space and 0 <= reward <= 1 and not terminated
+            rows += [observation["position"], observation["finger/biotac/electrodes"]]
+        runs.append(np.concatenate(rows))
+    np.testing.assert_array_equal(*runs)
+    assert len(runs[0]) == 1 + 5 * 22
+    other, _ = env.reset(seed=6)
+    assert other["target"] != runs[0][0]
+
+
+def test_several_side_by_side():
+    envs = gymnasium.make_vec("BioTac/Press-v0", num_envs=2, vectorization_mode="sync", time_limit=0.05)
+    observation, _ = envs.reset(seed=1)
+    assert observation["finger/biotac/electrodes"].shape == (2, 19) and observation["target"][0] != observation["target"][1]
+    for _ in range(6):
+        observation, reward, terminated, truncated, _ = envs.step(np.zeros((2, 3), np.float32))
+    assert reward.shape == (2,)
+    envs.close()
+
+
+def test_without_touch_there_is_none():
+    names = BioTacEnv("finger", "press", observe="none").observation_space.keys()
+    assert sorted(names) == ["position", "target"]
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="unknown render_mode 'human': choose rgb_array or None"):
+        BioTacEnv("finger", "press", render_mode="human")
+    with pytest.raises(ValueError, match="domain 'finger' has no task 'pres'"):
+        BioTacEnv("finger", "pres")
+
+
+def test_training_example_learns_from_touch_interface(repo, tmp_path):
+    """The example's wrapper gives finite, scaled features, with touch and without; a training of a few steps runs to its end."""
+    pytest.importorskip("stable_baselines3", reason="needs stable-baselines3 (extra examples)")
+    from test_examples import load
+
+    example = load(repo, "train_press")
+    for touch, size in ((True, 22), (False, 2)):
+        env = example.PressByTouch(touch)
+        observation, _ = env.reset(seed=0)
+        assert observation.shape == (size,) and np.abs(observation).max() < 5
+        env.close()
+    rows = example.train(True, steps=16, seed=0, rollout=16)
+    assert rows and {"steps", "reward"} <= set(rows[0])
