@@ -14,7 +14,8 @@ __all__ = ["PAPER", "evaluate_models", "table"]
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
 PAPER = {"trajectory": {"latent_projection": 0.010, "pointnet": 0.012}, "object": {"latent_projection": 0.015, "pointnet": 0.016}}
 UNIT = 2048.0
-_REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae")  # rows to compare with: nothing that a user would serve
+# rows to compare with, nothing that is served; a window cannot be: see experiment.train_split
+_REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae", "local_window")
 _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 

@@ -63,6 +63,7 @@ def _add_evaluate(verbs, verb):
         "--new-sensor", metavar="SET", help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights"
     )
     v.add_argument("--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)")
+    v.add_argument("--ship", metavar="FOLDER", help="copy the trained weights there, each with a card")
     v.add_argument("--fraction", type=float, default=0.7, help="of the recording's rows, in time, that train")
     v.add_argument("--seed", type=int, default=0, help="of the recording's networks")
     v.add_argument("--json", metavar="FILE", help="where the numbers go, a plot beside them (default: out/evaluate/...)")
@@ -88,7 +89,12 @@ def _evaluate(args):
 def _evaluate_models(args):
     from .report import evaluate_models, table
 
-    print(table(evaluate_models(args.folder, args.json)))
+    result = evaluate_models(args.folder, args.json)
+    print(table(result))
+    if args.ship:
+        from .shipping import ship
+
+        print("written: " + ", ".join(map(str, ship(args.folder, result, args.ship))))
 
 
 def _add_contact_patch(verbs, verb):

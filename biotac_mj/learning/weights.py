@@ -10,7 +10,7 @@ import torch
 from ..press_record import replacing
 from ..sensor.channels import CHANNELS
 
-__all__ = ["load_forward", "load_inverse", "mesh_key", "save_forward", "save_inverse", "shipped", "window_of"]
+__all__ = ["describe", "load_forward", "load_inverse", "mesh_key", "save_forward", "save_inverse", "shipped", "window_of"]
 
 _FORMAT = "biotac_mj.learning.weights/1"
 
@@ -63,7 +63,8 @@ def _save(path, tensors, geometry, meta):
         save_file(tensors, str(temporary), {"biotac_mj": json.dumps(meta, sort_keys=True)})
 
 
-def _meta(path):
+def describe(path) -> dict:
+    """What a file of weights says about itself: direction, skin, nvert, channels, kind ..."""
     return _read(path, ())[0]
 
 
@@ -115,7 +116,7 @@ def window_of(path) -> tuple:
     """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has none."""
     from .features import FilmFeatures
 
-    meta = _meta(path)
+    meta = describe(path)
     return (len(meta["window"]), 19, FilmFeatures.count) if meta.get("window") else (0,)
 
 
