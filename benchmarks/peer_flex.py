@@ -11,7 +11,7 @@ import numpy as np
 
 from biotac_mj.geometry import SkinGeometry
 
-__all__ = ["VERSION", "press"]
+__all__ = ["SETTLE", "VERSION", "force_on_sphere", "model_xml", "press"]
 
 VERSION = mujoco.__version__
 TIMESTEP = 2e-3  # [s]
@@ -34,7 +34,7 @@ def press(geometry: SkinGeometry, material, radius: float, path: np.ndarray, dir
       force: (3,) of the skin on the sphere at the end [N].
     """
     begin = time.perf_counter()
-    model = mujoco.MjModel.from_xml_string(_xml(geometry, material, radius, path[0] - 1e-5 * direction))
+    model = mujoco.MjModel.from_xml_string(model_xml(geometry, material, radius, path[0] - 1e-5 * direction))
     data = mujoco.MjData(model)
     setup = time.perf_counter() - begin
     begin, cpu = time.perf_counter(), time.process_time()
@@ -50,11 +50,11 @@ def press(geometry: SkinGeometry, material, radius: float, path: np.ndarray, dir
         "cpu_ms_per_step": 1e3 * cpu / moves,
         "setup_s": setup,
         "steps": moves,
-        "force": _force_on_sphere(model, data),
+        "force": force_on_sphere(model, data),
     }
 
 
-def _xml(geometry, material, radius, center):
+def model_xml(geometry, material, radius, center):
     def text(array):
         return " ".join(f"{v:.9g}" for v in np.ravel(array))
 
@@ -77,7 +77,7 @@ def _xml(geometry, material, radius, center):
 </mujoco>"""
 
 
-def _force_on_sphere(model, data):
+def force_on_sphere(model, data):
     total, wrench = np.zeros(3), np.zeros(6)
     for i in range(data.ncon):
         contact = data.contact[i]

@@ -1,6 +1,7 @@
 """Speed of the standard press, and MuJoCo's own flex on the same mesh and press beside it.
 
     python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine] [--no-peer]
+    python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine --worlds 1,16,128,1024,4096
 
 The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of the outer surface
 there, the paper's material, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the core; with liquid and
@@ -8,8 +9,9 @@ without. A CPU run is held to one core. Kernels are compiled and the factor is m
 model and its factor); what is timed is the first press of a fresh skin, with every cost that a user's press has. `cpu_ms_per_press`
 is the processor time of the same press: where it is well below the wall time, other programs shared the core.
 
-force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press solved to a
-tolerance of 1e-6 in the same double precision: what stopping early costs, not what the mesh costs.
+force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press solved on the CPU in double
+precision to a tolerance of 1e-6: what stopping early and, on a GPU, single precision cost, not what the mesh costs.
+mb_per_world: device memory that a world of the batch takes; what the model takes once is `mb_model`. A row that does not fit says so.
 For the condensed tier F_tight is the full tier's press of the row above (docs/condensed.md says more).
 """
 
@@ -18,6 +20,7 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
 
 import argparse
+import functools
 import pathlib
 import platform
 import sys
@@ -51,9 +54,12 @@ COLUMNS = (
     "tier",
     "liquid",
     "worlds",
+    "tolerance",
     "ms_per_press",
     "cpu_ms_per_press",
+    "ms_per_press_and_world",
     "ms_per_step",
+    "mb_per_world",
     "setup_s",
     "force_error_rel",
     "not_converged",
@@ -95,42 +101,90 @@ def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarr
     return np.array(force), np.array(seconds), int(data.nonconverged.sum())
 
 
-def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int) -> dict:
-    """A row of the table, with the forces of the first world (increments, 3) beside it."""
-    geometry = load_skin(skin)
-    path, _ = standard_path(geometry, increments)
+@functools.cache
+def _model(skin, liquid, device, tolerance):
+    """The model of a row, with its factor, and the seconds and the device memory [bytes] that it takes."""
+    options = SkinOptions(liquid=liquid, tolerance=tolerance, max_newton=60 if tolerance < 1e-4 else SkinOptions.max_newton)
 
-    def make(tolerance):
-        options = SkinOptions(liquid=liquid, tolerance=tolerance, max_newton=60 if tolerance < 1e-4 else SkinOptions.max_newton)
-        model = SkinModel(geometry, PRESETS["paper"], options, device=device)
+    def make():
+        model = SkinModel(load_skin(skin), PRESETS["paper"], options, device=device)
         model.factor  # noqa: B018  made once for each model
         return model
 
-    press(make(SkinOptions.tolerance), path[:2], worlds)  # compiles
-    begin = time.perf_counter()
-    model = make(SkinOptions.tolerance)
-    setup = time.perf_counter() - begin
-    force, seconds, lost = press(model, path, worlds)
-    again = press(model, path, worlds)[1]
-    tight, _, lost_tight = press(make(TIGHT), path)
-    wrong = np.linalg.norm(force - tight, axis=2).mean(1)
-    return {
+    make()  # compiles
+    begin, memory = time.perf_counter(), _used(device)
+    model = make()
+    return model, time.perf_counter() - begin, _used(device) - memory
+
+
+@functools.cache
+def _tight(skin, liquid, increments):
+    """Forces (increments, 1, 3) of the same press solved tightly in double precision on the CPU, and steps that did not converge."""
+    force, _, lost = press(_model(skin, liquid, "cpu", TIGHT)[0], standard_path(load_skin(skin), increments)[0])
+    return force, lost
+
+
+def _used(device) -> int:
+    """Memory in use on a CUDA device, by Warp and by torch [bytes]; 0 on the CPU."""
+    if device == "cpu":
+        return 0
+    import torch
+
+    return wp.get_mempool_used_mem_current(device) + torch.cuda.memory_allocated(wp.device_to_torch(wp.get_device(device)))
+
+
+def _per_world(model, worlds, path) -> float:
+    """Device memory [bytes] of a world in a batch."""
+    if not model.device.is_cuda:
+        return 0.0
+    from biotac_mj.skin.device_step import prepare_device
+
+    before = _used(str(model.device))
+    data = SkinData(model, worlds)
+    geoms = GeomSet(["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device))
+    prepare_device(model, data, geoms)
+    return (_used(str(model.device)) - before) / worlds
+
+
+def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int, tolerance: float = SkinOptions.tolerance) -> dict:
+    """A row of the table, with the forces of the first world (increments, 3) beside it."""
+    geometry = load_skin(skin)
+    path, _ = standard_path(geometry, increments)
+    model, setup, memory = _model(skin, liquid, device, tolerance)
+    row = {
         "device": device,
         "solver": "biotac_mj",
         "skin": skin,
         "tier": "full",
         "liquid": liquid,
         "worlds": worlds,
+        "tolerance": tolerance,
+    }
+    row |= {"setup_s": setup, "mb_model": memory / 1e6, "mb_per_world": None, "increments": increments}
+    if device != "cpu":
+        total = wp.get_device(device).total_memory
+        per_world = _per_world(model, min(worlds, 16), path)
+        if memory + per_world * worlds > 0.95 * total:
+            note = f"does not fit: {(memory + per_world * worlds) / 1e9:.0f} GB of {total / 1e9:.0f}"
+            return row | {"note": note, "mb_per_world": per_world / 1e6}
+        per_world = _per_world(model, worlds, path)
+        row |= {"mb_per_world": per_world / 1e6, "largest_nworld": int((0.95 * total - memory) / per_world)}
+    press(model, path[:2], worlds)  # compiles
+    force, seconds, lost = press(model, path, worlds)
+    again = press(model, path, worlds)[1]
+    tight, lost_tight = _tight(skin, liquid, increments)
+    wrong = np.linalg.norm(force - tight, axis=2).mean(1)
+    return row | {
         "ms_per_press": 1e3 * seconds[:, 0].sum(),
         "cpu_ms_per_press": 1e3 * seconds[:, 1].sum(),
+        "ms_per_press_and_world": 1e3 * seconds[:, 0].sum() / worlds,
         "ms_per_step": 1e3 * seconds[:, 0].mean(),
         "ms_slowest_step": 1e3 * seconds[:, 0].max(),
+        "ms_median_step": 1e3 * float(np.median(seconds[:, 0])),
         "ms_per_press_again": 1e3 * again[:, 0].sum(),
-        "setup_s": setup,
         "force_error_rel": float(wrong.mean() / np.linalg.norm(tight, axis=2).max()),
         "not_converged": lost,
         "not_converged_tight": lost_tight,
-        "increments": increments,
         "peak_force_N": float(np.linalg.norm(force[:, 0], axis=1).max()),
         "force": force[:, 0].tolist(),
         "wall_and_cpu_ms_of_steps": (1e3 * seconds).tolist(),
@@ -228,13 +282,15 @@ def _cpu_name() -> str:
 def _print_row(row):
     cells = []
     for column in COLUMNS:
-        value = row[column]
-        if column == "force_error_rel":
+        value = row.get(column, "")
+        if value is None or value == "":
+            value = ""
+        elif column == "force_error_rel":
             value = f"{value:.2%}"
         elif isinstance(value, float):
-            value = f"{value:.1f}"
+            value = f"{value:.3g}" if column == "tolerance" else f"{value:.2f}"
         cells.append(f"{value!s:>{max(9, len(column) + 1)}}" if column != "solver" else f"{value:>20}")
-    print("".join(cells), flush=True)
+    print("".join(cells), row.get("note", ""), flush=True)
 
 
 def main(arguments=None) -> int:
@@ -243,6 +299,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
     parser.add_argument("--skins", default="default", help=f"comma-separated: {', '.join(SKINS)}")
     parser.add_argument("--worlds", default="1", help="comma-separated numbers of skins solved together")
+    parser.add_argument("--tolerances", default=str(SkinOptions.tolerance), help="comma-separated tolerances of the solver")
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
     parser.add_argument("--no-peer", action="store_true", help="leave MuJoCo's flex out")
     options = parser.parse_args(arguments)
@@ -263,9 +320,14 @@ def main(arguments=None) -> int:
     rows = []
     for skin in skins:
         for liquid in (False, True):
-            for worlds in map(int, options.worlds.split(",")):
-                rows.append({**time_skin(skin, liquid, options.device, worlds, options.increments), "machine": machine})
-                _print_row(rows[-1])
+            for tolerance in map(float, options.tolerances.split(",")):
+                for worlds in map(int, options.worlds.split(",")):
+                    row = time_skin(skin, liquid, options.device, worlds, options.increments, tolerance)
+                    rows.append({**row, "machine": machine})
+                    _print_row(rows[-1])
+                if "largest_nworld" in rows[-1]:
+                    print(f"  model {rows[-1]['mb_model']:.0f} MB; the largest nworld here: {rows[-1]['largest_nworld']}", flush=True)
+            _model.cache_clear()
     if options.device == "cpu":
         for ours in [row for row in rows if row["worlds"] == 1]:
             rows.append({**time_condensed(ours), "machine": machine})

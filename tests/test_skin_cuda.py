@@ -1,11 +1,14 @@
 """The same kernels on CUDA: needs a CUDA device and torch."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.device_step import prepare_device, step_device
 
 CUDA = wp.is_cuda_available()
 pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
@@ -45,3 +48,92 @@ def test_worlds_of_a_batch_do_not_touch_each_other():
     alone, x_alone, _ = press("cuda:0", depths, x=(-0.012,))
     np.testing.assert_allclose(together[:, 1], alone[:, 0], atol=1e-4 * np.abs(alone).max())
     np.testing.assert_allclose(x[1], x_alone[0], atol=1e-8)
+
+
+# --- the device step --------------------------------------------------------------------------------------------------------------
+
+
+def random_worlds(n, seed):
+    rng = np.random.default_rng(seed)
+    return [
+        dict(x=rng.uniform(-0.015, -0.009), side=rng.uniform(-2e-3, 2e-3), depth=rng.uniform(0.5, 1), friction=rng.uniform(0, 0.8),
+             modulus=rng.uniform(0.7, 1.4), bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]), fill=rng.uniform(-3, 3) * 1e-9)
+        for _ in range(n)
+    ]  # fmt: skip
+
+
+def make(model, worlds):
+    rubber = [dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus) for w in worlds]
+    data = SkinData(model, len(worlds), rubber)
+    geoms = GeomSet(["sphere"], [(0.0035,)], nworld=len(worlds), device=str(model.device))
+    geoms.set_friction([[w["friction"]] for w in worlds])
+    data.set_liquid([w["bulk"] for w in worlds], [w["fill"] if w["bulk"] else 0.0 for w in worlds])
+    return data, geoms
+
+
+def centres(worlds, depth):
+    return np.array([[[w["x"], -0.00825 + w["depth"] * depth - 0.0035, w["side"]]] for w in worlds])
+
+
+DEPTHS = (1e-4, 2.5e-4, 4e-4)
+
+
+def test_64_random_worlds_are_each_alone_on_the_cpu():
+    """Pose, friction, modulus and liquid differ; both stop at an energy error of 1e-5."""
+    options = SkinOptions(liquid=True, tolerance=1e-5, max_newton=60)
+    models = {device: SkinModel(load_skin("coarse"), "default", options, device=device) for device in ("cpu", "cuda:0")}
+    worlds = random_worlds(64, seed=1)
+    data, geoms = make(models["cuda:0"], worlds)
+    together = []
+    for depth in DEPTHS:
+        geoms.set_pose(centres(worlds, depth))
+        step(models["cuda:0"], data, geoms)
+        assert data.converged.all()
+        together.append(data.wrench[:, 0, :3])
+    for i, world in enumerate(worlds):
+        alone, one = make(models["cpu"], [world])
+        for depth, wrench in zip(DEPTHS, together):
+            one.set_pose(centres([world], depth))
+            step(models["cpu"], alone, one)
+            assert alone.converged.all()
+            np.testing.assert_allclose(wrench[i], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * np.abs(together[-1]).max())
+        np.testing.assert_allclose(data.vert_xpos[i], alone.vert_xpos[0], rtol=0, atol=5e-7)
+        np.testing.assert_allclose(data.pressure[i], alone.pressure[0], rtol=0.01, atol=5.0)
+
+
+def test_inside_a_graph_of_the_caller_a_nan_world_disturbs_nobody():
+    """Poses are written on the device; the step is replayed with what else the caller's graph holds."""
+    model = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True), device="cuda:0")
+    worlds = random_worlds(20, seed=2)
+    results = []
+    for spoil in (False, True):
+        data, geoms = make(model, worlds)
+        prepare_device(model, data, geoms)
+        path = [wp.array(np.swapaxes(centres(worlds, d), 0, 1), dtype=wp.vec3d, ndim=2, device="cuda:0") for d in DEPTHS]
+        pose = wp.clone(path[0])
+        with wp.ScopedCapture("cuda:0") as capture:
+            wp.copy(geoms.struct.pos, pose)
+            step_device(model, data, geoms)
+        for at in path:
+            wp.copy(pose, at)
+            if spoil:
+                spoiled = pose.numpy()
+                spoiled[0, 7, 1] = np.nan
+                pose.assign(spoiled)
+            wp.capture_launch(capture.graph)
+        results.append((data.converged, data.nonconverged, data.wrench, data.vert_xpos))
+    (sound, _, wrench, x), (converged, lost, other, y) = results
+    assert sound.all() and np.flatnonzero(~converged).tolist() == [7] and lost[7] == 3
+    rest = np.arange(20) != 7
+    np.testing.assert_array_equal(other[rest], wrench[rest])
+    np.testing.assert_array_equal(y[rest], x[rest])
+    assert np.isfinite(y[7]).all() and (y[7] == model.rest.vert).all()
+
+
+def test_the_step_must_be_ready_before_a_capture():
+    model = SkinModel(load_skin("coarse"), "default", SkinOptions(), device="cuda:0")
+    model.factor  # noqa: B018
+    data, geoms = make(model, random_worlds(1, 0))
+    with pytest.raises(ValueError, match=r"call prepare_device\(model, data, geoms\) before the capture begins"):
+        with wp.ScopedCapture("cuda:0"):
+            step_device(model, data, geoms)

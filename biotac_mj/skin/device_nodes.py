@@ -148,13 +148,17 @@ def add_inertia(
     on: wp.array(dtype=int),
     # In and out:
     force: wp.array2d(dtype=vec3),
+    # Out:
+    inertial_out: wp.array2d(dtype=wp.vec3),
 ):
     i, w = wp.tid()
     if on[w] == 0:
         return
     h = dt[w]
     m = density * node_volume[i] / (h * h)
-    force[i, w] = force[i, w] - m * (x[i, w] - target[i, w]) - damping * h * m * (x[i, w] - x_last[i, w])
+    inertial = -m * (x[i, w] - target[i, w]) - damping * h * m * (x[i, w] - x_last[i, w])
+    inertial_out[i, w] = single(inertial)
+    force[i, w] = force[i, w] + inertial
 
 
 @wp.kernel
@@ -199,6 +203,7 @@ def residuals(
     gradient: wp.array2d(dtype=vec3),
     x: wp.array2d(dtype=vec3),
     rest: wp.array2d(dtype=vec3),
+    inertial: wp.array2d(dtype=wp.vec3),
     on: wp.array(dtype=int),
     # Out:
     r_out: wp.array2d(dtype=wp.vec3),
@@ -206,7 +211,7 @@ def residuals(
     touch_out: wp.array(dtype=int),
     go_on: wp.array(dtype=int),
 ):
-    """Residual; by chunks its square, the work of the loads, and the square of the liquid's direction."""
+    """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the work of inertia."""
     c, w = wp.tid()
     if c == 0 and w == 0:
         go_on[0] = 0
@@ -217,6 +222,7 @@ def residuals(
     rr = real(0.0)
     work = real(0.0)
     gg = real(0.0)
+    fly = real(0.0)
     for i in range(c * chunk, wp.min((c + 1) * chunk, force.shape[0])):
         r = wp.vec3()
         if mask[i] > real(0.0):
@@ -231,10 +237,14 @@ def residuals(
             load += core[i, w]
         if external.shape[0] > 0:
             load += external[i, w]
-        work += wp.dot(load, x[i, w] - rest[i, 0])
+        u = x[i, w] - rest[i, 0]
+        work += wp.dot(load, u)
+        if inertial.shape[0] > 0:
+            fly += wp.dot(double(inertial[i, w]), u)
     part_out[0, c, w] = rr
     part_out[1, c, w] = work
     part_out[2, c, w] = gg
+    part_out[3, c, w] = fly
 
 
 @wp.kernel

@@ -89,7 +89,7 @@ class DevicePreconditioner:
 
         Args:
           st: Worlds, of which the active ones are looked at.
-          part: (3, nchunk, nworld) squares of r and of the gradient as its first and third.
+          part: (4, nchunk, nworld) squares of r and of the gradient as its first and third.
           r: [nvert, nworld] residual, zero at fixed nodes. gradient: of the liquid's volume [nvert, nworld], or of length zero.
           z_out: [nvert, nworld]. part_out: (2, nchunk, nworld) r . z and gradient . z.
         """

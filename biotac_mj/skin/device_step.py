@@ -69,7 +69,7 @@ class _Memory:
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=wp.vec3) for _ in range(5))
             self.base = wp.zeros((n, w), dtype=vec3)
-            self.worth = wp.zeros((3, self.nchunk, w), dtype=real)
+            self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
             self.part = wp.zeros((2, self.nchunk, w), dtype=real)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in (data.outer, data.core) if s]
             self.flags = wp.zeros(5, dtype=int)
@@ -86,6 +86,7 @@ class _Memory:
             self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
             implicit = model.options.dynamics == "implicit"
             self.world, self.target = (wp.zeros((n, w) if implicit else (0, w), dtype=vec3) for _ in range(2))
+            self.inertial = wp.zeros((n if implicit else 0, w), dtype=wp.vec3)
             self.node_volume = wp.array(model.elasticity.node_volume, dtype=real)
             self.damped = device_elements(model.elasticity, w) if implicit and model.options.stiffness_damping else None
         self.elements = device_elements(model.elasticity, w)
@@ -202,7 +203,7 @@ class DeviceStep:
         self._launch(
             nodes.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, self._external(),
-             self._gradient(), d.x, d.rest_vert, st.active],
+             self._gradient(), d.x, d.rest_vert, k.inertial, st.active],
             [k.r, k.worth, k.preconditioner.any_touch, self._newton_on],
         )  # fmt: skip
         k.preconditioner.update(st, k.worth, k.r, self._gradient(), k.p, k.part)
@@ -300,7 +301,8 @@ class DeviceStep:
         if self.implicit:
             o = m.options
             self._launch(nodes.add_inertia, d.x.shape,
-                         [m.material.density, o.mass_damping, k.node_volume, d.dt, k.target, d.x_last, d.x, on, d.force])  # fmt: skip
+                         [m.material.density, o.mass_damping, k.node_volume, d.dt, k.target, d.x_last, d.x, on, d.force],
+                         [k.inertial])  # fmt: skip
             if k.damped:
                 self._launch(nodes.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
                 k.damped.force(d.mu, d.lam, d.x, on, st.inverted)
