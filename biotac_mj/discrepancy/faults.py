@@ -260,7 +260,14 @@ class Swap(RecordedEffect):
         if best is None:
             return None
         _, cut, a, b = best
-        onset, end = float(line.time[cut]), float(session.recording.time[-1])
+        # The row itself: as it stands fits before it, exchanged after it.
+        rate, pair = session.recording.rate, [int(line.used[a]), int(line.used[b])]
+        first = max(int((line.time[cut] - 2 * line.period) * rate), 20)
+        x = session.counts[first : int((line.time[cut] + 2 * line.period) * rate), pair]
+        level = np.median(session.counts[first - 20 : first, pair], axis=0)
+        cost = np.abs(x - level).sum(1) - np.abs(x - level[::-1]).sum(1)
+        onset = (first + int(np.argmin(np.cumsum(cost))) + 1 - 0.5) / rate
+        end = float(session.recording.time[-1])
         return Finding(self, tuple(int(line.used[k]) for k in (a, b)), {"start": onset, "end": end + 1},
                        {"onset": (onset, onset - line.period, onset + line.period)}, 100.0, onset, end, 0.0,
                        note="each takes the other's level from one moment to the next")  # fmt: skip

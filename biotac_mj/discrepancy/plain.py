@@ -110,7 +110,7 @@ def _search(session, effects, bar):
         if len(alike) >= 2 and chosen.theta.get("kind") in ("step", "pulse"):
             # One jump is an event, jumps again and again are a behaviour that no effect here describes.
             session.give_up(
-                alike, f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} jumps again and again"
+                alike, f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} goes up and down again and again"
             )
             break
         session.accept(chosen)

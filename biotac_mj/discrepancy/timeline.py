@@ -53,14 +53,16 @@ class Timeline:
         effective = max(1.0, self.width * (1 - recording.repeated.mean()))
         self.noise = np.maximum(sample, 1e-5) / np.sqrt(effective)
         self._fill()
+        white = self.noise
         if self.width > 2:  # noise that is not white is larger in means than its samples say
             self.noise = np.maximum(self.noise, noise_level(self.value, None, 1e-6))
         self._departures = {}
         self.covariance = self._fast_covariance()
         c = len(self.used)
         apart = np.eye(c) - 1 / c  # what all electrodes do alike is no load: a contact raises some and lowers others
-        activity = np.sqrt(np.diag(apart @ self.covariance @ apart)) / self.noise
-        self.loaded = bool(np.median(np.sort(activity)[-6:]) > 5)
+        size = np.sqrt(np.diag(apart @ self.covariance @ apart))
+        # A load moves electrodes by tens of counts within seconds; noise, filtered or not, does not.
+        self.loaded = bool(np.median(np.sort(size / white)[-6:]) > 5 and np.median(np.sort(size / np.median(slope, axis=0))[-6:]) > 6)
 
     def _fill(self):
         """Bins without a good sample take the conditional mean given the others, or the electrode's median."""

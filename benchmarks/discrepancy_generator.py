@@ -1,0 +1,264 @@
+"""Measured data with a hidden effect, for the blind benchmark of `biotac_mj.discrepancy` - which nothing here imports.
+
+The skin and film are the project's, solved on a mesh of the generator's choice with its own way through the poses; every effect is written
+anew, in another form than the catalogue's (Euler integration instead of closed recursions, two time constants where one is fitted, a second-order filter,
+nearest neighbours instead of a kernel, tanh instead of a bent line, Dahl's law instead of a play operator).
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+__all__ = ["HIDDEN", "OUTSIDE", "Generator", "plan"]
+
+_E_NEAR = {0: (1, 3, 7), 1: (0, 2, 3, 16), 2: (1, 4, 16, 17), 3: (0, 1, 2, 4), 4: (2, 3, 5, 17), 5: (3, 4, 18), 6: (7, 8, 9), 7: (0, 6, 9), 8: (6, 9, 10),
+           9: (6, 7, 8, 16), 10: (8, 11, 13), 11: (10, 12, 13, 16), 12: (11, 14, 16, 17), 13: (10, 11, 12, 14), 14: (12, 13, 15, 17), 15: (13, 14, 18),
+           16: (1, 9, 11, 17), 17: (4, 14, 16, 18), 18: (5, 15, 17)}  # fmt: skip
+
+
+def plan(seed, count, skin="coarse"):
+    """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,); press, hold, sometimes slide, unload."""
+    from biotac_mj import approach
+    from biotac_mj.geometry import load_skin
+
+    geometry, rng, out, clock = load_skin(skin), np.random.default_rng(seed), [], 0.0
+    for i in range(count):
+        point, normal = approach.surface_point(geometry, rng.uniform(-0.014, -0.004), rng.uniform(-0.5, 0.5))
+        heading = -normal
+        depth, speed = rng.uniform(0.5e-3, 1.5e-3), np.exp(rng.uniform(np.log(0.5e-3), np.log(20e-3)))
+        hold, slide = np.exp(rng.uniform(np.log(0.2), np.log(6))), rng.choice([0.0, 0.0, 0.8e-3])
+        side = np.cross(heading, [1.0, 0, 0])
+        side /= np.linalg.norm(side)
+        legs = [(0.2, -0.02e-3, 0, 3), (depth / speed, depth, 0, 6), (hold, depth, 0, 5)]
+        legs += [(0.2, depth, slide, 4)] if slide else []
+        legs += [(depth / speed, -0.02e-3, slide, 5), (0.1, -0.05e-3, slide, 1)]
+        t, d, s = [0.0], [-0.02e-3], [0.0]
+        for seconds, to, across, rows in legs:
+            t0, d0, s0 = t[-1], d[-1], s[-1]
+            for k in range(1, rows + 1):
+                t.append(t0 + seconds * k / rows), d.append(d0 + (to - d0) * k / rows), s.append(s0 + (across - s0) * k / rows)
+        turn = Rotation.align_vectors([heading], [[0.0, 1.0, 0.0]])[0]
+        out.append(
+            {
+                "id": f"t{i:02d}", "tool": str(rng.choice(["sphere_7mm", "sphere_14mm"])), "clock": clock, "time": np.array(t),
+                "pos": point + np.outer(d, heading) + np.outer(s, side), "turn": turn.as_matrix(), "quat": np.roll(turn.as_quat(), 1),
+                "heading": heading, "depth": np.array(d),
+            }
+        )  # fmt: skip
+        clock += t[-1] + 5
+    return out
+
+
+class Generator:
+    """The skin of a mesh under plans; `footprint` widens what the electrodes see of a contact (a mildly wrong base model)."""
+
+    def __init__(self, skin="coarse", modulus=1.0, footprint=0.0):
+        from biotac_mj.geometry import load_skin
+        from biotac_mj.sensor.film import FilmConduction
+        from biotac_mj.skin.material import material
+        from biotac_mj.skin.model import SkinModel, SkinOptions
+
+        self.geometry = load_skin(skin)
+        self.film = FilmConduction(self.geometry, sensor="1")
+        self.model = SkinModel(self.geometry, material("default"), SkinOptions(liquid=True))
+        self.modulus, self.footprint = modulus, footprint
+        self._solved = {}
+
+    def skin(self, one, pos, radius=None):
+        """force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]."""
+        key = (one["id"], one["tool"], radius, np.round(pos, 8).tobytes())
+        if key not in self._solved:
+            self._solved[key] = self._solve(one, pos, radius)
+        return [x.copy() for x in self._solved[key]]
+
+    def _solve(self, one, pos, radius):
+        from biotac_mj.data.objects import make_object
+        from biotac_mj.skin.condensed import CondensedSkin, Memory
+        from biotac_mj.skin.geoms import GeomSet
+
+        r = float(make_object(one["tool"]).size[0]) * (radius or 1.0)
+        skin = self.__dict__.setdefault("_skins", {}).get(r)
+        if skin is None:
+            skin = self._skins[r] = CondensedSkin(
+                self.model, GeomSet(["sphere"], [(r,)], friction=[self.model.material.friction], device="cpu")
+            )
+        memory, force, pressure, impedance = Memory.rest(1), [], [], []
+        before = pos[0]
+        for p in pos:
+            parts = max(1, int(np.ceil(np.linalg.norm(p - before) / 0.6e-4)))  # finer than the fitter's way
+            for k in range(1, parts + 1):
+                centre = before + (p - before) * k / parts - r * one["heading"]
+                out = skin.solve(memory, centre[None], np.eye(3)[None])
+                memory = out.memory
+            before = p
+            force.append(out.wrench[0, :3]), pressure.append(memory.pressure)
+            impedance.append(self.film.impedance(out.vert_xpos[: self.geometry.nvert]))
+        return np.array(force), np.array(pressure), np.array(impedance)
+
+    def measure(self, plans, effects, seed, repeatability=0.02e-3):
+        """Per plan: counts (n, 19), pdc (n,), force (n, 3) with noise and rounding; effects: list of (name, size)."""
+        rng = np.random.default_rng(seed)
+        memory, out = {}, []
+        for one in plans:
+            s = _State(one, self, rng.normal(0, repeatability, 3), memory)
+            for name, size in effects:
+                if name in _BEFORE:
+                    _BEFORE[name](s, size)
+            pos = one["pos"] + s.offset
+            for _ in range(4 if s.compliance else 1):
+                s.force, s.pressure, s.impedance = self.skin(one, pos, s.radius)
+                if s.compliance:
+                    pos = one["pos"] + s.offset - 0.8 * s.compliance * np.outer(np.maximum(-s.force @ one["heading"], 0), one["heading"]) + 0.2 * (
+                        pos - one["pos"] - s.offset)  # fmt: skip
+            s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
+            s.rest = s.impedance[0]
+            if self.footprint:
+                change = np.log(s.impedance / s.rest)
+                smear = np.eye(19) * (1 - self.footprint)
+                for k, near in _E_NEAR.items():
+                    smear[k, list(near)] = self.footprint / len(near)
+                s.impedance = s.rest * np.exp(change @ smear.T)
+            for name, size in effects:
+                if name in _LOAD:
+                    _LOAD[name](s, size)
+            s.counts, s.pdc = 4095 / (s.impedance / 1e4 + 1), 2000 + s.pressure / 36.5
+            s.zero = 4095 / (s.rest / 1e4 + 1)
+            for name, size in effects:
+                if name in _READ:
+                    _READ[name](s, size)
+            counts = np.clip(np.rint(s.counts + 3.5 * rng.standard_normal(s.counts.shape)), 0, 4095)
+            out.append((counts, np.rint(s.pdc + rng.standard_normal(len(s.pdc))), s.force + 0.006 * rng.standard_normal(s.force.shape)))
+        return out
+
+
+class _State:
+    def __init__(self, one, generator, slip, memory):
+        self.one, self.generator, self.offset, self.memory = one, generator, slip, memory
+        self.radius, self.compliance = None, 0.0
+        self.t, self.clock, self.depth = one["time"], one["clock"] + one["time"], np.maximum(one["depth"], 0)
+
+
+def _integrate(t, x, tau):
+    """Explicit Euler in small steps: y' = (x - y) / tau."""
+    y, out = x[0].copy() if x.ndim > 1 else float(x[0]), [x[0]]
+    for i in range(1, len(t)):
+        parts = max(1, int(np.ceil(20 * (t[i] - t[i - 1]) / tau)))
+        for k in range(parts):
+            now = x[i - 1] + (x[i] - x[i - 1]) * (k + 0.5) / parts
+            y = y + (t[i] - t[i - 1]) / parts / tau * (now - y)
+        out.append(y)
+    return np.array(out)
+
+
+def _relax(s, size):
+    for share, tau in ((0.7, 0.3), (0.3, 2.5)):
+        s.force = s.force + size * share * (s.force - _integrate(s.t, s.force, tau))
+        s.pressure = s.pressure + size * share * (s.pressure - _integrate(s.t, s.pressure, tau))
+
+
+def _hyster(s, size):
+    z = 0.0
+    for i in range(1, len(s.t)):
+        step = s.depth[i] - s.depth[i - 1]
+        for _ in range(10):
+            z += step / 10 / 1.5e-4 * (1 - np.sign(step) * z)
+        s.force[i] *= 1 + size * z
+        s.pressure[i] *= 1 + size * z
+
+
+def _stiffen(s, size):
+    factor = 1 + size * (s.depth / 1.5e-3) ** 1.6
+    s.force, s.pressure = s.force * factor[:, None], s.pressure * factor
+
+
+def _mullins(s, size):
+    key = tuple(np.round(s.one["pos"][len(s.t) // 2] / 4e-3).astype(int))
+    largest = np.maximum(np.maximum.accumulate(s.depth), s.memory.get(key, 0.0))
+    loss = size * np.tanh(3 * np.maximum(largest**2 - s.depth**2, 0) / np.maximum(largest**2, 1e-12))
+    s.force, s.pressure = s.force * (1 - loss)[:, None], s.pressure * (1 - loss)
+    s.memory[key] = float(largest.max())
+
+
+def _adhesion(s, size):
+    leaving = np.gradient(s.depth) < 0
+    s.force = s.force + np.outer(size * (0.3 + 0.7 * leaving) * (s.depth > 0) * np.sqrt(s.depth / 1e-3), s.one["heading"])
+
+
+def _fluidloss(s, size):
+    s.impedance = s.impedance * (1 + size * s.clock / 100)[:, None]
+
+
+def _warmup(s, size):
+    s.impedance = s.impedance * np.exp(-size * (0.8 * (1 - np.exp(-s.clock / 60)) + 0.2 * (1 - np.exp(-s.clock / 15))))[:, None]
+
+
+def _asper(s, size):
+    s.impedance = s.rest * (s.impedance / s.rest) ** (1 + size)
+
+
+def _gain(s, size):
+    g = s.memory.setdefault("gain", size * np.random.default_rng(int(size * 1e6)).standard_normal(19))
+    s.counts = s.zero + (s.counts - s.zero) * (1 + g)
+
+
+def _crosstalk(s, size):
+    m = np.zeros((19, 19))
+    for k, near in _E_NEAR.items():
+        m[k, list(near)] = size
+    s.counts = s.counts + (s.counts - s.zero) @ m.T
+
+
+def _saturate(s, size):
+    s.counts = s.zero + size * np.tanh((s.counts - s.zero) / size)
+
+
+def _lowpass(s, size):
+    s.counts = _integrate(s.t, _integrate(s.t, s.counts, size / 2), size / 2)
+
+
+def _latency(s, size):
+    fine = np.linspace(s.t[0] - 1, s.t[-1], 20000)
+    for k in range(19):
+        s.counts[:, k] = np.interp(np.interp(s.t - size, fine, fine), s.t, s.counts[:, k])
+
+
+def _drift(s, size):
+    s.counts = s.counts + (size * (s.t - s.t[0]) ** 0.9)[:, None]
+
+
+def _set(name):
+    def change(s, size):
+        if name == "radius":
+            s.radius = 1 + size
+        elif name == "compliance":
+            s.compliance = size
+        elif name == "depth0":
+            s.offset = s.offset + size * s.one["heading"]
+        else:
+            s.offset = s.offset + np.array([size, 0, 0.6 * size])
+
+    return change
+
+
+def _ripple(s, size):
+    """Outside: a stick-slip ripple of the electrodes in depth."""
+    s.counts = s.counts + size * np.sin(2 * np.pi * s.depth / 0.25e-3)[:, None] * np.cos(np.arange(19))
+
+
+def _leak(s, size):
+    """Outside: electrodes read the pressure through a damaged seal, each with its own sign, and keep part of it."""
+    seen = np.maximum.accumulate(np.maximum(s.pressure, 0)) / 5000
+    s.counts = s.counts + size * np.outer(0.5 * s.pressure / 5000 + 0.5 * seen, np.sin(2.1 * np.arange(19)))
+
+
+_BEFORE = {"radius": _set("radius"), "mount": _set("compliance"), "depth0": _set("depth0"), "misalign": _set("misalign")}
+_LOAD = {"relax": _relax, "hyster": _hyster, "stiffen": _stiffen, "mullins": _mullins, "adhesion": _adhesion, "fluidloss": _fluidloss,
+         "warmup": _warmup, "asper": _asper}  # fmt: skip
+_READ = {"gain": _gain, "crosstalk": _crosstalk, "saturate": _saturate, "lowpass": _lowpass, "latency": _latency, "drift": _drift, "ripple": _ripple,
+         "leak": _leak}  # fmt: skip
+# Smallest and largest size of each hidden effect.
+HIDDEN = {
+    "relax": (0.15, 0.4), "hyster": (0.08, 0.25), "stiffen": (0.2, 0.5), "mullins": (0.2, 0.4), "adhesion": (0.06, 0.15), "fluidloss": (0.03, 0.1),
+    "warmup": (0.06, 0.25), "asper": (0.15, 0.4), "gain": (0.1, 0.25), "crosstalk": (0.06, 0.15), "saturate": (150, 400), "lowpass": (0.04, 0.15),
+    "latency": (0.03, 0.1), "drift": (4, 15), "radius": (0.12, 0.25), "mount": (4e-5, 12e-5), "depth0": (6e-5, 15e-5), "misalign": (1.5e-4, 4e-4),
+}  # fmt: skip
+OUTSIDE = {"ripple": (20, 60), "leak": (40, 120)}

@@ -1,0 +1,248 @@
+"""The full workflow: effects against closed forms, statistics, YAML, and diagnoses on a sensor of springs that costs nothing."""
+
+import ast
+import pathlib
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
+from biotac_mj.discrepancy.catalogue import _memory, by_id
+from biotac_mj.discrepancy.effect import STAGES, Run
+from biotac_mj.discrepancy.workflow import phases
+
+ROOT = pathlib.Path(__file__).parents[1]
+WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)
+
+
+class Springs(Simulator):
+    """A sensor whose skin is F = 600 d + 2e5 d^2 [N] and whose electrodes follow depth and place: the workflow without finite elements."""
+
+    def solve(self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None):
+        out = []
+        for i, t in enumerate(trajectories):
+            pos = t.pos + (0 if offset is None else offset[i])
+            d = np.maximum((pos - t.pos[0]) @ t.heading - 20e-6, 0) * np.exp(0.5 * (0 if log_radius is None else log_radius[i]))
+            side = pos[:, 0] - t.pos[0, 0]
+            force = -np.outer(600 * d + 2e5 * d**2, t.heading)
+            place = np.cos(np.arange(19) + 300 * t.pos[0, 0])
+            z = (
+                np.linspace(-0.9, -0.3, 19)
+                + np.log(1e4)
+                + np.outer(d / 1e-3, WEIGHT + 0.1 * place)
+                + np.outer(200 * side * d / 1e-3, place)
+            )
+            out.append({"force": force, "pressure": 4e6 * d * (1 - 1e7 * bubble), "log_z": z})
+            if progress:
+                progress()
+        return out
+
+
+def plans(n=14, seed=0, unload=True):
+    rng = np.random.default_rng(seed)
+    out, clock = [], 0.0
+    for i in range(n):
+        depth, speed, hold = rng.uniform(0.4e-3, 1.6e-3), np.exp(rng.uniform(np.log(0.5e-3), np.log(15e-3))), np.exp(rng.uniform(-1.5, 1.7))
+        d = np.concatenate([[0, 0, 0], np.linspace(0, depth, 8)[1:], np.full(6, depth), np.linspace(depth, -1e-5, 7)[1:] if unload else []])
+        t = np.concatenate([[0, 0.1, 0.2], 0.2 + depth / speed * np.arange(1, 8) / 7])
+        t = np.concatenate([t, t[-1] + hold * np.arange(1, 7) / 6])
+        t = np.concatenate([t, t[-1] + depth / speed * np.arange(1, 7) / 6]) if unload else t
+        pos = np.array([rng.uniform(-0.012, -0.006), -0.008, 0]) + np.outer(d, [0.0, 1.0, 0.0])
+        n_rows = len(t)
+        out.append(Trajectory(f"t{i}", "sphere_7mm", clock, t, pos, np.tile(np.eye(3), (n_rows, 1, 1)), np.full((n_rows, 19), 2500.0),
+                              np.full(n_rows, 2000.0), None, np.zeros((n_rows, 3))))  # fmt: skip
+        clock += t[-1] + 4
+    return out
+
+
+def measured(effects, seed=1, **kw):
+    """What the springs with effects would read, with noise, slips of the pose and another modulus (synthetic)."""
+    rng = np.random.default_rng(seed)
+    data = plans(**kw)
+    slips = [rng.normal(0, 15e-6, 3) for _ in data]
+    runs = Springs().run(data, None, True, effects, 1.07, 0.0, slips)
+    return [
+        Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),
+                   np.rint(r.pdc + rng.standard_normal(len(t.time))), None, r.force + 0.005 * rng.standard_normal(r.force.shape))
+        for t, r in zip(data, runs)
+    ]  # fmt: skip
+
+
+def run_of(n=40):
+    t = np.linspace(0, 4, n)
+    d = 1e-3 * np.clip(t, 0, 1) * np.clip(4 - t, 0, 1)
+    z = np.tile(np.linspace(8.5, 9.0, 19), (n, 1)) + np.outer(d / 1e-3, WEIGHT)
+    return Run(time=t, clock=10 + t, tool="sphere_7mm", heading=np.array([0, 1.0, 0]), depth=d, place=np.array([-0.01, -0.008, 0.001]), order=0,
+               offset=np.zeros((n, 3)), force=-np.outer(800 * d, [0, 1.0, 0.2]), pressure=3e6 * d, log_z=z, temperature=np.linspace(0, 1, n), session={},
+               rest_log_z=z[0], counts=4095 / (np.exp(z) / 1e4 + 1), pdc=2000 + 3e6 * d / 36.5)  # fmt: skip
+
+
+# --- effects -------------------------------------------------------------------------------------------------------------------------
+
+
+def test_every_effect_says_what_it_is():
+    assert len(CATALOGUE) >= 20 and len({e.id for e in CATALOGUE}) == len(CATALOGUE)
+    for e in CATALOGUE:
+        assert e.stage in STAGES and e.physics and e.confusable and e.params
+        for p in e.params.values():
+            assert p.low < p.high and p.low <= p.start <= p.high and p.source and p.scale > 0
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.id)
+def test_an_effect_of_size_zero_changes_nothing_and_of_its_own_size_something(effect):
+    names = ("force", "pressure", "log_z", "counts", "pdc", "offset", "log_radius", "log_friction", "bubble")
+    for size, same in ((0.0, True), (1.0, False)):
+        before, run = run_of(), run_of()
+        run.session["mullins"] = [(run.place, 2e-3)]
+        theta = effect.default()
+        theta.update({n: effect.params[n].start + size * effect.params[n].scale for n in effect.free})
+        effect.apply(run, theta)
+        unchanged = all(np.allclose(getattr(run, n), getattr(before, n), rtol=1e-12, atol=1e-15) for n in names)
+        assert unchanged == same
+
+
+def test_memory_is_the_solution_of_its_equation():
+    run = run_of()
+    x = 3 * run.depth / 1e-3
+    exact = solve_ivp(lambda t, q: np.interp(t, run.time[:-1] + np.diff(run.time) / 2, np.diff(x) / np.diff(run.time)) * 0
+                      + (np.diff(x) / np.diff(run.time))[min(np.searchsorted(run.time, t, "right") - 1, len(x) - 2)] - q / 0.4,
+                      (0, 4), [0.0], t_eval=run.time, max_step=0.002)  # fmt: skip
+    np.testing.assert_allclose(_memory(run, x, 0.4), exact.y[0], atol=2e-3)
+
+
+def test_relaxation_of_a_step_is_the_prony_series():
+    run = run_of()
+    run.time = np.concatenate([[0, 1e-9], np.linspace(0.1, 4, 38)])
+    run.force = np.zeros((40, 3))
+    run.force[1:, 1] = -2.0
+    by_id("relax").apply(run, {"g": 0.3, "tau": 0.7})
+    np.testing.assert_allclose(run.force[1:, 1], -2 * (1 + 0.3 * np.exp(-run.time[1:] / 0.7)), rtol=1e-6)
+
+
+# --- files ---------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_simulator_is_the_same_after_saving(tmp_path):
+    effect = by_id("mount")
+    sim = Simulator(skin="coarse", effects=[(effect, {"compliance": 5e-5})], modulus=1.1, intervals={"mount": {"compliance": (4e-5, 6e-5)}})
+    sim.save(tmp_path / "s.yaml")
+    text = (tmp_path / "s.yaml").read_text()
+    assert "m/N" in text and "boundary" in text and "biotac_mj.sensor/1" in text
+    again = load_simulator(tmp_path / "s.yaml")
+    assert again.modulus == 1.1 and again.effects[0][0].id == "mount" and again.effects[0][1] == {"compliance": 5e-5}
+    assert again.intervals == sim.intervals
+
+
+def test_bad_sensor_files_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="Simulator\\(\\).save"):
+        load_simulator(tmp_path / "none.yaml")
+    (tmp_path / "a.yaml").write_text("schema: other/9\n")
+    with pytest.raises(ValueError, match="schema 'other/9'"):
+        load_simulator(tmp_path / "a.yaml")
+    (tmp_path / "b.yaml").write_text("schema: biotac_mj.sensor/1\nstages:\n  set-up:\n  - effect: wobble\n    parameters: {}\n")
+    with pytest.raises(ValueError, match="unknown effect 'wobble'"):
+        load_simulator(tmp_path / "b.yaml")
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(pos=lambda t: t.pos * 1e3), "these look like millimetres"),
+        (dict(electrodes=lambda t: t.electrodes / 1000), "raw counts 0..4095 are needed"),
+        (dict(force=lambda t: t.force + 9000.0), "look like mN"),
+        (dict(time=lambda t: t.time[::-1].copy()), "does not increase"),
+        (dict(time=lambda t: np.where(np.arange(len(t.time)) > 9, t.time + 5000, t.time)), "has a gap of"),
+        (dict(electrodes=lambda t: np.where(np.arange(19) == 3, np.nan, t.electrodes)), "not finite"),
+    ],
+)
+def test_wrong_units_gaps_and_holes_are_refused(change, message):
+    t = plans(1)[0]
+    values = {**t.__dict__, **{k: f(t) for k, f in change.items()}}
+    with pytest.raises(ValueError, match=message):
+        Trajectory(**values)
+
+
+# --- diagnosis -----------------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_named_where_nothing_is():
+    report = diagnose(Springs(), measured([]), progress=False)
+    assert report.verdict == "no significant disagreement" and not report.effects
+
+
+@pytest.mark.parametrize(
+    "name, size", [("latency", {"delay": 0.06}), ("relax", {"g": 0.25, "tau": 0.5}), ("mount", {"compliance": 1.2e-4})]
+)
+def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path):
+    effect = by_id(name)
+    data = measured([(effect, {**effect.default(), **size})])
+    report = diagnose(Springs(), data, progress=False)
+    assert [e["id"] for e in report.effects] == [name] and report.closed > 0.8
+    parameter = report.effects[0]["parameters"][0]
+    assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
+    assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
+    assert report.ranking[0][0] == name and any(c["phase"] in ("approach", "hold", "unload") for c in report.where)
+    amended = report.apply(Springs())
+    assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
+    from biotac_mj.discrepancy.workflow_verb import summary, write_report
+
+    files = write_report(report, Springs(), tmp_path)
+    assert all(f.exists() for f in files) and "kept aside" in summary(report)
+    assert load_simulator(tmp_path / "sensor_amended.yaml").effects[0][0].id == name
+
+
+def test_an_effect_of_your_own_in_ten_lines():
+    class Sag(Effect):
+        id, name, stage = "sag", "sagging arm", "S"
+        physics = "the arm sinks while the session lasts"
+        params = {"rate": Param("m/s", -1e-5, 1e-5, "my robot's manual", scale=1e-6)}
+        confusable = {"depth0": "repeat the first trajectory at the end"}
+
+        def apply(self, run, theta):
+            run.offset = run.offset + theta["rate"] * run.clock[:, None] * run.heading
+
+    data = measured([(Sag(), {"rate": -2.5e-6})])
+    report = diagnose(Springs(), data, effects=[*CATALOGUE, Sag()], progress=False)
+    assert report.effects[0]["id"] == "sag" or "sag" in report.effects[0]["ties"]
+    assert abs(report.effects[0]["parameters"][0]["value"] + 2.5e-6) < 8e-7
+
+
+def test_too_few_trajectories_are_refused():
+    with pytest.raises(ValueError, match="the trajectory is the unit of evidence"):
+        diagnose(Springs(), measured([], n=4), progress=False)
+
+
+def test_what_the_data_cannot_tell_is_said():
+    report = diagnose(Springs(), measured([], n=8, unload=False), progress=False)
+    text = " ".join(report.notes)
+    assert "no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known" in text
+    assert "8 trajectories: p-values cannot fall below" in text and "no slides" in text and "no TDC" in text
+    data = [Trajectory(**{**t.__dict__, "force": None}) for t in measured([], n=8)]
+    assert "no force: the rubber's modulus shows in the liquid's pressure alone" in diagnose(Springs(), data, progress=False).notes
+
+
+def test_phases_are_told_apart():
+    t = plans(1)[0]
+    rows = phases(t)
+    assert sum(r.sum() for r in rows.values()) == len(t.time)
+    assert rows["approach"].any() and rows["hold"].any() and rows["unload"].any() and rows["free"][0]
+
+
+# --- independence of the benchmark ---------------------------------------------------------------------------------------------------
+
+
+def imports(path):
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        if isinstance(node, ast.ImportFrom):
+            found.add(("." * node.level) + (node.module or ""))
+    return found
+
+
+def test_generator_and_fitter_share_no_code():
+    assert not any("discrepancy" in name for name in imports(ROOT / "benchmarks/discrepancy_generator.py"))
+    for path in (ROOT / "biotac_mj/discrepancy").glob("*.py"):
+        assert not any("benchmark" in name or "generator" in name for name in imports(path)), path
