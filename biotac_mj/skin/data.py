@@ -78,7 +78,7 @@ class SkinData:
       model: the SkinModel.
       nworld: number of worlds.
       material: None, or one Material of the model's law for each world.
-      resident: whether all state lives on the device and `step` never looks back at the host (see `device_step`); None: where CUDA is.
+      resident: whether all state lives on the device and `step` never looks back at the host (see `device_step`): on CUDA, always.
         Attributes are then copied when they are read, and a world's contact beyond `contact_capacity` touching nodes slows its solves.
 
     Attributes (all arrays lead with nworld, on the host):
@@ -108,6 +108,8 @@ class SkinData:
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
         self.nworld, self.model = nworld, model
         self.resident = model.device.is_cuda if resident is None else resident
+        if model.device.is_cuda and not self.resident:
+            raise ValueError("on CUDA the state is always resident: leave resident out, or make the model on the CPU")
         second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
         nsample = len(model.sample)
         with wp.ScopedDevice(model.device):
@@ -353,11 +355,13 @@ class SkinData:
 
     def _preconditioner_of_state(self):
         """Made anew: the device step keeps its own, of the last evaluation but one."""
-        from .solver import preconditioner
+        from .preconditioner import Preconditioner
 
         m = self.model
         mask = view(m.free_mask)[:, None, None]
-        made = preconditioner(m)(m, self.stiffness_scale)
+        if m.device.is_cuda:
+            from .batch_preconditioner import BatchPreconditioner as Preconditioner  # torch is for CUDA only
+        made = Preconditioner(m, self.stiffness_scale)
         states = [self.outer] + ([self.core] if self.core else [])
         kappa = self.liquid.stiffness if m.has_liquid else np.zeros(self.nworld)
         made.update(states, view(self.force) * mask, view(self.gradient) * mask if m.has_liquid else None, kappa)

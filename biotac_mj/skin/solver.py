@@ -11,7 +11,7 @@ from .model import SkinModel
 from .preconditioner import Preconditioner
 from .types import vec3
 
-__all__ = ["preconditioner", "step"]
+__all__ = ["step"]
 
 # matrices of a few hundred rows: more threads of BLAS only wait for each other
 _threads = ThreadpoolController()
@@ -83,7 +83,7 @@ class _Step:
     def __init__(self, model, data, geoms, dt, core_pos, core_mat):
         self.m, self.d, self.geoms = model, data, geoms
         self.x = view(data.x)
-        self.start = _copy(self.x)
+        self.start = self.x.copy()
         self.force = view(data.force)
         self.mask = view(model.free_mask)[:, None, None]
         self.gradient = view(data.gradient)
@@ -91,7 +91,7 @@ class _Step:
         if data.liquid:
             data.liquid.begin()
         if not hasattr(data, "preconditioner"):
-            data.preconditioner = preconditioner(model)(model, data.stiffness_scale)
+            data.preconditioner = Preconditioner(model, data.stiffness_scale)
         self.M = data.preconditioner
         self.inertia = None
         if model.options.dynamics == "implicit":
@@ -108,9 +108,7 @@ class _Step:
         target = np.einsum("wji,nwj->nwi", mat, world + dt * velocity - pos)
         coefficient = self.m.material.density * self.m.elasticity.node_volume[:, None, None] / dt**2
         self.pose, self.world, self.dt = (pos, mat), world, dt
-        like = self.x if isinstance(self.x, np.ndarray) else None
-        self.target = target if like is not None else self.x.new_tensor(target)
-        self.inertia = coefficient if like is not None else self.x.new_tensor(coefficient)
+        self.target, self.inertia = target, coefficient
 
     def _motion(self):
         """How far each geom moves in this step: (nworld, ngeom, 3)."""
@@ -126,7 +124,7 @@ class _Step:
         now, last = self._motion() * touching, d.motion * touching
         square = (last * last).sum((1, 2))
         repeat = np.clip((now * last).sum((1, 2)) / np.where(square > 0, square, 1), 0, 2)
-        self.x += _like(self.x, repeat)[:, None] * view(d.increment)
+        self.x += repeat[:, None] * view(d.increment)
 
     def run(self):
         self.d.iterations[:] = 0
@@ -135,7 +133,7 @@ class _Step:
         if not good.all():  # the guess may have been the trouble
             self._back(~good)
             good |= self._newton(~good)
-        if not good.all() and self.m.material.poissons_ratio > 0.45 and not self.m.device.is_cuda and self.d.nworld == 1:
+        if not good.all() and self.m.material.poissons_ratio > 0.45 and self.d.nworld == 1:
             self._back(~good)
             good = self._newton_from_deformed()
         self._finish(good)
@@ -167,18 +165,18 @@ class _Step:
         self._evaluate()
         for iteration in range(options.max_newton + 1):
             residual = self.force * self.mask
-            finite = np.isfinite(_host(residual.sum((0, 2))))
+            finite = np.isfinite(residual.sum((0, 2)))
             states = self._contacts()
-            touched = np.logical_or.reduce([_host(view(s.touching).any(0)) for s in states])
-            at_rest = ~touched & (_host((residual * residual).sum((0, 2))) < _BALANCED**2)
+            touched = np.logical_or.reduce([view(s.touching).any(0) for s in states])
+            at_rest = ~touched & ((residual * residual).sum((0, 2)) < _BALANCED**2)
             if at_rest.all():
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
                 return asked
             z = self.M.update(states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
-            error = _host((residual * z).sum((0, 2)))
+            error = (residual * z).sum((0, 2))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
-            work = np.abs(_host((load * (self.x - view(d.rest_vert))).sum((0, 2)))) + 1e-12
+            work = np.abs((load * (self.x - view(d.rest_vert))).sum((0, 2))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
             active = asked & finite & ~at_rest & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
             if not active.any() or iteration == options.max_newton:
@@ -191,7 +189,7 @@ class _Step:
         """Whether the step z would hardly change the liquid's pressure. Its energy cannot tell: the liquid is almost incompressible."""
         if not self.m.has_liquid:
             return True
-        change = self.kappa * np.abs(_host((self.gradient * self.mask * z).sum((0, 2))))
+        change = self.kappa * np.abs((self.gradient * self.mask * z).sum((0, 2)))
         return change <= _PRESSURE_TOLERANCE * np.abs(self.d.liquid.gauge_pressure) + _PRESSURE_NOISE
 
     def _line_search(self, dx, residual, active):
@@ -199,16 +197,16 @@ class _Step:
 
         Along a descent direction of an energy that is its minimum; friction has no energy, its work along dx still has to balance.
         """
-        base = _copy(self.x)
-        slope = _host((residual * dx).sum((0, 2)))
+        base = self.x.copy()
+        slope = (residual * dx).sum((0, 2))
         low, high = np.zeros_like(slope), np.full_like(slope, np.nan)
         slope_low, slope_high = slope.copy(), slope.copy()
         alpha = np.where(active, 1.0, 0.0)
         side = np.zeros(len(slope), int)
         for _ in range(12):
-            self.x[...] = base + _like(self.x, alpha)[:, None] * dx
+            self.x[...] = base + alpha[:, None] * dx
             self._evaluate()
-            now = _host((self.force * dx).sum((0, 2)))
+            now = (self.force * dx).sum((0, 2))
             valid = np.isfinite(now)
             if self.m.material.law == "neo_hookean":
                 valid &= self.m.elasticity.smallest_jacobian(self.d.elastic) > 0.02
@@ -245,7 +243,7 @@ class _Step:
             d.liquid.evaluate(d.x, d.core)
         if m.has_liquid:
             launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.liquid.gradient(d.x), 1.0, 0], [d.gradient])
-            self.force += _like(self.x, d.liquid.gauge_pressure)[:, None] * self.gradient
+            self.force += d.liquid.gauge_pressure[:, None] * self.gradient
         if self.inertia is not None:
             self.force -= self.inertia * (self.x - self.target) + m.options.mass_damping * self.dt * self.inertia * (self.x - self.start)
             if m.options.stiffness_damping:
@@ -290,16 +288,16 @@ class _Step:
             q += (self.kappa * (self.gradient * p).sum((0, 2)))[:, None] * self.gradient
             bend = d.liquid.gradient_derivative(d.x, d.direction)
             launch(elasticity.gather, (m.nvert, d.nworld), [m.inner.start, m.inner.slot, bend, 1.0, 0], [d.bending])
-            q -= _like(self.x, d.liquid.gauge_pressure)[:, None] * view(d.bending)
+            q -= d.liquid.gauge_pressure[:, None] * view(d.bending)
         return q * self.mask
 
     def _conjugate_gradients(self, residual, z, active):
         """Solves tangent dx = residual until the preconditioned residual has fallen by ten; worlds that are not active get zero."""
-        r, p = residual, _copy(z)
+        r, p = residual, z.copy()
         dx = 0 * z
         rz = (r * z).sum((0, 2))
         first = rz
-        running = _like(self.x, active.astype(float))
+        running = active.astype(float)
         for _ in range(self.m.options.max_cg):
             q = self._product(p)
             curvature = (p * q).sum((0, 2))
@@ -321,9 +319,9 @@ class _Step:
                 break
             p = z + (rz_next / (rz + (rz == 0)))[:, None] * p
             rz = rz_next
-        untouched = _host((dx * dx).sum((0, 2))) == 0
+        untouched = (dx * dx).sum((0, 2)) == 0
         if (untouched & active).any():  # negative curvature at once: the preconditioner's step
-            chosen = _like(self.x, (untouched & active).astype(float))
+            chosen = (untouched & active).astype(float)
             dx += chosen[:, None] * p
         return dx
 
@@ -336,7 +334,7 @@ class _Step:
             return []
         struct, poses = self.geoms.struct, []
         for array, last in ((struct.pos, struct.pos_last), (struct.mat, struct.mat_last)):
-            poses.append((array, _copy(view(array))))
+            poses.append((array, view(array).copy()))
             for w in failed:
                 view(array)[:, w] = view(last)[:, w]
         for w in failed:
@@ -374,29 +372,8 @@ class _Step:
             d.core_pos, d.core_mat = pos.copy(), mat.copy()
 
 
-def preconditioner(model):
-    """The class of the preconditioner for the model's device."""
-    if not model.device.is_cuda:
-        return Preconditioner
-    from .batch_preconditioner import BatchPreconditioner  # torch is for CUDA only
-
-    return BatchPreconditioner
-
-
 def _launcher(device):
     def launch(kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
 
     return launch
-
-
-def _copy(array):
-    return array.copy() if isinstance(array, np.ndarray) else array.clone()
-
-
-def _host(array):
-    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
-
-
-def _like(array, host):
-    return host if isinstance(array, np.ndarray) else array.new_tensor(host)
