@@ -85,7 +85,7 @@ def _kept(path, make):
         return [file[name] for name in file.files]
 
 
-def _discriminant(presses, label, shrink=0.2):
+def _discriminant(presses, label, shrink=0.05):
     """Weights (100, 17) and bias (17,) of Fisher's linear discriminant, with the classes' common covariance shrunk to its diagonal."""
     mean = np.stack([presses[label == k].mean(0) for k in range(len(OBJECTS))])
     rest = presses - mean[label]

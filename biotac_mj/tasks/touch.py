@@ -52,17 +52,18 @@ class Touch:
 
 
 def _features(touch):
-    """(n, 1 + 20 + 210): constant, linear and quadratic terms of (n, 20)."""
+    """(n, 251) of (n, 20): the touch, and constant, linear and quadratic terms of its shape, whose size is that of no touch or any."""
+    shape = 10 * touch / (np.abs(touch).sum(axis=1, keepdims=True) + 1.0)
     i, j = np.triu_indices(touch.shape[1])
-    return np.concatenate([np.ones((len(touch), 1)), touch, touch[:, i] * touch[:, j]], axis=1)
+    return np.concatenate([np.ones((len(touch), 1)), shape, shape[:, i] * shape[:, j], touch], axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimator:
-    """Ridge regression of hidden quantities on quadratic features of one BioTac's touch.
+    """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape.
 
     Attributes:
-      scale: (231,) of the features; weight: (231, nestimated); error: (nestimated,) RMS on episodes that were held out.
+      scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on episodes that were held out.
     """
 
     scale: np.ndarray
