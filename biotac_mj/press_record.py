@@ -87,9 +87,12 @@ def replacing(path):
 
 def versions() -> dict:
     """Versions of what computed the press."""
-    from importlib import metadata
+    import mujoco
+    import warp
 
-    return {name: metadata.version(name) for name in ("biotac-mj", "mujoco", "warp-lang", "numpy")}
+    from . import __version__
+
+    return {"biotac-mj": __version__, "mujoco": mujoco.__version__, "warp-lang": warp.__version__, "numpy": np.__version__}
 
 
 def write_readings(record: PressRecord, path) -> None:

@@ -63,6 +63,9 @@ class Maker:
                 waiting.append(self._begin(batch, pool, bar))
                 if len(waiting) > 1:
                     written.append(self._end(waiting.pop(0), pool))
+                for one in written:  # a shard that could not be written stops the run now, not at its end
+                    if one.done():
+                        one.result()
             written += [self._end(one, pool) for one in waiting]
             for one in written:
                 one.result()
