@@ -131,7 +131,7 @@ class DevicePreconditioner:
             self._launch(sides.measure_along, self._chunks, [self.chunk, r, self._along, on], [self._part])
             self._by_block(small.sum_liquid, [self.nworld], [self._part, on, first], [self._W, self._u])
         if self.nworld <= FEW:
-            self._by_block(sides.small_rows, [self.nworld, self.capacity],
+            self._by_block(sides.small_rows, [self.nworld, 3 * self.capacity],
                            [self.liquid, inverse.half, inverse.rest, inverse.scale, self._free_nodes, self._free, self.node, self.size,
                             r, st, on],
                            [self._u, self._largest])  # fmt: skip

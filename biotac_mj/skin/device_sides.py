@@ -174,26 +174,24 @@ def small_rows(
     u_out: wp.array2d(dtype=float),
     largest_out: wp.array(dtype=float),
 ):
-    """What the residual does at the touching nodes, by their rows of the inverse: for few worlds."""
-    w, s, t = wp.tid()
+    """What the residual does at the touching nodes, by their rows of the inverse: for few worlds. A block of threads for each row."""
+    w, k, t = wp.tid()
     if on[w] == 0:
         return
-    if s == 0 and t == 0:
+    if k == 0 and t == 0:
         largest_out[w] = 0.0
+    s = k // 3
     if s >= size[w]:
         return
-    row = 3 * free_index[node[s, w]]
-    y = wp.vec3()
+    row = 3 * free_index[node[s, w]] + k % 3
+    y = float(0.0)
     for j in range(t, free.shape[0], wp.block_dim()):
         v = r[free[j], w]
-        for a in range(3):
-            for b in range(3):
-                y[a] += entry(inverse, rest, row + a, 3 * j + b) * v[b]
-    total = wp.tile_extract(wp.tile_sum(wp.tile(y, preserve_type=True)), 0)
+        for b in range(3):
+            y += entry(inverse, rest, row, 3 * j + b) * v[b]
+    total = wp.tile_extract(wp.tile_sum(wp.tile(y)), 0)
     if t == 0:
-        total = total * (scale * float(st.softness[w]))
-        for a in range(3):
-            u_out[w, has_liquid + 3 * s + a] = total[a]
+        u_out[w, has_liquid + k] = total * scale * float(st.softness[w])
 
 
 @wp.kernel
