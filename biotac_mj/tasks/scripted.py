@@ -90,11 +90,11 @@ class Explore(Scripted):
     task = "explore"
     places = 1e-3 * np.array([[0, 0], [3, 0], [-3, 0], [0, 3], [0, -3]])
     depth, clear = 0.9e-3, 0.7e-3
-    settle = 4  # frames at depth before the reading
+    settle, patience = 4, 25  # frames at depth before the reading; frames after which a stiff thing is taken as it is
 
     def reset(self):
         super().reset()
-        self.stage, self.first, self.count, self.felt_at = "search", None, 0, []
+        self.stage, self.first, self.count, self.pressed, self.felt_at = "search", None, 0, 0, []
         self.belief = np.zeros(len(OBJECTS))
 
     def act(self, observation, truth=None):
@@ -116,12 +116,13 @@ class Explore(Scripted):
         if self.stage == "done":
             return self._to(position, [0, 0, self.first + 2e-3])[0]
         place = self.places[len(self.felt_at)]
-        if self.stage in ("press", "hold"):
+        if self.stage == "press":
             motion, there = self._to(position, [*place, self.first - self.depth])
+            self.pressed += 1
             self.count = self.count + 1 if there else 0
-            if self.count >= self.settle:
+            if self.count >= self.settle or self.pressed >= self.patience:
                 self.felt_at.append(self.felt[0])
-                self.count, self.stage = 0, "lift"
+                self.count, self.pressed, self.stage = 0, 0, "lift"
                 if len(self.felt_at) == len(self.places):
                     self.stage = "done"
                     self.decide()
