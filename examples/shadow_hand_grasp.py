@@ -197,7 +197,7 @@ def targets(model, address, angle):
 
 
 def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress=True):
-    """Grasps and lifts. `frame(data)` is called 25 times a second.
+    """Grasps and lifts. `frame(data)` is called every 80 ms.
 
     Returns:
       dict: time (n,), height of the object (n,) [m], and per finger counts (n, 5, 19), pdc (n, 5), force (n, 5) [N]; model, data, handles.
@@ -218,6 +218,7 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
     hand = np.isfinite(way[0]) & (owner >= 0)
     mujoco.mj_forward(model, data)
     rest = np.array([h.read(data, "pdc")[0] for h in handles.values()])
+    thumb = np.array([f == "th" for f in FINGERS])
     closing, log = np.zeros(5), {key: [] for key in ("time", "height", "counts", "pdc", "force")}
     z, steps = model.actuator("z").id, round((CLOSE + SQUEEZE + LIFT + HOLD) / TIMESTEP)
     for i in tqdm(range(steps), desc=name, disable=not progress):
@@ -225,8 +226,8 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         if data.time < CLOSE:  # who feels the object waits for the others
             closing += np.where(pdc - rest < FELT, 0.7 * TIMESTEP / CLOSE, 0.0)
         else:  # then each presses until it feels its share, and goes on adjusting while the hand lifts
-            wanted = np.where([f == "th" for f in FINGERS], 2.2, 1.0) * GRIP
-            closing = np.clip(closing + TIMESTEP * np.clip(2.5 * (wanted - pdc + rest) / wanted, -0.5, 1.5), 0.0, 2.0)
+            wanted = np.where(thumb, 1.6, 1.0) * GRIP
+            closing = np.clip(closing + TIMESTEP * np.clip(2.5 * (wanted - pdc + rest) / wanted, -0.5, 1.5), 0.0, np.where(thumb, 1.3, 2.0))
         c = closing[owner]
         data.ctrl[hand] = (way[1] + np.where(c < 0.5, (1 - 2 * c) * (way[0] - way[1]), (2 * c - 1) * (way[2] - way[1])))[hand]
         data.ctrl[z] = touch[nj + 2] + height * np.clip((data.time - CLOSE - SQUEEZE) / LIFT, 0, 1)
@@ -237,7 +238,7 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         log["counts"].append([h.read(data, "electrodes") for h in handles.values()])
         log["pdc"].append(pdc - rest)
         log["force"].append([np.linalg.norm(h.read(data, "contact_force")[:3]) for h in handles.values()])
-        if frame is not None and i % round(0.04 / TIMESTEP) == 0:
+        if frame is not None and i % round(0.08 / TIMESTEP) == 0:
             frame(data)
     return {key: np.array(value) for key, value in log.items()} | {"model": model, "data": data, "handles": handles, "closing": closing}
 
@@ -289,7 +290,7 @@ def main(arguments=None):
 
         def frame(data):
             nonlocal screen
-            screen = screen or Offscreen(data.model, 480, 360, find_gl())
+            screen = screen or Offscreen(data.model, 360, 270, find_gl())
             frames.append(screen.render(data, camera()))
     else:
         frame = None
@@ -298,8 +299,8 @@ def main(arguments=None):
         from PIL import Image
 
         options.video.parent.mkdir(parents=True, exist_ok=True)
-        first, *rest = [Image.fromarray(f).quantize(96) for f in frames]
-        first.save(options.video, save_all=True, append_images=rest, duration=40, loop=0, optimize=True)
+        first, *rest = [Image.fromarray(f).quantize(64) for f in frames]
+        first.save(options.video, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
         screen.__exit__()
     if options.traces:
         draw_traces(result, options.traces, options.object)

@@ -227,6 +227,15 @@ def test_dm_controls_wrappers_and_viewer():
     assert picture.shape == (48, 64, 3) and picture.std() > 5
 
 
+def test_example_puts_it_on_an_existing_model(repo, capsys):
+    """The arm comes to rest on the table: the fingertip carries its 50 g and the BioTac's own 3.965 g."""
+    from test_examples import load as load_example
+
+    force, step = load_example(repo, "existing_model").main()
+    assert force[1] == pytest.approx((0.05 + 0.003965) * 9.81, rel=0.01)
+    assert step.observation["biotac/electrodes"].shape == (19,) and "force on the fingertip" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "call, text",
     [
