@@ -12,8 +12,10 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from biotac_mj import batch
+from biotac_mj.geometry import load_skin
 from biotac_mj.skin.material import material
 
 RADIUS, DT = 3.5e-3, 2e-3  # [m], [s]
@@ -35,6 +37,18 @@ def scene(skin):
     return spec.compile()
 
 
+def first_touch(skin, axis, outwards):
+    """How far from points (n, 3) of the finger's axis a sphere's centre is when it just touches the skin's nodes (n,) [m]."""
+    geometry = load_skin(skin) if isinstance(skin, str) else skin
+    nodes = cKDTree(geometry.vert[np.unique(geometry.outer_face)])
+    near, far = np.full(len(axis), 5e-3), np.full(len(axis), 25e-3)
+    for _ in range(20):
+        middle = 0.5 * (near + far)
+        inside = nodes.query(axis + middle[:, None] * outwards)[0] < RADIUS
+        near, far = np.where(inside, middle, near), np.where(inside, far, middle)
+    return far
+
+
 def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figure=None, seed=0):
     """Presses; returns dict of youngs_modulus (nworld,), depth (steps,), force (steps, nworld, 3), electrodes (steps, nworld, 19)."""
     rng = np.random.default_rng(seed)
@@ -42,7 +56,8 @@ def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figur
     youngs_modulus = rubber["youngs_modulus"] * rng.uniform(0.5, 1.5, nworld)
     along, angle = rng.uniform(-13e-3, -5e-3, nworld), rng.uniform(-0.5, 0.5, nworld)
     outwards = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], axis=1)
-    start = np.stack([along, 0 * along, 0 * along], axis=1) + (7e-3 + RADIUS) * outwards
+    start = np.stack([along, 0 * along, 0 * along], axis=1)
+    start += first_touch(skin, start, outwards)[:, None] * outwards
 
     mjm = scene(skin)
     with wp.ScopedDevice(device):
@@ -105,7 +120,7 @@ def draw(record, path, shown=200):
         color = colormaps["viridis"](colors[w])
         left.plot(1e3 * record["depth"], size[:, w], color=color, lw=0.7)
         right.plot(size[:, w], change[:, w], color=color, lw=0.7)
-    left.set(xlabel="way of the sphere [mm]", ylabel="force [N]", title=f"{size.shape[1]} presses, colour: Young's modulus")
+    left.set(xlabel="depth [mm]", ylabel="force [N]", title=f"{size.shape[1]} presses, colour: Young's modulus")
     right.set(xlabel="force [N]", ylabel="change of E17 [counts]", title="the electrode under the pad's middle")
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ import warp as wp
 
 import biotac_mj
 from biotac_mj import batch as batches
-from biotac_mj.geometry import SkinGeometry
+from biotac_mj.geometry import SkinGeometry, load_skin
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
 from biotac_mj.skin.material import material as preset
@@ -100,12 +100,27 @@ def read(mjm, d, channel):
     return d.sensordata.numpy()[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
 
 
-def places(nworld, seed=0):
-    """Random places under the pad where the sphere has not yet met it (nworld, 3) [m]."""
+def places(nworld, seed=0, geometry=None):
+    """Random places around the pad (nworld, 3) [m]: where the sphere touches a skin's first node; for the shell, a depth that it bears."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(-0.4, 0.4, nworld)
-    reach = 7.2e-3 + RADIUS
-    return np.stack([rng.uniform(-13e-3, -4e-3, nworld), -reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+    along = rng.uniform(-13e-3, -4e-3, nworld)
+    if geometry is None or geometry is shell():
+        reach = 7.2e-3 + RADIUS
+        return np.stack([along, -reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+    outer = geometry.vert[np.unique(geometry.outer_face)]
+    out = []
+    for x, a in zip(along, angle):
+        outwards = np.array([0, -np.cos(a), np.sin(a)])
+        near, far = 5e-3, 20e-3
+        for _ in range(20):
+            middle = 0.5 * (near + far)
+            if np.linalg.norm(outer - ([x, 0, 0] + middle * outwards), axis=1).min() < RADIUS:
+                near = middle
+            else:
+                far = middle
+        out.append([x, 0, 0] + far * outwards)
+    return np.array(out)
 
 
 def move(d, pos):
@@ -122,7 +137,7 @@ def press(m, d, start, steps, depth):
 
 
 def single(pos, skin, settings):
-    """Force (nstep, 6), electrodes and pdc of one world by the engine plugin over the poses pos (nstep, 3)."""
+    """Force (nstep, 6), electrodes, pdc and status of one world by the engine plugin over the poses pos (nstep, 3)."""
     spec = press_spec()
     handle = biotac_mj.attach(spec, skin=skin, **settings)
     model = spec.compile()
@@ -131,7 +146,7 @@ def single(pos, skin, settings):
     for p in pos:
         data.mocap_pos[0] = p.astype(np.float32)
         mujoco.mj_step(model, data)
-        rows.append(np.concatenate([handle.read(data, c) for c in ("contact_force", "electrodes", "pdc")]))
+        rows.append(np.concatenate([handle.read(data, c) for c in ("contact_force", "electrodes", "pdc", "status")]))
     return np.array(rows)
 
 
@@ -139,7 +154,7 @@ def compare_with_single_worlds(skin, nworld, steps, force_error, counts):
     rng = np.random.default_rng(1)
     base = preset("default")
     materials = [{**_fields(base), "youngs_modulus": e} for e in base.youngs_modulus * rng.uniform(0.6, 1.5, nworld)]
-    friction, depth, start = rng.uniform(0.2, 1.0, nworld), rng.uniform(0.8e-3, 1.6e-3, nworld), places(nworld)
+    friction, depth, start = rng.uniform(0.2, 1.0, nworld), rng.uniform(0.8e-3, 1.6e-3, nworld), places(nworld, geometry=skin)
     options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}}
     mjm, m, d, _ = make(
         press_spec(), nworld, skin=skin, material=materials, friction=friction, priority=1, options=options, readings={"noise": False}
@@ -150,16 +165,20 @@ def compare_with_single_worlds(skin, nworld, steps, force_error, counts):
         paths.append(d.mocap_pos.numpy()[:, 0].astype(float))
     got, paths = np.stack(rows, axis=1), np.stack(paths, axis=1)
     assert (read(mjm, d, "status")[:, 0] == 1).all()
-    worst = 0.0
+    worst, lost = 0.0, 0
     for w in range(nworld):
         settings = {"material": materials[w], "friction": friction[w], "priority": 1}
         options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}, "readings": {"noise": False}}
         expected = single(paths[w], skin, settings | {"options": options})
+        good = expected[:, 26] == 1  # where the CPU itself found the balance
+        lost += (~good).sum()
+        expected, mine = expected[good, :26], got[w, good]
         scale = np.linalg.norm(expected[:, :3], axis=1).max()
         assert scale > 0.2
-        np.testing.assert_allclose(got[w, :, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}")
-        np.testing.assert_allclose(got[w, :, 6:], expected[:, 6:], atol=counts, err_msg=f"world {w}")
-        worst = max(worst, np.abs(got[w, :, :3] - expected[:, :3]).max() / scale)
+        np.testing.assert_allclose(mine[:, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}")
+        np.testing.assert_allclose(mine[:, 6:], expected[:, 6:], atol=counts, err_msg=f"world {w}")
+        worst = max(worst, np.abs(mine[:, :3] - expected[:, :3]).max() / scale)
+    assert lost <= 0.05 * nworld * steps
     return worst
 
 
@@ -175,7 +194,8 @@ def test_each_world_is_the_single_simulation():
 
 @pytest.mark.slow
 def test_64_random_worlds_are_the_single_simulations():
-    print(f"largest force error {compare_with_single_worlds('coarse', 64, 25, force_error=0.01, counts=3):.1e}")
+    worst = compare_with_single_worlds(load_skin("coarse"), 64, 16, force_error=0.01, counts=3)
+    print(f"largest force error {worst:.1e}")
 
 
 def test_readings_are_those_of_the_single_sensor():
