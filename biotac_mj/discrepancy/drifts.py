@@ -86,7 +86,7 @@ class _Common(TimeShaped):
         if shape is None:
             return []
         late = line.loaded and (shape.kind == "step" or shape.onset > line.time[0])
-        if shape.nats < (30 if late else 12 if line.loaded else 8):
+        if shape.nats < (20 if late else 12 if line.loaded else 8):
             return []
         found = self._finding(session, line, pattern, shape, tuple(int(k) for k in line.used))
         if found.parameters["counts"][0] < max(1.0, 0.1 * np.median(line.noise) * 1000):
@@ -300,7 +300,7 @@ class GainChange(RecordedEffect):
         line = session.timeline()
         if not line.loaded:
             return []
-        best = None
+        best, alone = None, {}
         n = len(line.time)
         cuts = np.unique(np.linspace(0.04 * n, 0.96 * n, 48).astype(int))
         for k in _whole_electrodes(session, line):
@@ -319,6 +319,7 @@ class GainChange(RecordedEffect):
                 more = np.concatenate([base, through(np.stack([on, on * signal], axis=1))], axis=1)
                 rss0, _ = _least_squares(base, residual)
                 rss1, w = _least_squares(more, residual)
+                alone[k] = max(alone.get(k, 0.0), float(np.log(rss0 / rss1)))
                 if best is None or rss0 / rss1 > best[0]:
                     best = rss0 / rss1, k, start, stop, w, rss1, residual, signal, more
         if best is None:
@@ -327,7 +328,9 @@ class GainChange(RecordedEffect):
         neff = max(4.0, n / correlation_length(residual - more @ w))
         nats = 0.5 * neff * np.log(ratio) - 2 * np.log(neff) - np.log(19) - 3
         gain = float(w[2])
-        if nats < 20 or not 0.08 < abs(gain) < 1.2:
+        # Where the place of a contact bends the relations, several electrodes seem to change: a gain is one electrode's.
+        shared = max((v for i, v in alone.items() if i != k), default=0.0) > 0.6 * alone[k]
+        if nats < 25 or ratio < 1.6 or shared or not 0.08 < abs(gain) < 1.2:
             return []
         covariance = np.linalg.pinv(more.T @ more) * rss1 / n * n / neff
         half = 1.96 * float(np.sqrt(covariance[2, 2]))
@@ -337,7 +340,7 @@ class GainChange(RecordedEffect):
         channel = int(line.used[k])
         rest = float(np.median(line.value[:, k]))
         shift = float(w[1])
-        theta = {"gain": gain, "rest": rest, "start": first, "end": np.inf if whole else last, "shift": shift}
+        theta = {"ratio": ratio, "gain": gain, "rest": rest, "start": first, "end": np.inf if whole else last, "shift": shift}
         parameters = {"gain": (gain, gain - half, gain + half), "onset": (first, first - 2 * line.period, first + 2 * line.period)}
         note = f"its response to load changes by {gain:+.0%} against what the other electrodes say"
         return [Finding(self, (channel,), theta, parameters, nats, first, last, float(np.exp(-min(nats, 700))), note=note)]

@@ -110,7 +110,8 @@ def _search(session, effects, bar):
         if len(alike) >= 2 and chosen.theta.get("kind") in ("step", "pulse"):
             # One jump is an event, jumps again and again are a behaviour that no effect here describes.
             session.give_up(
-                alike, f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} goes up and down again and again"
+                alike,
+                f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} goes up and down again and again",
             )
             break
         session.accept(chosen)
@@ -130,9 +131,13 @@ def _choose(session, candidates):
         return None
     best = max(candidates, key=lambda f: f.nats)
     common = [f for f in candidates if f.id in _COMMON]
-    if common and not session.timeline().loaded and max(f.nats for f in common) > 0.3 * best.nats:
+    if common and not session.timeline().loaded:
         best = max(common, key=lambda f: f.nats)  # its pattern was checked electrode by electrode
     # A change of one electrode leaks into the common pattern and the other way round; the matched one has more energy.
+    if session.timeline().loaded and common and best.id in ("drift", "gain"):
+        rival = max(common, key=lambda f: f.nats)
+        if best.id == "gain" or _energy(session, rival) > _energy(session, best):
+            best = rival if rival.nats > 0.4 * best.nats else best
     if best.id in _COMMON:
         single = [f for f in candidates if f.id == "drift" and f.nats > 0.7 * best.nats]
         if session.timeline().loaded and single and _energy(session, single[0]) > _energy(session, best):
@@ -204,6 +209,8 @@ def _late(session, effects):
             candidates = [f for f in candidates if f.theta.get("kind") not in ("step", "pulse")]
         if any(f.id in _COMMON for f in session.findings):
             candidates = [f for f in candidates if f.id not in _COMMON or f.nats > 40]
+        if whole.timeline().loaded:  # nothing is left to confirm them, so they must be plain
+            candidates = [f for f in candidates if f.id not in ("gain", "drift") or f.nats > 80]
         candidates = [f for f in candidates if f.start >= begin - 0.02 * session.recording.time[-1]]
         chosen = _choose(whole, [f for f in candidates if f.id != "hum"]) or (candidates[0] if candidates else None)
         if chosen is None:

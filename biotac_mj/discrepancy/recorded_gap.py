@@ -69,7 +69,8 @@ def _compare(finding, without, both):
         share = float(flags[rows].any(1).mean()) if flags is not None else np.nan
         return {"name": "share of rows affected", "unit": "1", "before": share, "after": 0.0, "part": place}, None if not active else True
     before, after = values
-    verified = None if not active else bool(after < before)
+    # Under load the others predict an electrode to some per cent: a gain must do better than chance improvements.
+    verified = None if not active else bool(after < (0.92 if effect.id == "gain" else 1.0) * before)
     return {"name": name, "unit": unit, "before": before, "after": after, "part": place}, verified
 
 

@@ -12,7 +12,6 @@ from .drifts import TimeShaped
 from .plain import EFFECTS, RecordingDiagnosis
 from .recorded_effect import STAGES
 from .recorded_gap import _line
-from .recording import log_impedance
 
 __all__ = ["summary", "verdict_dict", "write_report"]
 
