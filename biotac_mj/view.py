@@ -36,12 +36,7 @@ def build_scene(skin="default", **attach_options):
     spec.option.timestep = 4e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
-    spec.visual.headlight.ambient[:] = 0.3
-    sky = spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384
-    )
-    sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
-    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
+    _light(spec)
     ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
     ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
     for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
@@ -53,6 +48,16 @@ def build_scene(skin="default", **attach_options):
     handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
     see_through(spec, handle)
     return spec, handle
+
+
+def _light(spec):
+    """Sky and light."""
+    spec.visual.headlight.ambient[:] = 0.3
+    sky = spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384
+    )
+    sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
+    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
 
 
 def build_hand(path, skin="coarse", **attach_options):
@@ -77,8 +82,8 @@ def build_hand(path, skin="coarse", **attach_options):
         raise FileNotFoundError(f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand")
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.visual.headlight.ambient[:] = 0.3
-    ball = spec.worldbody.add_body(name="ball", pos=[0.425, 0.0, 0.06])
+    _light(spec)
+    ball = spec.worldbody.add_body(name="ball", pos=[0.41, 0.0, 0.05])
     ball.add_freejoint(name="ball")
     ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[0.85, 0.45, 0.15, 1])
     return spec, attach_to_hand(spec, "shadow_hand", skin=skin, **attach_options)
