@@ -133,7 +133,7 @@ def _used(device) -> int:
     return wp.get_mempool_used_mem_current(device) + torch.cuda.memory_allocated(wp.device_to_torch(wp.get_device(device)))
 
 
-def _per_world(model, worlds, path) -> float:
+def _per_world(model, worlds) -> float:
     """Device memory [bytes] of a world in a batch."""
     if not model.device.is_cuda:
         return 0.0
@@ -163,11 +163,11 @@ def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int
     row |= {"setup_s": setup, "mb_model": memory / 1e6, "mb_per_world": None, "increments": increments}
     if device != "cpu":
         total = wp.get_device(device).total_memory
-        per_world = _per_world(model, min(worlds, 16), path)
+        per_world = _per_world(model, min(worlds, 32))
         if memory + per_world * worlds > 0.95 * total:
             note = f"does not fit: {(memory + per_world * worlds) / 1e9:.0f} GB of {total / 1e9:.0f}"
             return row | {"note": note, "mb_per_world": per_world / 1e6}
-        per_world = _per_world(model, worlds, path)
+        per_world = _per_world(model, worlds)
         row |= {"mb_per_world": per_world / 1e6, "largest_nworld": int((0.95 * total - memory) / per_world)}
     press(model, path[:2], worlds)  # compiles
     force, seconds, lost = press(model, path, worlds)

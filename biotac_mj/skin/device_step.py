@@ -22,7 +22,6 @@ from . import device_krylov as krylov
 from . import device_liquid as liquid
 from . import device_nodes as nodes
 from . import device_worlds as worlds
-from .contact import depth_in_core  # noqa: F401 - loads the module of the geoms' struct
 from .device_elasticity import device_elements
 from .device_preconditioner import FEW, DevicePreconditioner
 from .types import mat33, real, vec3
@@ -123,10 +122,10 @@ class DeviceStep:
 
     def run(self):
         """One step, on the current stream."""
+        self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # its outputs are now the data's
         if not self.m.device.is_cuda:
             self.record()
             return
-        self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # its outputs are now the data's
         if self._graph is None:
             with wp.ScopedCapture(self.m.device) as capture:
                 self.record()
