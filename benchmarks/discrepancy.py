@@ -2,7 +2,8 @@
 
     python benchmarks/discrepancy.py --seeds practice --kinds none single --count 1 --json out/discrepancy.json
 
-Every case is drawn, measured by `discrepancy_generator` and sealed (a hash of the truth is printed before its verdict); run again, it goes on
+Every case is drawn, measured by `discrepancy_generator` and sealed (a hash of the truth is printed before its verdict); run again, it
+goes on
 where it stopped. Beside the verdicts stand two baselines: least RMS in sample, and BIC with samples taken as independent.
 """
 
@@ -108,8 +109,8 @@ def main(argv=None):
         least, bic = ("", "") if args.no_baselines else baselines(report.comparison, report.selection)
         rows.append(
             {
-                "case": name, "kind": kind, "seeds": args.seeds, "thresholds": threshold_hash(), "seal": seal, "verdict": report.verdict, "named": named,
-                "ties": ties, "truth": [e for e, _ in effects], "sizes": [s for _, s in effects], "settings": settings, "closed": report.closed,
+                "case": name, "kind": kind, "seeds": args.seeds, "thresholds": threshold_hash(), "seal": seal, "verdict": report.verdict, "named": named,  # noqa: E501
+                "ties": ties, "truth": [e for e, _ in effects], "sizes": [s for _, s in effects], "settings": settings, "closed": report.closed,  # noqa: E501
                 "nats": report.ranking[0][1] if report.ranking else 0.0, "confidence": [e["confidence"] for e in report.effects],
                 "least_rms": least, "bic": bic,
             }
@@ -139,7 +140,7 @@ def table(rows) -> str:
         lines.append(f"top-1, single effects: {sum(r['named'][:1] == r['truth'] for r in single)}/{len(single)}")
         lines.append(f"  of them 10 nats per trajectory: {sum(r['named'][:1] == r['truth'] for r in strong)}/{len(strong)}")
         lines.append(
-            f"  baseline least RMS: {sum([r['least_rms']] == r['truth'] for r in single)}/{len(single)}, BIC: {sum([r['bic']] == r['truth'] for r in single)}/{len(single)}"
+            f"  baseline least RMS: {sum([r['least_rms']] == r['truth'] for r in single)}/{len(single)}, BIC: {sum([r['bic']] == r['truth'] for r in single)}/{len(single)}"  # noqa: E501
         )
         closed = [r["closed"] for r in single if r["closed"] == r["closed"] and r["named"]]
         lines.append(f"  gap closed on trajectories kept aside, median: {np.median(closed):.0%}" if closed else "  nothing named")
@@ -147,7 +148,7 @@ def table(rows) -> str:
         if by[kind]:
             named = sum(bool(r["named"]) for r in by[kind])
             lines.append(
-                f"{kind}: named something {named}/{len(by[kind])}; BIC {sum(r['bic'] not in ('none', '') for r in by[kind])}, least RMS always"
+                f"{kind}: named something {named}/{len(by[kind])}; BIC {sum(r['bic'] not in ('none', '') for r in by[kind])}, least RMS always"  # noqa: E501
             )
     if by["outside"]:
         lines.append(f"outside the catalogue: abstained {sum('unknown' in r['verdict'] for r in by['outside'])}/{len(by['outside'])}")

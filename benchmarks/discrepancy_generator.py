@@ -1,7 +1,8 @@
 """Measured data with a hidden effect, for the blind benchmark of `biotac_mj.discrepancy` - which nothing here imports.
 
 The skin and film are the project's, solved on a mesh of the generator's choice with its own way through the poses; every effect is written
-anew, in another form than the catalogue's (Euler integration instead of closed recursions, two time constants where one is fitted, a second-order filter,
+anew, in another form than the catalogue's (Euler integration instead of closed recursions, two time constants where one is fitted, a
+second-order filter,
 nearest neighbours instead of a kernel, tanh instead of a bent line, Dahl's law instead of a play operator).
 """
 
@@ -10,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 __all__ = ["HIDDEN", "OUTSIDE", "Generator", "plan"]
 
-_E_NEAR = {0: (1, 3, 7), 1: (0, 2, 3, 16), 2: (1, 4, 16, 17), 3: (0, 1, 2, 4), 4: (2, 3, 5, 17), 5: (3, 4, 18), 6: (7, 8, 9), 7: (0, 6, 9), 8: (6, 9, 10),
-           9: (6, 7, 8, 16), 10: (8, 11, 13), 11: (10, 12, 13, 16), 12: (11, 14, 16, 17), 13: (10, 11, 12, 14), 14: (12, 13, 15, 17), 15: (13, 14, 18),
+_E_NEAR = {0: (1, 3, 7), 1: (0, 2, 3, 16), 2: (1, 4, 16, 17), 3: (0, 1, 2, 4), 4: (2, 3, 5, 17), 5: (3, 4, 18), 6: (7, 8, 9), 7: (0, 6, 9), 8: (6, 9, 10),  # noqa: E501
+           9: (6, 7, 8, 16), 10: (8, 11, 13), 11: (10, 12, 13, 16), 12: (11, 14, 16, 17), 13: (10, 11, 12, 14), 14: (12, 13, 15, 17), 15: (13, 14, 18),  # noqa: E501
            16: (1, 9, 11, 17), 17: (4, 14, 16, 18), 18: (5, 15, 17)}  # fmt: skip
 
 
 def plan(seed, count, skin="coarse"):
-    """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,); press, hold, sometimes slide, unload."""
+    """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,); press, hold, sometimes slide,
+    unload."""
     from biotac_mj import approach
     from biotac_mj.geometry import load_skin
 
@@ -107,7 +109,7 @@ class Generator:
             for _ in range(4 if s.compliance else 1):
                 s.force, s.pressure, s.impedance = self.skin(one, pos, s.radius)
                 if s.compliance:
-                    pos = one["pos"] + s.offset - 0.8 * s.compliance * np.outer(np.maximum(-s.force @ one["heading"], 0), one["heading"]) + 0.2 * (
+                    pos = one["pos"] + s.offset - 0.8 * s.compliance * np.outer(np.maximum(-s.force @ one["heading"], 0), one["heading"]) + 0.2 * (  # noqa: E501
                         pos - one["pos"] - s.offset)  # fmt: skip
             s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
             s.rest = s.impedance[0]
@@ -253,12 +255,12 @@ def _leak(s, size):
 _BEFORE = {"radius": _set("radius"), "mount": _set("compliance"), "depth0": _set("depth0"), "misalign": _set("misalign")}
 _LOAD = {"relax": _relax, "hyster": _hyster, "stiffen": _stiffen, "mullins": _mullins, "adhesion": _adhesion, "fluidloss": _fluidloss,
          "warmup": _warmup, "asper": _asper}  # fmt: skip
-_READ = {"gain": _gain, "crosstalk": _crosstalk, "saturate": _saturate, "lowpass": _lowpass, "latency": _latency, "drift": _drift, "ripple": _ripple,
+_READ = {"gain": _gain, "crosstalk": _crosstalk, "saturate": _saturate, "lowpass": _lowpass, "latency": _latency, "drift": _drift, "ripple": _ripple,  # noqa: E501
          "leak": _leak}  # fmt: skip
 # Smallest and largest size of each hidden effect.
 HIDDEN = {
-    "relax": (0.15, 0.4), "hyster": (0.08, 0.25), "stiffen": (0.2, 0.5), "mullins": (0.2, 0.4), "adhesion": (0.06, 0.15), "fluidloss": (0.03, 0.1),
-    "warmup": (0.06, 0.25), "asper": (0.15, 0.4), "gain": (0.1, 0.25), "crosstalk": (0.06, 0.15), "saturate": (150, 400), "lowpass": (0.04, 0.15),
-    "latency": (0.03, 0.1), "drift": (4, 15), "radius": (0.12, 0.25), "mount": (4e-5, 12e-5), "depth0": (6e-5, 15e-5), "misalign": (1.5e-4, 4e-4),
+    "relax": (0.15, 0.4), "hyster": (0.08, 0.25), "stiffen": (0.2, 0.5), "mullins": (0.2, 0.4), "adhesion": (0.06, 0.15), "fluidloss": (0.03, 0.1),  # noqa: E501
+    "warmup": (0.06, 0.25), "asper": (0.15, 0.4), "gain": (0.1, 0.25), "crosstalk": (0.06, 0.15), "saturate": (150, 400), "lowpass": (0.04, 0.15),  # noqa: E501
+    "latency": (0.03, 0.1), "drift": (4, 15), "radius": (0.12, 0.25), "mount": (4e-5, 12e-5), "depth0": (6e-5, 15e-5), "misalign": (1.5e-4, 4e-4),  # noqa: E501
 }  # fmt: skip
 OUTSIDE = {"ripple": (20, 60), "leak": (40, 120)}

@@ -2,7 +2,8 @@
 
     python examples/find_the_missing_effect.py --seed 3 --out out/missing.png
 
-The "measurement" is synthetic: the condensed skin with one effect that the seed chooses, another modulus, slips of the pose, noise and 12 bits.
+The "measurement" is synthetic: the condensed skin with one effect that the seed chooses, another modulus, slips of the pose, noise and 12
+bits.
 Everything that is fitted starts from raw counts and newtons.
 """
 
@@ -41,7 +42,7 @@ def presses(count, seed):
         t = np.concatenate([[0], np.cumsum(t)])
         mat = Rotation.align_vectors([-normal], [[0.0, 1.0, 0.0]])[0].as_matrix()
         n = len(t)
-        out.append(Trajectory(f"press {i}", ["sphere_7mm", "sphere_14mm"][i % 2], clock, t, point - np.outer(d, normal), np.tile(mat, (n, 1, 1)),
+        out.append(Trajectory(f"press {i}", ["sphere_7mm", "sphere_14mm"][i % 2], clock, t, point - np.outer(d, normal), np.tile(mat, (n, 1, 1)),  # noqa: E501
                               np.full((n, 19), 2000.0), np.full(n, 2000.0), None, np.zeros((n, 3))))  # fmt: skip
         clock += t[-1] + 5
     return out

@@ -367,7 +367,7 @@ class ForceZero(Effect):
 
 CATALOGUE = (
     Relaxation(), PowerCreep(), Hysteresis(), Mullins(), Stiffening(), Inhomogeneity(), Bubble(), FluidLoss(), Friction(), FrictionLoad(),
-    Adhesion(), Radius(), Misalignment(), DepthZero(), Mount(), Rocking(), Thermal(), WarmUp(), Asperities(), Gain(), CrossTalk(), Saturation(),
+    Adhesion(), Radius(), Misalignment(), DepthZero(), Mount(), Rocking(), Thermal(), WarmUp(), Asperities(), Gain(), CrossTalk(), Saturation(),  # noqa: E501
     LowPass(), Latency(), Drift(), PressureGain(), ForceZero(),
 )  # fmt: skip
 

@@ -395,7 +395,7 @@ class Thermal(_Common):
         theta = {"slope": float(w[1]), "lag": lag, "temperature": temperature, "rate": recording.rate, "reference": float(temperature[0]),
                  "pattern": np.ones(19)}  # fmt: skip
         parameters = {"slope": (float(w[1]), float(w[1] - half), float(w[1] + half)), "lag": (lag, np.nan, np.nan)}
-        return [Finding(self, tuple(int(k) for k in line.used), theta, parameters, nats, 0.0, float(recording.time[-1]), float(np.exp(-min(nats, 700))),
+        return [Finding(self, tuple(int(k) for k in line.used), theta, parameters, nats, 0.0, float(recording.time[-1]), float(np.exp(-min(nats, 700))),  # noqa: E501
                         ties=("warmup",), note="the common change follows TDC")]  # fmt: skip
 
     @staticmethod

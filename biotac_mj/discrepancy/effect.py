@@ -2,16 +2,16 @@
 
 Your own in ten lines:
 
-    class Sag(Effect):
-        id, name, stage = "sag", "sagging arm", "S"
-        physics = "the arm sinks while the session lasts"
-        params = {"rate": Param("m/s", -1e-6, 1e-6, "my robot's manual", scale=2e-7)}
-        confusable = {"depth0": "repeat the first trajectory at the end"}
+    class HalfBoard(Effect):
+        id, name, stage = "half_board", "one half of the multiplexer creeps", "A"
+        physics = "the reference of every other electrode creeps while the session lasts"
+        params = {"rate": Param("counts/s", -5, 5, "my own board", scale=0.1)}
+        confusable = {"warmup": "one half of the electrodes or all"}
 
         def apply(self, run, theta):
-            run.offset += theta["rate"] * run.clock[:, None] * run.heading
+            run.counts[:, ::2] += theta["rate"] * run.clock[:, None]
 
-    diagnose(sim, data, effects=[*CATALOGUE, Sag()])
+    diagnose(sim, data, effects=[*CATALOGUE, HalfBoard()])
 """
 
 import dataclasses
@@ -83,7 +83,8 @@ class Run:
 
 
 class Effect:
-    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values of shape parameters) and `apply`.
+    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values of shape parameters) and
+    `apply`.
 
     apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no effect) at `Param.start`.
     """

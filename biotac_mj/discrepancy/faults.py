@@ -52,7 +52,7 @@ class Stuck(RecordedEffect):
                 Finding(
                     self, (k,), {"mask": mask, "value": value}, {"value": (value, value, value)},
                     -total * np.log(max(p, 0.02)), (first + long[0][0]) / rate, (first + long[-1][0] + long[-1][1]) / rate,
-                    p=float(max(p, 0.02) ** min(n, 200)), note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",
+                    p=float(max(p, 0.02) ** min(n, 200)), note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",  # noqa: E501
                 )
             )  # fmt: skip
         return found
@@ -132,7 +132,7 @@ class Saturate(RecordedEffect):
                 Finding(
                     self, channels, {"level": float(level), "side": side}, {"level": (float(level), level - 0.5, level + 0.5)},
                     min(mass * np.log(mass / expected), 1e4), at[0] / session.recording.rate, at[-1] / session.recording.rate, p=0.0,
-                    note=f"{np.mean([g[1] for g in group]):.1%} of the samples lie on {level}, the {'largest' if side > 0 else 'smallest'} value",
+                    note=f"{np.mean([g[1] for g in group]):.1%} of the samples lie on {level}, the {'largest' if side > 0 else 'smallest'} value",  # noqa: E501
                 )
             )  # fmt: skip
         return found
@@ -305,8 +305,8 @@ class Swap(RecordedEffect):
         onset = self._onset(z, t, a, b, cut, late, line)
         start, end = (onset, float(session.recording.time[-1])) if late else (0.0, onset)
         channels = tuple(int(line.used[i]) for i in (a, b))
-        return Finding(self, channels, {"start": start, "end": end + (1 if late else 0)}, {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},
-                       gain, start, end, 0.0, note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}")  # fmt: skip
+        return Finding(self, channels, {"start": start, "end": end + (1 if late else 0)}, {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},  # noqa: E501
+                       gain, start, end, 0.0, note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}")  # fmt: skip  # noqa: E501
 
     @staticmethod
     def _onset(z, t, a, b, cut, late, line):

@@ -80,9 +80,7 @@ def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
     x = np.concatenate([nuisance, x0])
     bounds = (np.concatenate([[-1.5, -1.5], low]), np.concatenate([[1.5, 1.5], high]))
     prior = np.array([2.5 if not e.params[n].shape else 1.0 for i, (eid, n) in enumerate(names) for e, _ in effects if e.id == eid])
-    centre = np.array(
-        [0.0 if not _param(effects, nm).shape else np.log(dict((e.id, th) for e, th in effects)[nm[0]][nm[1]]) for nm in names]
-    )
+    centre = np.array([0.0 if not _param(effects, nm).shape else np.log({e.id: th for e, th in effects}[nm[0]][nm[1]]) for nm in names])
 
     def unpack(v):
         filled = [(e, dict(th)) for e, th in effects]
@@ -116,7 +114,7 @@ def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
     n = len(keep)
     sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
     covariance = np.maximum(np.diag(sandwich)[2:], np.diag(bread)[2:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)))
-    jacobian = np.array([1.0 if not _param(effects, nm).shape else dict((e.id, th) for e, th in filled)[nm[0]][nm[1]] for nm in names])
+    jacobian = np.array([1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]] for nm in names])
     covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
     return Fit(filled, log_modulus, log_friction, names, covariance, float(out.cost))
 

@@ -1,6 +1,7 @@
 """Effects between force and electrodes: latency, low-pass, relaxation after a load change, hysteresis.
 
-Force is regressed on the electrodes (they know the place of the contact, force alone does not), ridge, cross-validated by contiguous blocks of
+Force is regressed on the electrodes (they know the place of the contact, force alone does not), ridge, cross-validated by contiguous
+blocks of
 time. An effect is a change of the force that the electrodes follow; it is judged by the logarithm of each block's error, block by block.
 """
 
@@ -113,7 +114,7 @@ class Latency(ForceEffect):
             return []
         theta = {"delay": exact / rate, "start": 0.0, "end": np.inf}
         found = Finding(self, tuple(range(19)), theta, {"delay": (exact / rate, low / rate, high / rate)}, _nats(gain, session),
-                        0.0, float(session.recording.time[-1]), p, note=f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks")  # fmt: skip
+                        0.0, float(session.recording.time[-1]), p, note=f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks")  # fmt: skip  # noqa: E501
         found.theta["gain"] = gain
         part = _segment(delays, score)
         if part is not None:
@@ -172,7 +173,7 @@ class LoadLowPass(ForceEffect):
         low, high = np.exp(np.quantile(draws, [0.025, 0.975]))
         tau = float(np.exp(log_tau))
         found = Finding(self, tuple(range(19)), {"tau": tau, "gain": gain}, {"tau": (tau, low, high)}, _nats(gain, session), 0.0,
-                        float(session.recording.time[-1]), p, note=f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks")  # fmt: skip
+                        float(session.recording.time[-1]), p, note=f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks")  # fmt: skip  # noqa: E501
         return [found]
 
     def see(self, force, rate, theta):
@@ -224,7 +225,7 @@ class Relaxation(ForceEffect):
             return []
         found = Finding(self, tuple(range(19)), {"fraction": g, "tau": tau, "gain": gain},
                         {"fraction": (g, g - half, g + half), "tau": (tau, tau / 1.6, tau * 1.6)}, _nats(gain, session), 0.0,
-                        float(session.recording.time[-1]), p, note=f"force {'overshoots' if g > 0 else 'lags'} what the electrodes say and comes back")  # fmt: skip
+                        float(session.recording.time[-1]), p, note=f"force {'overshoots' if g > 0 else 'lags'} what the electrodes say and comes back")  # fmt: skip  # noqa: E501
         return [found]
 
     def see(self, force, rate, theta):
@@ -271,8 +272,8 @@ class Hysteresis(ForceEffect):
         if abs(eta) < half or abs(eta) < 0.03:
             return []
         theta = {"fraction": eta, "width": width, "gain": gain}
-        return [Finding(self, tuple(range(19)), theta, {"fraction": (eta, eta - half, eta + half), "width": (float(np.median(width)), np.nan, np.nan)},
-                        _nats(gain, session), 0.0, float(session.recording.time[-1]), p, note="the loop between loading and unloading does not depend on speed")]  # fmt: skip
+        return [Finding(self, tuple(range(19)), theta, {"fraction": (eta, eta - half, eta + half), "width": (float(np.median(width)), np.nan, np.nan)},  # noqa: E501
+                        _nats(gain, session), 0.0, float(session.recording.time[-1]), p, note="the loop between loading and unloading does not depend on speed")]  # fmt: skip  # noqa: E501
 
     def see(self, force, rate, theta):
         return force - theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])

@@ -214,7 +214,8 @@ class CrossTalk(RecordedEffect):
 
     @staticmethod
     def _correlation(session, rows=None, share=None):
-        """Correlation (19, 19) of fifth differences in the quietest share of windows of 40 rows, and how many independent samples made it."""
+        """Correlation (19, 19) of fifth differences in the quietest share of windows of 40 rows, and how many independent samples made
+        it."""
         recording = session.recording
         share = (0.3 if session.timeline().loaded else 1.0) if share is None else share
         where = np.flatnonzero((session.fit if rows is None else rows) & ~recording.repeated)
@@ -386,7 +387,7 @@ class Noise(RecordedEffect):
                 own = float(np.median(excess[(edges[:-1] >= start - 1e-9) & (edges[1:] <= end + 1e-9)]))
             n = len(cuts) * 60
             nats = min(0.1 * n * np.log(own) ** 2, 1e4)
-            found.append(Finding(self, (int(k),), {}, {"factor": (float(own), np.nan, np.nan)}, nats, start, end, float(np.exp(-min(nats, 700))),
+            found.append(Finding(self, (int(k),), {}, {"factor": (float(own), np.nan, np.nan)}, nats, start, end, float(np.exp(-min(nats, 700))),  # noqa: E501
                                  note=f"{own:.1f} times as noisy as the other electrodes' law"))  # fmt: skip
         return found
 

@@ -262,7 +262,7 @@ def _notes(result):
         notes.append("no TDC: a change with temperature cannot be told from one with time; give --tdc, or switch the heater off and on")
     if line.loaded:
         notes.append(
-            "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole record cannot be told from its calibration"
+            "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole record cannot be told from its calibration"  # noqa: E501
         )
         if r.force is not None and not (np.linalg.norm(r.force, axis=1) < 0.1).any():
             notes.append("no free segment: the rest values cannot be checked; leave the sensor untouched at both ends")
@@ -270,7 +270,7 @@ def _notes(result):
         notes.append("the sensor is not loaded: gains, saturation and cross-talk of signals cannot be known; press it")
     if r.rest_correlation < 0.5:
         notes.append(
-            f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published sensors (0.9 among them): check the channels' order"
+            f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published sensors (0.9 among them): check the channels' order"  # noqa: E501
         )
     return notes
 

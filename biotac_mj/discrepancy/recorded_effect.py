@@ -63,7 +63,8 @@ class Finding:
 class RecordedEffect:
     """One effect that recordings alone can show.
 
-    Subclasses set id, name, stage (of STAGES), physics, params (name -> Parameter) and confusable (id -> what would tell them apart) and write
+    Subclasses set id, name, stage (of STAGES), physics, params (name -> Parameter) and confusable (id -> what would tell them apart) and
+    write
 
       find(session) -> list of Finding: on the rows `session.fit` only;
       apply(counts, time, channels, theta): counts (n, 19) as the effect changes them;

@@ -251,12 +251,15 @@ def _page(d, figures):
     left = esc(d.remainder["text"]) + ("<br>" + esc(d.remainder["force"]["text"]) if d.remainder.get("force") else "")
     pictures = "".join(f'<img src="{name}" style="max-width:100%">' for name in figures)
     return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
-<style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}table{{border-collapse:collapse;width:100%;font-size:13px}}
+<style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}
+table{{border-collapse:collapse;width:100%;font-size:13px}}
 td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
-<p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])}; the last {d.locked:.0%} took no part in the fits.</p>
+<p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
+the last {d.locked:.0%} took no part in the fits.</p>
 <h2>1. What was found and added</h2>
-<table><tr><th>effect</th><th>stage</th><th>electrodes</th><th>when</th><th>parameters (95 %)</th><th>confidence</th><th>not distinguished from</th><th>proof</th></tr>
+<table><tr><th>effect</th><th>stage</th><th>electrodes</th><th>when</th><th>parameters (95 %)</th><th>confidence</th>
+<th>not distinguished from</th><th>proof</th></tr>
 {effects}</table>
 <h2>2. Where the unamended recording departs</h2><p>{len(d.where)} cells of channel x tenth of the record, family-wise 5 %.</p>
 <table><tr><th>channel</th><th>when</th><th>counts</th><th>p</th></tr>{cells}</table>

@@ -15,7 +15,8 @@ _PARTS = 10
 
 
 def cells(session) -> list:
-    """Cells (channel or "all together") x tenth of the record in which the unamended recording departs from its own level, family-wise 5 %."""
+    """Cells (channel or "all together") x tenth of the record in which the unamended recording departs from its own level, family-wise 5
+    %."""
     raw = Session(session.recording, session.fit)
     raw.masked = session.masked
     line, deviation, inside = _line(raw)
@@ -114,7 +115,7 @@ def _loaded(line, deviation, slope):
         if (odd[2:] & odd[1:-1] & odd[:-2]).any():
             where = np.flatnonzero(odd)
             start, end = line.time[parts[where[0]][0]], line.time[parts[where[-1]][-1]]
-            guilty.append((size[odd].max() * slope[k], f"e{line.used[k] + 1} departs from the other electrodes by {size[odd].max() * slope[k]:.0f} counts"
+            guilty.append((size[odd].max() * slope[k], f"e{line.used[k] + 1} departs from the other electrodes by {size[odd].max() * slope[k]:.0f} counts"  # noqa: E501
                            f" from {start:.0f} s to {end:.0f} s"))  # fmt: skip
     guilty.sort(reverse=True)
     text = "; ".join(g[1] for g in guilty[:3])

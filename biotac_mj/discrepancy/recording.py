@@ -45,7 +45,7 @@ class Recording:
             raise ValueError(f"{len(e)} rows are too few to fit on one part and check on another: record at least {MIN_ROWS}")
         if e.min() < 0 or e.max() > FULL_SCALE:
             raise ValueError(
-                f"electrodes reach from {e.min():g} to {e.max():g}, raw counts are 0..4095: give the raw values, not tared, scaled or in ohm"
+                f"electrodes reach from {e.min():g} to {e.max():g}, raw counts are 0..4095: give the raw values, not tared, scaled or in ohm"  # noqa: E501
             )
         if e.max() <= 8:
             raise ValueError(

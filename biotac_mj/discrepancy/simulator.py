@@ -75,7 +75,7 @@ class Simulator:
                 radius *= np.exp(grow)
                 tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
             key = hashlib.sha256(
-                repr((self.skin, self.tier, self.material, self.sensor, tool, round(log_friction, 9), round(bubble * 1e12, 6), "v2")).encode()
+                repr((self.skin, self.tier, self.material, self.sensor, tool, round(log_friction, 9), round(bubble * 1e12, 6), "v2")).encode()  # noqa: E501
                 + np.round(pos, 9).tobytes() + np.round(t.mat, 9).tobytes()
             ).hexdigest()[:24]  # fmt: skip
             path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"

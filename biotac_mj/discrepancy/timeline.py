@@ -1,7 +1,8 @@
 """How 19 electrodes move together: time bins, the load's covariance, and the amplitude of a pattern over time.
 
 ln Z of all electrodes moves on few dimensions while the skin is loaded. The covariance S of *fast* changes (within a few seconds) knows
-these and the noise, and hardly any drift. For a pattern p the amplitude a(t) = p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the load
+these and the noise, and hardly any drift. For a pattern p the amplitude a(t) = p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the
+load
 disturbs least (the minimum-variance filter, Capon, Proc. IEEE 57, 1969). With p = e_k it is the residual of predicting electrode k from the
 other 18, with p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain average: one formula for both.
 """

@@ -19,7 +19,8 @@ class Trajectory:
     Attributes:
       id: unique. tool: as `biotac generate --objects` names it. clock: when it began in the session [s].
       time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
-      electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None. force: (n, 3) of the skin on the object [N] or None.
+      electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None. force: (n, 3) of the skin on the object [N] or
+      None.
     """
 
     id: str
@@ -53,7 +54,7 @@ class Trajectory:
             raise ValueError(f"the time of trajectory {self.id!r} does not increase: sort its rows and drop repeated ones")
         if step.max() > 100 * np.median(step):
             raise ValueError(
-                f"the clock of trajectory {self.id!r} has a gap of {step.max():.3g} s where rows are {np.median(step):.3g} s apart: cut it in two "
+                f"the clock of trajectory {self.id!r} has a gap of {step.max():.3g} s where rows are {np.median(step):.3g} s apart: cut it in two "  # noqa: E501
                 "there; what happened meanwhile cannot be guessed"
             )
         if np.abs(self.pos).max() > 0.5:
@@ -62,7 +63,7 @@ class Trajectory:
             )
         if self.electrodes.min() < 0 or self.electrodes.max() > 4095 or self.electrodes.max() <= 8:
             raise ValueError(
-                f"electrodes of trajectory {self.id!r} lie in {self.electrodes.min():g}..{self.electrodes.max():g}: raw counts 0..4095 are needed"
+                f"electrodes of trajectory {self.id!r} lie in {self.electrodes.min():g}..{self.electrodes.max():g}: raw counts 0..4095 are needed"  # noqa: E501
             )
         if self.force is not None and np.abs(self.force).max() > 500:
             raise ValueError(

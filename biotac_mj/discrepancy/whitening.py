@@ -58,7 +58,7 @@ class Comparison:
     def _prepare(self):
         """Whitened pose columns of every trajectory (orthonormal) and how much each is shrunk."""
         self._basis = []
-        for i, t in enumerate(self.trajectories):
+        for i in range(len(self.trajectories)):
             base = self.fields.base[i]
             z = np.exp(base["log_z"]) / 1e4
             counts_per_log = -4095 * z / (z + 1) ** 2

@@ -22,7 +22,7 @@ THRESHOLDS = {
     "gain": 1.0,  # [nats per trajectory] mean gain of evidence on trajectories left out
     "share": 0.15,  # of the closable log mean square that one effect has to close
     "named": 0.7,  # of it that all have to close, else the rest is unknown
-    "significant": 2.0,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise, repeatability)
+    "significant": 2.0,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise, repeatability)  # noqa: E501
     "most": 3,  # effects
     "refit": 6,  # effects that are refitted after the screen
 }
@@ -40,7 +40,8 @@ class Report:
 
     Attributes:
       verdict: one line. effects: list of dicts (id, name, stage, parameters, confidence, ties, p, nats). ranking: list of (id, nats per
-      trajectory left out, p) of the first round. where: list of cells. before, after: dicts of mean square and RMS per channel on the locked
+      trajectory left out, p) of the first round. where: list of cells. before, after: dicts of mean square and RMS per channel on the
+      locked
       trajectories. closed: share S on them. isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
       fit: Fit. comparison, selection, locked: what it was made of.
     """
@@ -85,7 +86,7 @@ def diagnose(
     n = len(data)
     if n < FEWEST:
         raise ValueError(
-            f"{n} trajectories are too few: the trajectory is the unit of evidence and some are kept aside; measure at least {FEWEST}, better 24"
+            f"{n} trajectories are too few: the trajectory is the unit of evidence and some are kept aside; measure at least {FEWEST}, better 24"  # noqa: E501
         )
     if not 0 < locked < 0.6:
         raise ValueError(f"locked is {locked}: keep a share between 0 and 0.6 of the trajectories aside")
@@ -279,7 +280,7 @@ def _settle(comparison, null, current, found, ranking, chosen, aside, significan
         effects.append(
             {
                 "id": item["effect"].id, "name": item["effect"].name, "stage": item["effect"].stage, "physics": item["effect"].physics,
-                "parameters": parameters, "ties": item["ties"], "p": item["p"], "q": item["q"], "nats": item["nats"], "share": item["share"],
+                "parameters": parameters, "ties": item["ties"], "p": item["p"], "q": item["q"], "nats": item["nats"], "share": item["share"],  # noqa: E501
                 "confidence": _confidence(item, residual_closed), "confusable": item["effect"].confusable,
             }
         )  # fmt: skip
@@ -299,7 +300,7 @@ def _settle(comparison, null, current, found, ranking, chosen, aside, significan
         else:
             verdict = f"unknown ({remainder})"
     isolability = _isolability(comparison, current, usable, effects, chosen)
-    return Report(verdict, effects, ranking, _where(comparison, null, chosen), before, after, closed, isolability, _next(comparison, effects, isolability),
+    return Report(verdict, effects, ranking, _where(comparison, null, chosen), before, after, closed, isolability, _next(comparison, effects, isolability),  # noqa: E501
                   notes + isolability.pop("notes"), current, comparison, chosen, aside, remainder)  # fmt: skip
 
 
@@ -382,7 +383,7 @@ def _depends(comparison, current, chosen):
     loss = {n: share - _explained(np.delete(x, k, axis=1), y, owner) for k, n in enumerate(names)}
     top = [n for n, v in sorted(loss.items(), key=lambda kv: -kv[1]) if v > 0.05 * share][:2]
     rest = [n for n in names if n not in top]
-    return f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; these explain {share:.0%} of it on trajectories left out"
+    return f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; these explain {share:.0%} of it on trajectories left out"  # noqa: E501
 
 
 def _explained(x, y, owner):
@@ -438,7 +439,7 @@ def _next(comparison, effects, isolability):
         if effect["id"] in ids and other in ids:
             share = isolability["matrix"][ids.index(effect["id"])][ids.index(other)]
             left = share * isolability["nats"][ids.index(effect["id"])]
-            nats = f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: {int(np.ceil(3 / max(left, 1e-3)))} trajectories make 3 nats)"
+            nats = f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: {int(np.ceil(3 / max(left, 1e-3)))} trajectories make 3 nats)"  # noqa: E501
         out.append(f"{effect['name']} or {other}: {text or 'vary load, speed and hold together less'}{nats}")
     return "; ".join(out) or "none needed: nothing was named, or nothing is tied"
 

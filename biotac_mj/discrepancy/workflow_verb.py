@@ -52,7 +52,7 @@ def summary(report: Report) -> str:
         lines.append(f"  where: {len(report.where)} cells of channel x phase at family-wise 5 %: {cells}")
     for e in report.effects:
         lines.append(
-            f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats per trajectory left out, p {e['p']:.2g}"
+            f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats per trajectory left out, p {e['p']:.2g}"  # noqa: E501
         )
         for p in e["parameters"][:4]:
             lines.append(f"    {p['name']} {p['value']:.4g} {p['unit']} ({p['interval95'][0]:.4g} .. {p['interval95'][1]:.4g})")
@@ -185,9 +185,11 @@ def _page(report, pictures):
 td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(report.verdict)}</h1>
 <h2>1. Where</h2><p>{len(report.where)} cells of channel x phase at family-wise 5 %.</p>
-<h2>2. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th><th>p</th><th>ties</th></tr>
+<h2>2. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th>
+<th>p</th><th>ties</th></tr>
 {"".join(rows) or "<tr><td colspan=7>none</td></tr>"}</table><p>{esc(report.remainder)}</p>
 <h2>3. Added</h2><p>sensor_amended.yaml</p>
-<h2>4. Proof on trajectories kept aside</h2><table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table><p>share of the closable gap: {closed}</p>
+<h2>4. Proof on trajectories kept aside</h2><table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table>
+<p>share of the closable gap: {closed}</p>
 <h2>5. What the data cannot tell</h2><ul>{notes}</ul><h2>6. Next experiment</h2><p>{esc(report.next_experiment)}</p>
 {images}<p>thresholds {threshold_hash()}</p>"""
