@@ -27,6 +27,14 @@ def block_index(a: int, b: int):
     return a * (5 - a) // 2 + b
 
 
+@wp.func
+def known_clearance(x0: vec3, x1: vec3, x2: vec3, free: real):
+    """Nothing is known of a face without a place: it is looked at again, wherever it goes."""
+    if wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
+        return free
+    return real(-1.0)
+
+
 @wp.kernel
 def cull_faces(
     # In:
@@ -77,7 +85,7 @@ def cull_faces(
             for s in range(nsample):
                 geom_out[f * nsample + s, w] = -1
         if still == 1:
-            clearance[f, w] = free
+            clearance[f, w] = known_clearance(x0, x1, x2, free)
             seen[3 * f, w] = x0
             seen[3 * f + 1, w] = x1
             seen[3 * f + 2, w] = x2
@@ -121,7 +129,8 @@ def near_contact(
         anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
     )  # fmt: skip
     if still == 1:
-        clearance[f, w] = free
+        t = face[f]
+        clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
         for c in range(3):
             seen[3 * f + c, w] = x[face[f][c], w]
 
@@ -218,7 +227,8 @@ def sum_samples(
     if c == 0:
         touching_out[f, w] = touching
         if still == 1:
-            clearance[f, w] = free
+            t = face[f]
+            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
     if still == 1:
         seen[3 * f + c, w] = x[face[f][c], w]
 
