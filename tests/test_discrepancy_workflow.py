@@ -246,3 +246,29 @@ def test_generator_and_fitter_share_no_code():
     assert not any("discrepancy" in name for name in imports(ROOT / "benchmarks/discrepancy_generator.py"))
     for path in (ROOT / "biotac_mj/discrepancy").glob("*.py"):
         assert not any("benchmark" in name or "generator" in name for name in imports(path)), path
+
+
+def test_trajectories_are_read_from_a_data_set(tmp_path):
+    from biotac_mj.data.schema import Interaction
+    from biotac_mj.data.store import write_shard
+    from biotac_mj.discrepancy import read_trajectories
+
+    rows = []
+    for t in measured([], n=2):
+        n = len(t.time)
+        counts = np.full((n, 23), np.nan, np.float32)
+        counts[:, :19], counts[:, 19] = t.electrodes, t.pdc
+        wrench = np.concatenate([t.force, np.zeros((n, 3))], axis=1).astype(np.float32)
+        rows.append(
+            Interaction(t.id, t.tool, "recorded", "train", 0, {"clock": t.clock}, t.time, indenter_pos=t.pos,
+                        indenter_quat=np.tile([1.0, 0, 0, 0], (n, 1)), measured_counts=counts, measured_wrench=wrench)
+        )  # fmt: skip
+    write_shard(tmp_path / "shard-00000.h5", rows)
+    again = read_trajectories(tmp_path)
+    for a, b in zip(again, measured([], n=2)):
+        assert a.id == b.id and abs(a.clock - b.clock) < 1e-9 and a.tdc is None
+        np.testing.assert_allclose(a.electrodes, b.electrodes)
+        np.testing.assert_allclose(a.force, b.force, atol=1e-6)
+        np.testing.assert_allclose(a.depth, b.depth, atol=1e-12)
+    with pytest.raises(FileNotFoundError, match="give an HDF5 file or folder"):
+        read_trajectories(tmp_path / "none.h5")
