@@ -299,7 +299,7 @@ def main(arguments=None):
         from PIL import Image
 
         options.video.parent.mkdir(parents=True, exist_ok=True)
-        first, *rest = [Image.fromarray(f).quantize(64) for f in frames]
+        first, *rest = [Image.fromarray(f).quantize(128, method=Image.Quantize.MAXCOVERAGE) for f in frames]
         first.save(options.video, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
         screen.__exit__()
     if options.traces:
