@@ -109,7 +109,10 @@ class _Common(TimeShaped):
             if agreement < 0.93:
                 return []
             fit = pattern * (own[inside] @ pattern[inside]) / (pattern[inside] @ pattern[inside])
-            shape.amplitude *= float(np.mean(fit / pattern) / shape.amplitude) if abs(shape.amplitude) > 0 else 1.0
+            factor = float(np.mean(fit / pattern) / shape.amplitude) if abs(shape.amplitude) > 0 else 1.0
+            shape.amplitude *= factor
+            if "amplitude" in shape.interval:
+                shape.interval["amplitude"] = tuple(sorted(v * factor for v in shape.interval["amplitude"]))
             found = self._finding(session, line, pattern, shape, tuple(int(k) for k in line.used))
             if agreement > 0.98 and self.id == "warmup":  # the electrodes' own shares, a few per cent about the pattern, belong to it
                 share = np.where(inside, own / np.mean(fit / pattern), pattern)
