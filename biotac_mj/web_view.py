@@ -1,4 +1,4 @@
-"""A page in the browser: deforming skins, electrodes coloured by their change, traces; live or from a recorded press. Extra `web`: viser."""
+"""A page in the browser: deforming skins, electrodes coloured by their change, traces; live or from a recorded press. Extra `web`."""
 
 import dataclasses
 import time as clock
