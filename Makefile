@@ -45,7 +45,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) ".[control,batch,test]"
+	$(PIP) ".[control,batch,learning,data,lerobot,gymnasium,web,test]"
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python
