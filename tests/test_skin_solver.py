@@ -209,7 +209,7 @@ def test_bad_options(options, text):
 
 
 def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
-    """Nearly incompressible rubber whose first two tries fail is solved with another factor: the same answer, and the old one is back."""
+    """Nearly incompressible rubber whose first try fails is solved with another factor: the same answer, and the old one is back."""
     from biotac_mj.geometry import load_skin
     from biotac_mj.skin import solver
 
@@ -232,8 +232,8 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
         return data, model, tries
 
     plain, _, _ = press(0)
-    other, model, tries = press(2)
-    assert tries[2] is not model.factor and other.preconditioner.factor is model.factor
+    other, model, tries = press(1)
+    assert tries[1] is not model.factor and other.preconditioner.factor is model.factor
     assert np.abs(plain.wrench).max() > 0.01
     np.testing.assert_allclose(other.vert_xpos, plain.vert_xpos, atol=2e-8)
     np.testing.assert_allclose(other.wrench, plain.wrench, atol=1e-4 * np.abs(plain.wrench).max())

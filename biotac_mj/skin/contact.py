@@ -17,6 +17,7 @@ __all__ = [
     "contact_product",
     "contact_wrench",
     "core_contact_force",
+    "deepest_corner",
     "depth_in_core",
     "face_samples",
     "rest_gap",
@@ -291,12 +292,34 @@ def core_contact_force(
         moved = wp.max(moved, wp.length_sq(x[t[c], w] - seen[3 * f + c, w]))
     if wp.sqrt(moved) < clearance[f, w]:
         return
-    clearance[f, w] = touch_face(
+    free = touch_face(
         f, w, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
         anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
     )  # fmt: skip
+    known = wp.isfinite(wp.length_sq(x[t[0], w]) + wp.length_sq(x[t[1], w]) + wp.length_sq(x[t[2], w]))
+    clearance[f, w] = wp.where(known, free, real(-1.0))  # nothing is known of a face without a place: looked at again, wherever it goes
     for c in range(3):
         seen[3 * f + c, w] = x[t[c], w]
+
+
+@wp.kernel
+def deepest_corner(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    depth_out: wp.array2d(dtype=real),
+):
+    """How deep the corners of each face are in the first geom [face, world]; negative outside."""
+    f, w = wp.tid()
+    depth = real(-1.0)
+    R = wp.transpose(geoms.mat[0, w])
+    for c in range(3):
+        y = R * (x[face[f][c], w] - geoms.pos[0, w])
+        dn = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], y)
+        depth = wp.max(depth, -dn[3])
+    depth_out[f, w] = depth
 
 
 @wp.kernel

@@ -16,12 +16,20 @@ class Preconditioner:
     """For all worlds of one SkinData; `update` after each evaluation of the forces, then `apply`."""
 
     def __init__(self, model, scale):
-        self.factor = model.factor
+        self._rest, self.factor = model.factor, model.factor
         self.free_mask = np.zeros(model.nvert, bool)
         self.free_mask[model.free] = True
         self.free = model.free
         self.scale = scale
-        self._rows = {}
+        self._rows = self._rest_rows = {}
+
+    def replace(self, factor):
+        """Takes another stiffness' factor until `restore`."""
+        self.factor, self._rows = factor, {}
+
+    def restore(self):
+        """Takes the factor at rest again."""
+        self.factor, self._rows = self._rest, self._rest_rows
 
     def update(self, states, residual, gradient, kappa):
         """Takes the tangents of contact and liquid; returns the approximate inverse of the new tangent times the residual.

@@ -16,7 +16,6 @@ wp.set_module_options({"enable_backward": False})
 
 # MuJoCo's mjtGeom
 GEOM_TYPES = {"plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
-_FAR = wp.constant(wp.float64(1.0e3))
 
 
 @wp.struct
@@ -118,17 +117,15 @@ def pack_grids(grids, device):
 
 @wp.func
 def _grid_value(grids: Grids, k: int, p: vec3):
-    """Trilinear; far outside the grid a lower bound of the distance is not needed, only 'far'."""
-    s = (p - grids.origin[k]) / grids.spacing[k]
+    """Trilinear; outside the grid, whose box holds the mesh, a lower bound of the distance (by the box's nearest point)."""
     n = grids.shape[k]
-    if (
-        s[0] < real(0.0) or s[1] < real(0.0) or s[2] < real(0.0)
-        or s[0] > real(n[0] - 1) or s[1] > real(n[1] - 1) or s[2] > real(n[2] - 1)
-    ):  # fmt: skip
-        return _FAR
-    i = wp.min(int(s[0]), n[0] - 2)
-    j = wp.min(int(s[1]), n[1] - 2)
-    l = wp.min(int(s[2]), n[2] - 2)
+    top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
+    asked = (p - grids.origin[k]) / grids.spacing[k]
+    s = wp.min(wp.max(asked, vec3()), top)
+    beyond = wp.length(asked - s) * grids.spacing[k]
+    i = wp.clamp(int(s[0]), 0, n[0] - 2)
+    j = wp.clamp(int(s[1]), 0, n[1] - 2)
+    l = wp.clamp(int(s[2]), 0, n[2] - 2)
     a = s[0] - real(i)
     b = s[1] - real(j)
     c = s[2] - real(l)
@@ -140,7 +137,10 @@ def _grid_value(grids: Grids, k: int, p: vec3):
     v01 = real(grids.value[base + row]) * (one - c) + real(grids.value[base + row + 1]) * c
     v10 = real(grids.value[base + slab]) * (one - c) + real(grids.value[base + slab + 1]) * c
     v11 = real(grids.value[base + slab + row]) * (one - c) + real(grids.value[base + slab + row + 1]) * c
-    return (v00 * (one - b) + v01 * b) * (one - a) + (v10 * (one - b) + v11 * b) * a
+    value = (v00 * (one - b) + v01 * b) * (one - a) + (v10 * (one - b) + v11 * b) * a
+    if beyond > real(0.0):  # the angle at the box's nearest point is at least a right one
+        value = wp.sqrt(value * value + beyond * beyond)
+    return value
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate gradients."""
 
+import contextlib
+
 import numpy as np
 import warp as wp
 from threadpoolctl import ThreadpoolController
@@ -18,6 +20,8 @@ _threads = ThreadpoolController()
 
 _BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = 0.01
+_FACTOR = 60  # products of the tangent: about what a factor costs
+_CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
 _PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
 
@@ -93,6 +97,7 @@ class _Step:
         if not hasattr(data, "preconditioner"):
             data.preconditioner = Preconditioner(model, data.stiffness_scale)
         self.M = data.preconditioner
+        self.products = 0
         self.inertia = None
         if model.options.dynamics == "implicit":
             self._prepare_inertia(dt, core_pos, core_mat)
@@ -129,34 +134,29 @@ class _Step:
     def run(self):
         self.d.iterations[:] = 0
         self._predict()
-        good = self._newton(np.ones(self.d.nworld, bool))
-        if not good.all():  # the guess may have been the trouble
-            self._back(~good)
-            good |= self._newton(~good)
-        if not good.all() and self.m.material.poissons_ratio > 0.45 and self.d.nworld == 1:
-            self._back(~good)
-            good = self._newton_from_deformed()
+        try:
+            good = self._newton(np.ones(self.d.nworld, bool))
+            if not good.all():  # the guess may have been the trouble
+                self._back(~good)
+                self._renew_factor(self.start)
+                good |= self._newton(~good)
+        finally:
+            self.M.restore()
         self._finish(good)
 
     def _back(self, worlds):
         for w in np.flatnonzero(worlds):
             self.x[:, w] = self.start[:, w]
 
-    def _newton_from_deformed(self):
+    def _renew_factor(self, x):
         """Nearly incompressible rubber, turned and strained, is no longer like that at rest: solved with the factor of its present shape.
 
-        For this step alone, so that a step remains a function of the state it starts from.
+        For this step alone, so that a step remains a function of the state it starts from. Worlds share a factor: not where there are many.
         """
-        try:
-            factor = self.m.factor_at(self.start[:, 0])
-        except ValueError:  # a tetrahedron is inverted: no factor there
-            return np.zeros(1, bool)
-        kept = self.M.factor, self.M._rows
-        self.M.factor, self.M._rows = factor, {}
-        try:
-            return self._newton(np.ones(1, bool))
-        finally:
-            self.M.factor, self.M._rows = kept
+        self.products = -np.inf  # once is enough until the next start
+        if self.m.material.poissons_ratio > 0.45 and self.d.nworld == 1:
+            with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
+                self.M.replace(self.m.factor_at(x[:, 0]))
 
     def _newton(self, active):
         """Newton's method in the active worlds; which of them are now in balance."""
@@ -172,7 +172,7 @@ class _Step:
             if at_rest.all():
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
-                return asked
+                return asked & self._possible()
             z = self.M.update(states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
             error = (residual * z).sum((0, 2))
             load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
@@ -183,7 +183,21 @@ class _Step:
                 break
             d.iterations += active
             self._line_search(self._conjugate_gradients(residual, z, active), residual, active)
-        return asked & finite & ~active
+            if self.products > _FACTOR:
+                self._renew_factor(self.x)
+        return asked & finite & ~active & self._possible()
+
+    def _possible(self):
+        """Worlds (nworld,) whose skin a body can have: balance of an inverted element, or of skin that went through the core, is none."""
+        m, d = self.m, self.d
+        good = np.ones(d.nworld, bool)
+        if m.material.law != "linear":  # small strain: its determinant means nothing
+            good &= m.elasticity.smallest_jacobian(d.elastic) > 0
+        if m.has_core:
+            depth = wp.zeros((len(d.core.surface.face), d.nworld), dtype=wp.float64, device=m.device)
+            _launcher(m.device)(contact.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth])
+            good &= depth.numpy().max(0) < _CRUSHED * m.material.youngs_modulus / m.contact_stiffness
+        return good
 
     def _pressure_settled(self, z):
         """Whether the step z would hardly change the liquid's pressure. Its energy cannot tell: the liquid is almost incompressible."""
@@ -300,6 +314,7 @@ class _Step:
         running = active.astype(float)
         for _ in range(self.m.options.max_cg):
             q = self._product(p)
+            self.products += 1
             curvature = (p * q).sum((0, 2))
             # negative curvature: the tangent is not positive definite there; what has been found so far is a descent direction
             running = running * (curvature > 0)
