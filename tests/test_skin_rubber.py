@@ -1,0 +1,172 @@
+"""Nearly incompressible rubber pressed onto the core: no step may pass for a balance that a skin cannot have."""
+
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, step
+from biotac_mj.skin.contact import Geoms
+from biotac_mj.skin.data import view
+from biotac_mj.skin.shapes import bake_distance_grid, distance_bound
+from biotac_mj.skin.solver import _Step
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
+import rubber  # noqa: E402
+
+NOTHING = GeomSet([], [])
+
+
+def _sphere_at(geoms, depth):
+    geoms.set_pose([[-0.012, -0.00825 + depth - 3.5e-3, 0.0]])
+    return geoms
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SkinModel(load_skin("coarse"), "ansys")
+
+
+@wp.kernel
+def _bound(geoms: Geoms, p: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    out[i] = distance_bound(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], p[i])
+
+
+def test_distance_beyond_a_grid_is_a_lower_bound_and_near_the_true_one():
+    body = trimesh.creation.box((4e-3, 6e-3, 10e-3))
+    grid = bake_distance_grid(body.vertices, body.faces, spacing=4e-4, margin=3e-3)
+    geoms = GeomSet(["mesh"], [(0, 0, 0)], [0.0], grids=[grid])
+    p = np.random.default_rng(0).uniform(-3e-2, 3e-2, (2000, 3))
+    out = wp.zeros(len(p), dtype=wp.float64, device="cpu")
+    wp.launch(_bound, dim=len(p), inputs=[geoms.struct, wp.array(p, dtype=wp.vec3d, device="cpu")], outputs=[out], device="cpu")
+    exact = np.linalg.norm(np.maximum(np.abs(p) - [2e-3, 3e-3, 5e-3], 0), axis=1)
+    beyond = (np.abs(p) > np.array([2e-3, 3e-3, 5e-3]) + 4e-3).any(1)
+    assert beyond.sum() > 1000
+    bound = out.numpy()[beyond]
+    assert (bound <= exact[beyond]).all() and (bound > 0.7 * exact[beyond] - 2e-4).all()
+
+
+def _pressed_in(model):
+    """Nodes of the inner surface that start within 1.3 mm of the core's belly, half a millimetre in it."""
+    x = model.geometry.vert.copy()
+    nodes = np.intersect1d(np.unique(model.core_surface.face_np), model.free)
+    nodes = nodes[(x[nodes, 1] < -6.3e-3) & (np.abs(x[nodes, 0] + 9e-3) < 3e-3)]
+    assert len(nodes) > 3
+    x[nodes, 1] = -4.8e-3
+    return x, nodes
+
+
+@pytest.mark.parametrize("trial", [5e-2, np.nan])
+def test_a_trial_far_away_does_not_make_the_skin_lose_the_core(model, trial):
+    """A face that a bad trial of Newton's method put beyond the core's distance grid, or nowhere, meets the core when it is back."""
+    x, nodes = _pressed_in(model)
+
+    def core_force(first):
+        data = SkinData(model)
+        solved = _Step(model, data, NOTHING, None, None, None)
+        for place in first:
+            view(data.x)[:, 0] = place
+            solved._evaluate()
+        return data.core_force[0].copy()
+
+    away = model.geometry.vert.copy()
+    away[nodes, 1] -= trial
+    plain = core_force([x])
+    assert np.linalg.norm(plain[nodes].sum(0)) > 10
+    np.testing.assert_array_equal(core_force([x, away, x]), plain)
+
+
+def test_a_shape_that_no_skin_can_have_is_not_converged(model):
+    data = SkinData(model)
+    solved = _Step(model, data, NOTHING, None, None, None)
+
+    def possible(x):
+        view(data.x)[:, 0] = x
+        solved._evaluate()
+        return solved._possible()[0]
+
+    rest = model.geometry.vert
+    assert possible(rest)
+    assert possible(1.05 * rest)
+    assert not possible(_pressed_in(model)[0])
+    element = model.geometry.elem[np.isin(model.geometry.elem, model.fixed).sum(1) == 0][0]
+    folded = rest.copy()
+    folded[element[0]] += 1.2 * (rest[element[1:4]].mean(0) - rest[element[0]])  # a corner through the face opposite
+    assert not possible(folded)
+
+
+def test_skin_that_lost_the_core_is_reported(monkeypatch):
+    """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those inside the core counts."""
+    contact = _Step._contact
+
+    def blind(self, state, geoms):
+        if state is self.d.core:
+            state.clearance.fill_(1.0)
+            view(state.seen)[...] = view(self.d.x)[state.surface.face_np.ravel()]
+        contact(self, state, geoms)
+
+    def press():
+        model = SkinModel(load_skin("coarse"), "default")
+        data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.0])
+        good, deepest, volume = [], [], []
+        for depth in np.arange(2e-4, 2.5e-3, 2e-4):
+            step(model, data, _sphere_at(geoms, depth))
+            volume.append(data.volume[0])
+            good.append(bool(data.converged[0]))
+            deepest.append(rubber.shape(model, SkinData(model), data.vert_xpos[0])[1])
+        np.testing.assert_allclose(volume, model.liquid_volume, rtol=1e-5)  # kept, on the core too
+        return good, np.array(deepest)
+
+    good, deepest = press()
+    assert all(good) and deepest.max() < 5e-5
+    monkeypatch.setattr(_Step, "_contact", blind)
+    good, deepest = press()
+    assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
+
+
+def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypatch):
+    """The factor of the deformed shape is made within a step and forgotten with it: fresh SkinData at that state steps alike, bitwise."""
+    made = []
+    factor_at = SkinModel.factor_at
+    monkeypatch.setattr(SkinModel, "factor_at", lambda self, x: made.append(1) or factor_at(self, x))
+    data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5])
+    for depth in (0, 3e-4, 6e-4):
+        step(model, data, _sphere_at(geoms, depth))
+        assert data.converged.all()
+    state = dict(
+        x=data.vert_xpos[0].copy(),
+        increment=data.increment.numpy()[:, 0].copy(),
+        motion=data.motion[0].copy(),
+        contacts=data.contacts(),
+        pressure=data.liquid.last_pressure[0],
+    )
+    made.clear()
+    step(model, data, _sphere_at(geoms, 9e-4))
+    assert made and data.converged.all() and data.preconditioner.factor is model.factor
+    fresh, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5])
+    fresh.load(**state)
+    _sphere_at(geoms, 6e-4).advance()
+    step(model, fresh, _sphere_at(geoms, 9e-4))
+    np.testing.assert_array_equal(fresh.vert_xpos, data.vert_xpos)
+    np.testing.assert_array_equal(fresh.wrench, data.wrench)
+    enclosed = [trimesh.Trimesh(v, model.geometry.inner_face, process=False).volume for v in (model.geometry.vert, data.vert_xpos[0])]
+    assert abs((enclosed[1] - enclosed[0]) / model.liquid_volume) < 2e-6  # the liquid's volume is kept
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("indenter, least, most", [("sphere_7mm", 3.0, 4.5), ("cube_14mm", 20.0, 32.0)])
+def test_the_preset_bears_a_press_to_the_core(model, indenter, least, most):
+    """Every step in balance; force grows with depth, on the core steeply; no element inverted, no skin in the core, liquid kept."""
+    found = rubber.press("coarse", indenter)
+    force = np.array(found["force_N"])
+    assert found["not_converged"] == 0 and found["steps"] == 24
+    assert (np.diff(force) > 0).all() and least < force[-1] < most
+    assert np.diff(force)[-1] > 20 * np.diff(force)[3]
+    assert found["least_jacobian"] > 0.5 and found["deepest_in_core_um"] < 60
+    assert np.abs(found["pressure_Pa"]).max() < 3e3
+    assert PRESETS["ansys"].poissons_ratio == 0.499 and PRESETS["ansys"].friction == 0.186 and PRESETS["ansys"].youngs_modulus == 2.8e5
