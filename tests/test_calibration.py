@@ -14,7 +14,9 @@ from biotac_mj.calibration import (
     evaluate,
     parameter,
     plan_indentation,
+    plan_shear,
     read_indentation,
+    refined,
     simulate,
     stand_in,
     write_indentation,
@@ -62,6 +64,38 @@ def test_recovers_known_parameters_from_noisy_forces(way, shell):
     assert (np.abs(found.value - wanted) <= np.maximum([0.02, 0.02, 0.05] * wanted, 3 * error)).all(), found.value / wanted
     assert abs(found.value[0] / wanted[0] - 1) < 0.05 and abs(found.value[2] / wanted[2] - 1) < 0.05
     assert found.rms < 1.1 * np.sqrt((np.linalg.norm(data.force - true, axis=1) ** 2).mean())  # no worse than the truth itself
+
+
+def test_correction_takes_the_mesh_out_of_the_fit(shell):
+    """Forces made on the default skin, fitted on the coarse one, which is 8 % stiffer there: alone it takes that for the material."""
+    short = plan_indentation(depth=0.6e-3, slide=0.0, samples=4)
+    finer = configuration("shell_with_core", "default")
+    data = dataclasses.replace(short, force=simulate(finer.geometry, shell.options, [TRUTH], short).force[0])
+    start = dataclasses.replace(TRUTH, youngs_modulus=1.5e6)
+    alone = calibrate(shell, start, data, ["E"], max_iterations=4)
+    corrected = calibrate(shell, start, data, ["E"], max_iterations=4, finer=finer.geometry)
+    assert alone.value[0] < 0.95 * TRUTH.youngs_modulus
+    assert corrected.value == pytest.approx([TRUTH.youngs_modulus], rel=0.002)
+    assert corrected.rms < 0.2 * alone.rms and "corrected by" in corrected.skin
+
+
+def test_refined_skin_is_the_same_body():
+    skin = configuration("shell_with_core").geometry
+    fine = refined(skin)
+    assert len(fine.elem) == 8 * len(skin.elem) and np.isin(skin.fixed, fine.fixed).all()
+    once, twice = (TetMesh(g.vert, g.tets).check().volumes.sum() for g in (skin, fine))
+    assert once < twice < 1.005 * once and fine.name == "refined:coarse"  # both are polyhedra inside the curved body
+    with pytest.raises(ValueError, match="four-node tetrahedra"):
+        refined(dataclasses.replace(skin, elem=skin.tets))
+
+
+def test_way_that_tells_the_parameters_apart():
+    way = plan_shear(corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4)
+    assert len(way.tip) == 1 + 5 + 10 + 6 and np.diff(way.tip, axis=0).shape == (21, 3)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(way.tip, axis=0), axis=1), 2e-4, rtol=1e-9)
+    press, slide = way.tip[5] - way.tip[0], way.tip[15] - way.tip[5]
+    np.testing.assert_allclose(way.tip[-1] - way.tip[15], 1.2 * press, atol=1e-12)
+    assert abs(press @ slide) < 1e-3 * np.linalg.norm(press) * np.linalg.norm(slide)
 
 
 def test_batch_columns_equal_single_runs(way, shell):

@@ -4,8 +4,9 @@ from .comparison import Comparison, comparison_table, evaluate, plan_indentation
 from .configurations import CONFIGURATIONS, Configuration, configuration
 from .fit import Calibration, Parameter, calibrate, parameter
 from .forward import Response, simulate
-from .indentation import Indentation, plan_indentation, read_indentation, write_indentation
+from .indentation import Indentation, plan_indentation, plan_shear, read_indentation, write_indentation
 from .reference import stand_in
+from .refinement import refined
 
 __all__ = [
     "CONFIGURATIONS",
@@ -22,7 +23,9 @@ __all__ = [
     "parameter",
     "plan_indentation",
     "plan_indentations",
+    "plan_shear",
     "read_indentation",
+    "refined",
     "simulate",
     "stand_in",
     "write_indentation",

@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..skin.material import Material
 from ..skin.model import SkinOptions
 from .configurations import Configuration
@@ -180,6 +181,8 @@ def calibrate(
     max_iterations: int = 20,
     device: str = "cpu",
     progress: bool = False,
+    finer: SkinGeometry | None = None,
+    corrections: int = 2,
 ) -> Calibration:
     """Fits parameters to the force of an indentation.
 
@@ -191,6 +194,9 @@ def calibrate(
       material: law and starting values.
       parameters: names, as `parameter` takes them, or Parameters.
       progress: whether to show a bar.
+      finer: a finer mesh of the same body, or None. The fit on the configuration's mesh is then corrected by the difference of both meshes'
+        forces at the fitted values and repeated, `corrections` times (space mapping): it ends where the finer mesh fits the data, at the
+        price of `corrections` indentations of it.
 
     Raises:
       ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not tell the parameters apart.
@@ -250,19 +256,29 @@ def calibrate(
     settings = dict(ftol=1e-5, maxiter=max_iterations)
     rough = minimize(cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings)
     # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and Newton's needs no history
-    found = least_squares(
-        lambda s: ((evaluate(s)[1] - indentation.force) / scale_force).ravel(),
-        np.clip(start + back @ rough.x, lower + 1e-9, upper - 1e-9),
-        jac=lambda s: evaluate(s)[2].reshape(-1, len(s)) / scale_force,
-        bounds=(lower, upper),
-        x_scale="jac",
-        ftol=1e-5,
-        xtol=1e-6,
-        max_nfev=max_iterations,
-    )
+
+    def finish(at, correction):
+        return least_squares(
+            lambda s: ((evaluate(s)[1] + correction - indentation.force) / scale_force).ravel(),
+            np.clip(at, lower + 1e-9, upper - 1e-9),
+            jac=lambda s: evaluate(s)[2].reshape(-1, len(s)) / scale_force,
+            bounds=(lower, upper),
+            x_scale="jac",
+            ftol=1e-5 if finer is None else 1e-4,
+            xtol=1e-6 if finer is None else 1e-4,
+            max_nfev=max_iterations,
+        )
+
+    found, correction = finish(start + back @ rough.x, 0.0), 0.0
+    for _ in range(corrections if finer is not None else 0):
+        values, force, _, _ = evaluate(found.x)
+        case = _case(options, material, parameters, values)
+        correction = simulate(finer, case[0], [case[1]], indentation, device).force[0] - force
+        found = finish(found.x, correction)
     values, force, jacobian, lost = evaluate(found.x)
     bar.close()
-    return _result(fixed, material, indentation, parameters, begin, values, force, jacobian, lost, len(cache), found)
+    result = _result(fixed, material, indentation, parameters, begin, values, force + correction, jacobian, lost, len(cache), found)
+    return result if finer is None else dataclasses.replace(result, skin=f"{result.skin}, corrected by {finer.name}")
 
 
 def _result(configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found):
@@ -280,7 +296,7 @@ def _result(configuration, material, indentation, parameters, begin, values, for
         configuration=configuration.name,
         skin=configuration.geometry.name,
         law=material.law,
-        element=options.element or material.element,
+        element=options.element or material.element or configuration.geometry.element,
         liquid=bool(material.liquid if options.liquid is None else options.liquid),
         indenter=indentation.indenter,
         parameters=[p.name for p in parameters],

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..press_record import replacing
 
-__all__ = ["COLUMNS", "Indentation", "plan_indentation", "read_indentation", "write_indentation"]
+__all__ = ["COLUMNS", "Indentation", "plan_indentation", "plan_shear", "read_indentation", "write_indentation"]
 
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
 _ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
@@ -92,6 +92,26 @@ def plan_indentation(
     tip = np.array([path.position(*travel) for travel in zip(path.depth, path.slid)])
     time = 0.02 * np.arange(len(tip))
     return Indentation(indenter, indenter, time, tip, path.quat, np.zeros((len(tip), 3)))
+
+
+def plan_shear(indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4, **place) -> Indentation:
+    """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a press that squeezes the skin
+    on the core, in which the force hardly depends on nu.
+
+    Args:
+      corners: (depth, slid) [m] that the tip visits after first touch.
+      stride: longest way between two samples [m].
+      place: location, slide_direction, direction and skin as `plan_indentation` has them.
+    """
+    plan = plan_indentation(indenter, depth=1e-3, slide=1e-3, samples=8, **place)
+    axes = np.array([step / np.linalg.norm(step) for step in (plan.tip[1] - plan.tip[0], plan.tip[-1] - plan.tip[-2])])
+    travel = [np.zeros((1, 2))]
+    for corner in np.asarray(corners, float):
+        at = travel[-1][-1]
+        count = max(1, int(np.ceil(np.linalg.norm(corner - at) / stride - 1e-9)))
+        travel.append(at + (corner - at) * np.arange(1, count + 1)[:, None] / count)
+    tip = plan.tip[0] + np.concatenate(travel) @ axes
+    return dataclasses.replace(plan, time=0.02 * np.arange(len(tip)), tip=tip, force=np.zeros_like(tip))
 
 
 def read_indentation(path, indenter: str | None = None, direction=None) -> Indentation:

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from ..geometry.skins import load_skin
 from ..skin.material import material as preset
 from ..skin.model import SkinOptions
 from .forward import simulate
 from .indentation import Indentation
+from .refinement import skin as named_skin
 
 __all__ = ["STAND_IN", "stand_in"]
 
@@ -23,7 +23,7 @@ def stand_in(
     Args:
       indentation: the way.
       material: preset or Material; "rubber" is Neo-Hookean with the paper's ANSYS constants, and has liquid.
-      skin: mesh.
+      skin: mesh, "refined:NAME" for each of its tetrahedra cut into eight.
       noise: standard deviation added to each force component [N].
       seed: of the noise.
       liquid, element: see SkinOptions; None takes the material's choice.
@@ -34,7 +34,7 @@ def stand_in(
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")
     options = SkinOptions(liquid=liquid, element=element, tolerance=1e-4, max_newton=100)
-    answer = simulate(load_skin(skin), options, [preset(material)], indentation, device)
+    answer = simulate(named_skin(skin), options, [preset(material)], indentation, device)
     if answer.nonconverged[0]:
         raise ValueError(
             f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not converge: "

@@ -8,13 +8,12 @@ from ..skin.material import PRESETS, material
 from .comparison import PAPER, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
 from .fit import calibrate
-from .indentation import plan_indentation, read_indentation, write_indentation
+from .indentation import plan_shear, read_indentation, write_indentation
 from .reference import STAND_IN, stand_in
+from .refinement import refined
 from .report import calibration_table, read_material, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
-
-_SHEAR = dict(depth=1.2e-3, slide=3.0e-3)  # a press and a slide of the 7 mm sphere, long enough to slip at mu 0.78 too
 
 
 def _material(text):
@@ -28,15 +27,16 @@ def calibrate_verb(args) -> None:
     out = pathlib.Path(args.out)
     body = configuration(args.configuration, args.skin, liquid=args.liquid)
     if args.synthetic:
-        plan = plan_indentation(args.indenter or "sphere_7mm", direction=args.direction, **_SHEAR)
-        data = stand_in(plan, args.truth, args.truth_skin, args.noise, args.seed, device=args.device)
+        plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction)
+        data = stand_in(plan, args.truth, args.truth_skin, args.noise, args.seed, args.truth_liquid, device=args.device)
         write_indentation(data, out / "synthetic.csv")
         truth = material(args.truth)
         print(f"data: our own skin, {args.truth} on mesh {args.truth_skin}, E {truth.youngs_modulus:g} Pa, nu {truth.poissons_ratio:g}, "
               f"mu {truth.friction:g}, noise {args.noise:g} N; kept in {out / 'synthetic.csv'}")  # fmt: skip
     else:
         data = read_indentation(args.data, args.indenter, args.direction)
-    result = calibrate(body, _material(args.material), data, args.fit, device=args.device, progress=not args.quiet)
+    finer = refined(body.geometry) if args.correct else None
+    result = calibrate(body, _material(args.material), data, args.fit, device=args.device, progress=not args.quiet, finer=finer)
     write_json(result, out / "calibration.json")
     write_picture(result, out / "calibration.png")
     print(calibration_table(result))
@@ -59,7 +59,7 @@ def compare_verb(args) -> None:
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
             cases = references(plans, bar.update, **settings)
-        calibration = None if given else stand_in(plan_indentation(**_SHEAR), **settings)
+        calibration = None if given else stand_in(plan_shear(), **settings)
         reference = f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin {args.reference_skin})"
     results = []
     for body in chosen:
