@@ -4,7 +4,7 @@
     python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine --worlds 1,16,128,1024,4096
 
 The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of the outer surface
-there, the paper's material, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the core; with liquid and
+there, the paper's constants, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the core; with liquid and
 without. A CPU run is held to one core. Kernels are compiled and the factor is made before the clock starts (`setup_s` is the
 model and its factor); what is timed is the first press of a fresh skin, with every cost that a user's press has. `cpu_ms_per_press`
 is the processor time of the same press: where it is well below the wall time, other programs shared the core.
@@ -21,6 +21,7 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 
 import argparse
 import functools
+import itertools
 import pathlib
 import platform
 import sys
@@ -51,6 +52,7 @@ COLUMNS = (
     "device",
     "solver",
     "skin",
+    "element",
     "tier",
     "liquid",
     "worlds",
@@ -102,9 +104,10 @@ def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarr
 
 
 @functools.cache
-def _model(skin, liquid, device, tolerance):
+def _model(skin, element, liquid, device, tolerance):
     """The model of a row, with its factor, and the seconds and the device memory [bytes] that it takes."""
-    options = SkinOptions(liquid=liquid, tolerance=tolerance, max_newton=60 if tolerance < 1e-4 else SkinOptions.max_newton)
+    most = 60 if tolerance < 1e-4 else SkinOptions.max_newton
+    options = SkinOptions(element=element, liquid=liquid, tolerance=tolerance, max_newton=most)
 
     def make():
         model = SkinModel(load_skin(skin), PRESETS["paper"], options, device=device)
@@ -118,9 +121,9 @@ def _model(skin, liquid, device, tolerance):
 
 
 @functools.cache
-def _tight(skin, liquid, increments):
+def _tight(skin, element, liquid, increments):
     """Forces (increments, 1, 3) of the same press solved tightly in double precision on the CPU, and steps that did not converge."""
-    force, _, lost = press(_model(skin, liquid, "cpu", TIGHT)[0], standard_path(load_skin(skin), increments)[0])
+    force, _, lost = press(_model(skin, element, liquid, "cpu", TIGHT)[0], standard_path(load_skin(skin), increments)[0])
     return force, lost
 
 
@@ -146,15 +149,18 @@ def _per_world(model, worlds) -> float:
     return (_used(str(model.device)) - before) / worlds
 
 
-def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int, tolerance: float = SkinOptions.tolerance) -> dict:
+def time_skin(
+    skin: str, element: str, liquid: bool, device: str, worlds: int, increments: int, tolerance: float = SkinOptions.tolerance
+) -> dict:
     """A row of the table, with the forces of the first world (increments, 3) beside it."""
     geometry = load_skin(skin)
     path, _ = standard_path(geometry, increments)
-    model, setup, memory = _model(skin, liquid, device, tolerance)
+    model, setup, memory = _model(skin, element, liquid, device, tolerance)
     row = {
         "device": device,
         "solver": "biotac_mj",
         "skin": skin,
+        "element": element,
         "tier": "full",
         "liquid": liquid,
         "worlds": worlds,
@@ -172,7 +178,7 @@ def time_skin(skin: str, liquid: bool, device: str, worlds: int, increments: int
     press(model, path[:2], worlds)  # compiles
     force, seconds, lost = press(model, path, worlds)
     again = press(model, path, worlds)[1]
-    tight, lost_tight = _tight(skin, liquid, increments)
+    tight, lost_tight = _tight(skin, element, liquid, increments)
     wrong = np.linalg.norm(force - tight, axis=2).mean(1)
     return row | {
         "ms_per_press": 1e3 * seconds[:, 0].sum(),
@@ -195,7 +201,7 @@ def time_condensed(ours: dict) -> dict:
     """The condensed tier on the press of one of our rows; its row, with errors against the forces of that row."""
     geometry = load_skin(ours["skin"])
     path, _ = standard_path(geometry, ours["increments"])
-    model = SkinModel(geometry, PRESETS["paper"], SkinOptions(liquid=ours["liquid"]))
+    model = SkinModel(geometry, PRESETS["paper"], SkinOptions(element=ours["element"], liquid=ours["liquid"]))
     mat = np.eye(3)[None]
 
     def walk(skin):
@@ -224,6 +230,7 @@ def time_condensed(ours: dict) -> dict:
         "device": "cpu",
         "solver": "biotac_mj",
         "skin": ours["skin"],
+        "element": ours["element"],
         "tier": "condensed",
         "liquid": ours["liquid"],
         "worlds": 1,
@@ -254,6 +261,7 @@ def time_peer(ours: dict) -> dict:
         "device": "cpu",
         "solver": f"mujoco {peer_flex.VERSION} flex",
         "skin": ours["skin"],
+        "element": "linear",
         "tier": "full",
         "liquid": False,
         "worlds": 1,
@@ -298,6 +306,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--device", default="cpu", help="cpu, or a CUDA device of Warp such as cuda:0")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
     parser.add_argument("--skins", default="default", help=f"comma-separated: {', '.join(SKINS)}")
+    parser.add_argument("--elements", default="quadratic,linear", help="comma-separated: quadratic (the default), linear (the paper's)")
     parser.add_argument("--worlds", default="1", help="comma-separated numbers of skins solved together")
     parser.add_argument("--tolerances", default=str(SkinOptions.tolerance), help="comma-separated tolerances of the solver")
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
@@ -319,10 +328,10 @@ def main(arguments=None) -> int:
     print("".join(f"{c:>{max(9, len(c) + 1)}}" if c != "solver" else f"{c:>20}" for c in COLUMNS))
     rows = []
     for skin in skins:
-        for liquid in (False, True):
+        for element, liquid in itertools.product(options.elements.split(","), (False, True)):
             for tolerance in map(float, options.tolerances.split(",")):
                 for worlds in map(int, options.worlds.split(",")):
-                    row = time_skin(skin, liquid, options.device, worlds, options.increments, tolerance)
+                    row = time_skin(skin, element, liquid, options.device, worlds, options.increments, tolerance)
                     rows.append({**row, "machine": machine})
                     _print_row(rows[-1])
                 if "largest_nworld" in rows[-1]:
@@ -333,7 +342,7 @@ def main(arguments=None) -> int:
             rows.append({**time_condensed(ours), "machine": machine})
             _print_row(rows[-1])
     if not options.no_peer and options.device == "cpu":
-        for ours in [row for row in rows if not row["liquid"] and row["worlds"] == 1 and row["tier"] == "full"]:
+        for ours in [row for row in rows if (row["element"], row["liquid"], row["worlds"], row["tier"]) == ("linear", False, 1, "full")]:
             peer = {**time_peer(ours), "machine": machine}
             mine = np.mean(ours["wall_and_cpu_ms_of_steps"][: peer["steps"]], axis=0)  # over the same travel
             peer["ratio_ms_per_step"] = peer["ms_per_step"] / mine[0]

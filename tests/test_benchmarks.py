@@ -130,7 +130,21 @@ def test_a_cylinder_without_length_is_refused(accuracy):
 
 
 def test_speed_writes_rows(repo, tmp_path):
-    done = _run(repo, "speed.py", "--device", "cpu", "--json", tmp_path / "speed.json", "--increments", 5, "--no-peer", "--skins", "coarse")
+    done = _run(
+        repo,
+        "speed.py",
+        "--device",
+        "cpu",
+        "--json",
+        tmp_path / "speed.json",
+        "--increments",
+        5,
+        "--no-peer",
+        "--skins",
+        "coarse",
+        "--elements",
+        "quadratic",
+    )
     assert done.returncode == 0, done.stderr
     everything = json.loads((tmp_path / "speed.json").read_text())["rows"]
     rows, condensed = ([row for row in everything if row["tier"] == tier] for tier in ("full", "condensed"))
