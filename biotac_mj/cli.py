@@ -299,8 +299,8 @@ def _add_diagnose(verbs):
     verb.add_argument(
         "--rate", type=float, default=None, metavar="HZ", help="rows per second (default: guessed from repeated rows, else 100)"
     )
-    verb.add_argument("--locked", type=float, default=None, metavar="SHARE",
-                      help="of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)")  # fmt: skip
+    kept = "of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
+    verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
     verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
