@@ -89,7 +89,7 @@ def write_picture(result: Calibration, path) -> None:
         top.plot(result.time, result.fitted[:, i], lw=1.2, color=color, label=f"F{'xyz'[i]}")
         bottom.plot(result.time, result.fitted[:, i] - result.measured[:, i], ".-", lw=0.8, ms=3, color=color)
     fitted = ", ".join(f"{name} {value:.4g}" for name, value in zip(result.parameters, result.value))
-    top.set_title(f"{result.configuration}, {result.indenter}: {fitted}\nRMS force error {result.rms:.4f} N", fontsize=9)
+    top.set_title(f"{result.configuration}, {result.indenter}: {fitted}\nRMS force error {result.rms:.4f} N", fontsize=8)
     top.set_ylabel("force on the indenter [N]\n(circles: measured, lines: fitted)")
     top.legend(fontsize=8)
     bottom.axhline(0, lw=0.5, color="black")
