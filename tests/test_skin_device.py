@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 from test_skin_solver import finger
 
+from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.device_step import prepare_device, step_device
 from biotac_mj.skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
@@ -205,3 +207,28 @@ def test_what_is_refused(model):
     dry = SkinModel(model.geometry, "default", SkinOptions(liquid=False))
     with pytest.raises(ValueError, match=r"this model has no liquid: make it with SkinOptions\(liquid=True\)"):
         SkinData(dry).set_liquid(1e6)
+
+
+@pytest.mark.parametrize("element", [pytest.param("quadratic", marks=pytest.mark.slow), "linear"])
+def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
+    """Each in its own world: rest, a tetrahedron turned inside out, an inner surface inside the core."""
+    geometry = load_skin("coarse") if element == "quadratic" else four_nodes("coarse")
+    model = SkinModel(geometry, "default", SkinOptions(element=element))
+    data, geoms = SkinData(model, 3, resident=True), GeomSet(["sphere"], [(3.5e-3,)], nworld=3)
+    ready = prepare_device(model, data, geoms)
+    x = np.repeat(geometry.vert[:, None], 3, 1)
+    corner = geometry.elem[np.isin(geometry.elem, model.fixed).sum(1) == 0][0][:4]
+    x[corner[0], 1] += 1.2 * (geometry.vert[corner[1:]].mean(0) - geometry.vert[corner[0]])
+    inner = np.unique(model.core_surface.face_np)
+    inner = inner[geometry.vert[inner, 1] < -5e-3]
+    x[inner, 2, 1] += 3e-3  # the pad's inside, pushed up into the core
+    data.x.assign(x)
+    data.worlds.asked.fill_(1)
+    data.worlds.failed.zero_()
+    ready._evaluate(data.worlds.asked)
+    ready._refuse_impossible()
+    assert data.worlds.failed.numpy().tolist() == [0, 1, 1]
+    monkeypatch.setattr(type(data.device_memory.elements), "refuse_inverted", lambda *_: None)  # the core alone
+    data.worlds.failed.zero_()
+    ready._refuse_impossible()
+    assert data.worlds.failed.numpy().tolist() == [0, 0, 1]

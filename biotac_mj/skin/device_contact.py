@@ -10,6 +10,7 @@ __all__ = [
     "block_index",
     "commit_contacts",
     "contact_inside_core",
+    "crushed_on_core",
     "cull_faces",
     "near_contact",
     "partial_wrench",
@@ -303,6 +304,28 @@ def commit_contacts(
         if touching[f, w] == 1:
             geom_out[i, w] = geom[i, w]
             anchor_out[i, w] = anchor[i, w]
+
+
+@wp.kernel
+def crushed_on_core(
+    # In:
+    limit: real,
+    face: wp.array(dtype=wp.vec3i),
+    core: Geoms,
+    x: wp.array2d(dtype=vec3),
+    asked: wp.array(dtype=int),
+    # Out:
+    failed_out: wp.array(dtype=int),
+):
+    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through, see `solver._possible`."""
+    f, w = wp.tid()
+    if asked[w] == 0:
+        return
+    R = wp.transpose(core.mat[0, w])
+    for c in range(3):
+        y = R * (x[face[f][c], w] - core.pos[0, w])
+        if distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y) < -limit:
+            failed_out[w] = 1
 
 
 @wp.kernel

@@ -239,6 +239,30 @@ def flag_inverted(law: int, jacobian: wp.array2d(dtype=real), on: wp.array(dtype
         inverted_out[w] = 1
 
 
+@wp.kernel
+def flag_turned_inside_out(
+    # In:
+    elem: wp.array(dtype=wp.vec4i),
+    inverse_edges: wp.array(dtype=mat33),
+    x: wp.array2d(dtype=vec3),
+    asked: wp.array(dtype=int),
+    # Out:
+    failed_out: wp.array(dtype=int),
+):
+    """Marks worlds with a tetrahedron whose determinant is not positive."""
+    e, w = wp.tid()
+    if asked[w] == 1 and not (wp.determinant(edge_matrix(x, elem[e], w) * inverse_edges[e]) > real(0.0)):
+        failed_out[w] = 1
+
+
+@wp.kernel
+def flag_points_inside_out(jacobian: wp.array2d(dtype=real), asked: wp.array(dtype=int), failed_out: wp.array(dtype=int)):
+    """The same for integration points."""
+    e, w = wp.tid()
+    if asked[w] == 1 and not (jacobian[e, w] > real(0.0)):
+        failed_out[w] = 1
+
+
 class _Linear:
     """Linear tetrahedra in an order in which neighbours in the list are neighbours in space, so that caches serve nodes to all of them."""
 
@@ -260,6 +284,9 @@ class _Linear:
     def force(self, mu, lam, x, on, inverted):
         kernel = corotational_force if self.law == 0 else linear_force
         wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, on], [self.corner, inverted], device=self.device)
+
+    def refuse_inverted(self, x, asked, failed):
+        wp.launch(flag_turned_inside_out, self._dim, [*self._mesh[:2], x, asked], [failed], device=self.device)
 
     def product(self, mu, lam, x, p, on):
         kernel = corotational_product if self.law == 0 else linear_product
@@ -288,6 +315,11 @@ class DeviceElements:
         self._elements.force(self._scratch, mu, lam, x, self._unused)
         jacobian = self._scratch.jacobian
         wp.launch(flag_inverted, jacobian.shape, [self.law, jacobian, on], [inverted], device=self.device)
+
+    def refuse_inverted(self, x, asked, failed):
+        """Marks worlds with an inverted element at x, where `force` was evaluated last."""
+        jacobian = self._scratch.jacobian
+        wp.launch(flag_points_inside_out, jacobian.shape, [jacobian, asked], [failed], device=self.device)
 
     def product(self, mu, lam, x, p, on):
         """Tangent at x, where `force` was evaluated last, times p, by corners."""

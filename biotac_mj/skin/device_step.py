@@ -149,6 +149,7 @@ class DeviceStep:
         self._continue_solve()
         self._search()
         self._continue_search()
+        self._refuse_impossible()
         self.k.flags.zero_()
 
     # --- the step ---------------------------------------------------------------------------------------------------------------
@@ -188,6 +189,16 @@ class DeviceStep:
         self._evaluate(self.st.active)
         self._check()
         wp.capture_while(self._newton_on, self._iterate)
+        self._refuse_impossible()
+
+    def _refuse_impossible(self):
+        """Balance of an inverted element, or of skin that went through the core, is none: see `solver._Step._possible`."""
+        m, d, st = self.m, self.d, self.st
+        if m.material.law != "linear":
+            self.k.elements.refuse_inverted(d.x, st.asked, st.failed)
+        if d.core:
+            face, core = d.core.surface.face, m.core(d.nworld).struct
+            self._launch(contact.crushed_on_core, (len(face), d.nworld), [m.crushed_depth, face, core, d.x, st.asked], [st.failed])
 
     def _iterate(self):
         self._solve()

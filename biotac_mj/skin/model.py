@@ -20,6 +20,8 @@ from .types import real, vec3
 
 __all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
 
+_CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
+
 
 @dataclasses.dataclass(frozen=True)
 class SkinOptions:
@@ -172,6 +174,7 @@ class SkinModel:
         self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
         self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
+        self.crushed_depth = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness  # [m]
 
         formulation = QuadraticTetrahedra if self.element == "quadratic" else elasticity.LinearTetrahedra
         self.elasticity = formulation(vert, elem, self.law, self.device)

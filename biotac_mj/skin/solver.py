@@ -21,7 +21,6 @@ _threads = ThreadpoolController()
 _BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = 0.01
 _FACTOR = 60  # products of the tangent: about what a factor costs
-_CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
 _PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
 
@@ -196,7 +195,7 @@ class _Step:
         if m.has_core:
             depth = wp.zeros((len(d.core.surface.face), d.nworld), dtype=wp.float64, device=m.device)
             _launcher(m.device)(contact.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth])
-            good &= depth.numpy().max(0) < _CRUSHED * m.material.youngs_modulus / m.contact_stiffness
+            good &= depth.numpy().max(0) < m.crushed_depth
         return good
 
     def _pressure_settled(self, z):
