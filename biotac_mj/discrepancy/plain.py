@@ -11,8 +11,9 @@ import tqdm
 
 from .drifts import CountGain, CountOffset, Drift, GainChange, SharedGain, Thermal
 from .faults import Freeze, Quantise, Saturate, Spikes, Stuck, Swap
+from .hum import Hum
 from .loads import Hysteresis, Latency, LoadLowPass, Relaxation
-from .noises import CommonNoise, CrossTalk, Hum, LowPass, Noise
+from .noises import CommonNoise, CrossTalk, LowPass, Noise
 from .recorded_effect import Session
 from .recorded_gap import gap, statistics
 from .recorded_rest import cells, remainder

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from .hum import Hum
 from .loads import ForceEffect, ForceView, force_features
-from .noises import CrossTalk, Hum, LowPass, _lag_one, quiet, windows
+from .noises import CrossTalk, LowPass, _lag_one, quiet, windows
 from .recorded_effect import Session
 from .recording import counts_of, log_impedance
 from .timeline import Timeline, noise_level

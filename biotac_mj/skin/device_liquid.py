@@ -3,7 +3,7 @@
 import warp as wp
 
 from .device_worlds import total_of
-from .liquid import contact_pressure
+from .liquid import contact_pressure, soften_face
 from .types import mat33, real, vec3
 
 __all__ = ["release_pressure", "settle_pressure", "wet_faces"]
@@ -109,25 +109,9 @@ def release_pressure(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """See `liquid.soften_contact`; only where the tangent was made anew."""
+    """See `liquid.soften_face`; only where the tangent was made anew."""
     f, w = wp.tid()
     if on[w] == 0:
         return
-    p = pressure[w]
-    if near[f, w] == 1 and touching[f, w] == 1 and p > real(0.0):
-        nsample = sample.shape[0]
-        share = area[f] / real(nsample)
-        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness * share
-        for s in range(nsample):
-            i = f * nsample + s
-            c = contact_pressure(i, w, geom, force, share)
-            if c > real(0.0) and c < real(2.0) * reference[w]:
-                n = wp.normalize(force[i, w])
-                K = factor * wp.outer(n, n)
-                b = sample[s]
-                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
-                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
-                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
-                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
-                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
-                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+    if near[f, w] == 1 and touching[f, w] == 1 and pressure[w] > real(0.0):
+        soften_face(f, w, sample, area, stiffness, reference[w], pressure[w], geom, force, block)

@@ -155,6 +155,40 @@ def gradient_derivative(
         corner_out[3 * f + k, w] = wet[f, w][k] * g
 
 
+@wp.func
+def soften_face(
+    f: int,
+    w: int,
+    # In:
+    sample: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
+    stiffness: real,
+    reference: real,
+    p: real,
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # In, out:
+    block: wp.array2d(dtype=mat33),
+):
+    """Takes from a core face's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref) of k."""
+    nsample = sample.shape[0]
+    share = area[f] / real(nsample)
+    factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * share
+    for s in range(nsample):
+        i = f * nsample + s
+        c = contact_pressure(i, w, geom, force, share)
+        if c > real(0.0) and c < real(2.0) * reference:
+            n = wp.normalize(force[i, w])
+            K = factor * wp.outer(n, n)
+            b = sample[s]
+            block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
+            block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
+            block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
+            block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
+            block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
+            block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+
+
 @wp.kernel
 def soften_contact(
     # In:
@@ -169,26 +203,10 @@ def soften_contact(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """Takes from the core contact's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref) of k."""
+    """See `soften_face`."""
     f, w = wp.tid()
-    p = pressure[w]
-    if touching[f, w] == 1 and p > real(0.0):
-        nsample = sample.shape[0]
-        share = area[f] / real(nsample)
-        factor = wp.min(p / (real(2.0) * reference[w]), real(1.0)) * stiffness * share
-        for s in range(nsample):
-            i = f * nsample + s
-            c = contact_pressure(i, w, geom, force, share)
-            if c > real(0.0) and c < real(2.0) * reference[w]:
-                n = wp.normalize(force[i, w])
-                K = factor * wp.outer(n, n)
-                b = sample[s]
-                block[6 * f, w] = block[6 * f, w] - (b[0] * b[0]) * K
-                block[6 * f + 1, w] = block[6 * f + 1, w] - (b[0] * b[1]) * K
-                block[6 * f + 2, w] = block[6 * f + 2, w] - (b[0] * b[2]) * K
-                block[6 * f + 3, w] = block[6 * f + 3, w] - (b[1] * b[1]) * K
-                block[6 * f + 4, w] = block[6 * f + 4, w] - (b[1] * b[2]) * K
-                block[6 * f + 5, w] = block[6 * f + 5, w] - (b[2] * b[2]) * K
+    if touching[f, w] == 1 and pressure[w] > real(0.0):
+        soften_face(f, w, sample, area, stiffness, reference[w], pressure[w], geom, force, block)
 
 
 @dataclasses.dataclass(frozen=True)
