@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
 from biotac_mj.discrepancy.catalogue import _memory, by_id
 from biotac_mj.discrepancy.effect import STAGES, Run
-from biotac_mj.discrepancy.workflow import phases
+from biotac_mj.discrepancy.where import phases
 
 ROOT = pathlib.Path(__file__).parents[1]
 WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)

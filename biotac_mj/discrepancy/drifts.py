@@ -1,4 +1,4 @@
-"""Effects that develop over the record: the shared impedance gain (warm-up), other common changes, drift or gain of single electrodes."""
+"""Effects that develop over the record in all electrodes: the shared impedance gain (warm-up), temperature, changes in counts."""
 
 import numpy as np
 
@@ -6,10 +6,21 @@ from .recorded_effect import Finding, Parameter, RecordedEffect
 from .recording import counts_of, log_impedance
 from .shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 
-__all__ = ["CountGain", "CountOffset", "Drift", "GainChange", "SharedGain", "Thermal"]
+__all__ = [
+    "LENGTH",
+    "ONSET",
+    "Common",
+    "CountGain",
+    "CountOffset",
+    "SharedGain",
+    "Thermal",
+    "TimeShaped",
+    "counts_per_log",
+    "least_squares",
+]
 
-_LENGTH = Parameter("s", 0.1, 1e5, "the record; warm-up of real sensors: minutes (Mongeon 2015, finger_force_control)")
-_ONSET = Parameter("s", 0, 1e6, "the record")
+LENGTH = Parameter("s", 0.1, 1e5, "the record; warm-up of real sensors: minutes (Mongeon 2015, finger_force_control)")
+ONSET = Parameter("s", 0, 1e6, "the record")
 
 
 class TimeShaped(RecordedEffect):
@@ -54,7 +65,7 @@ class TimeShaped(RecordedEffect):
             parameters["tau"] = (shape.tau, *shape.interval.get("tau", (np.nan, np.nan)))
         if shape.onset > line.time[0] + 1e-9:
             parameters["onset"] = (shape.onset, *shape.interval.get("onset", (np.nan, np.nan)))
-        slope = np.abs(np.median(_counts_per_log(session.counts), axis=0))
+        slope = np.abs(np.median(counts_per_log(session.counts), axis=0))
         sizes = np.abs(shape.amplitude * full) * slope * (np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end)))
         parameters["counts"] = (float(np.median(sizes[list(channels)])), np.nan, np.nan)
         note = {"exponential": "levels off exponentially", "ramp": "goes on steadily", "step": "jumps", "pulse": "comes and goes"}[
@@ -72,7 +83,7 @@ class TimeShaped(RecordedEffect):
         return line.amplitude(finding.theta["pattern"][line.used])
 
 
-class _Common(TimeShaped):
+class Common(TimeShaped):
     def pattern(self, counts):
         raise NotImplementedError
 
@@ -144,13 +155,13 @@ class _Common(TimeShaped):
                         {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
 
 
-class SharedGain(_Common):
+class SharedGain(Common):
     id, name, stage = "warmup", "shared impedance gain (warm-up)", "T"
     physics = "all impedances are multiplied by one factor that changes with time: the liquid's conductivity while the sensor warms up"
     params = {
         "amplitude": Parameter("ln Z", -1, 1, "-0.23 measured on an unloaded sensor over 190 s; Mongeon 2015: 10-17 % of full scale"),
-        "tau": _LENGTH,
-        "onset": _ONSET,
+        "tau": LENGTH,
+        "onset": ONSET,
     }
     confusable = {
         "thermal": "log TDC", "count_offset": "electrodes with very different rest counts", "drift": "one electrode or all",
@@ -161,7 +172,7 @@ class SharedGain(_Common):
         return np.ones(19)
 
 
-class _InCounts(_Common):
+class _InCounts(Common):
     """Patterns that are exact in counts, not in ln Z: theta["counts"] holds the factor from level to counts."""
 
     multiplies = False
@@ -169,7 +180,7 @@ class _InCounts(_Common):
     def _finding(self, session, line, pattern, shape, channels):
         found = super()._finding(session, line, pattern, shape, channels)
         counts = np.median(session.counts[session.fit], axis=0)[line.used]
-        mass = (counts if self.multiplies else 1) / np.abs(_counts_per_log(counts))
+        mass = (counts if self.multiplies else 1) / np.abs(counts_per_log(counts))
         found.theta["counts"] = -1 / float(mass.mean())
         return found
 
@@ -187,13 +198,13 @@ class CountOffset(_InCounts):
     physics = "all channels move by the same number of counts: reference or ground of the converter"
     params = {
         "amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "up to some hundred counts"),
-        "tau": _LENGTH,
-        "onset": _ONSET,
+        "tau": LENGTH,
+        "onset": ONSET,
     }
     confusable = {"warmup": "electrodes with very different rest counts", "count_gain": "the same"}
 
     def pattern(self, counts):
-        v = 1 / np.abs(_counts_per_log(counts))
+        v = 1 / np.abs(counts_per_log(counts))
         return v / v.mean()
 
 
@@ -201,169 +212,15 @@ class CountGain(_InCounts):
     multiplies = True
     id, name, stage = "count_gain", "common gain in counts (amplifier, excitation)", "A"
     physics = "all counts are multiplied by one factor: amplifier or excitation amplitude"
-    params = {"amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "some per cent"), "tau": _LENGTH, "onset": _ONSET}
+    params = {"amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "some per cent"), "tau": LENGTH, "onset": ONSET}
     confusable = {"warmup": "electrodes with very different rest counts", "count_offset": "the same"}
 
     def pattern(self, counts):
-        v = counts / np.abs(_counts_per_log(counts))
+        v = counts / np.abs(counts_per_log(counts))
         return v / v.mean()
 
 
-class Drift(TimeShaped):
-    id, name, stage = "drift", "drift or step of single electrodes", "A"
-    physics = "one electrode moves away from what the others say: drifting or jumping offset of its channel"
-    params = {
-        "amplitude": Parameter("ln Z", -2, 2, "up to hundreds of counts (warm-up tables, Mongeon 2015)"),
-        "tau": _LENGTH,
-        "onset": _ONSET,
-    }
-    confusable = {"gain": "load the electrode before and after: an offset does not scale with the signal", "warmup": "one electrode or all"}
-
-    def find(self, session):
-        line = session.timeline()
-        kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
-        best = None
-        slope = np.abs(np.median(_counts_per_log(session.counts), axis=0))[line.used]
-        common = max(
-            (f.parameters["counts"][0] for f in session.findings if isinstance(f.effect, _Common) and "counts" in f.parameters), default=0.0
-        )
-        for k in _whole_electrodes(session, line):
-            unit = np.zeros(len(line.used))
-            unit[k] = 1
-            series, sd = line.amplitude(unit)
-            through = line.explained_by_others(k) if line.loaded else None
-            if through is not None:
-                series = through(line.value[:, k] - line.value[:, k].mean())
-                sd = max(series.std(), line.noise[k])
-            shape = fit_shapes(line.time, series, kinds, tests=len(line.used), floor=sd * 0.1, through=through)
-            if shape is None or shape.nats < (15 if line.loaded else 8):
-                continue
-            if line.loaded and shape.nats < 20:
-                continue
-            size = abs(shape.amplitude) * slope[k] * np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end))
-            floor = max(2.0, 0.7 * line.noise[k] * np.sqrt(line.width) * slope[k])
-            # Real electrodes share a gain to 3 %: what is left of it is no drift of their own.
-            if size < max(floor, 0.12 * common) or (line.loaded and (shape.explained < 0.3 or size < 3 * floor)):
-                continue
-            energy = np.sum((series - series.mean()) ** 2) * shape.explained / sd**2
-            if best is None or energy > best[0]:
-                best = energy, k, unit, shape
-        if best is None or not line.loaded:
-            jump = self._jump(session, line)
-            if jump and (best is None or jump[0].nats > 50):
-                return jump
-        if best is None:
-            return []
-        _, k, unit, shape = best
-        found = self._finding(session, line, unit, shape, (int(line.used[k]),))
-        if not line.loaded:
-            found.ties = ("gain",)  # without load an offset and a gain of the channel look alike
-            found.note += "; unloaded, an offset and a gain of the channel look alike"
-        return [found]
-
-    def _jump(self, session, line):
-        """One electrode changes its level from one second to the next while the others stand still."""
-        known = session.known_jumps
-        at, step, w = line.jumps(known)
-        if not len(at):
-            return []
-        n, c = line.value.shape
-        P = np.linalg.inv(line.covariance)
-        alone = step @ P / np.diag(P)
-        moving = np.sqrt((np.sort(np.abs(step), axis=1)[:, : c - 2] ** 2).mean(1))
-        z = np.abs(alone) / np.hypot(line.noise * np.sqrt(2 / w), 0.5 * moving[:, None])
-        order = np.sort(z, axis=1)
-        lone = order[:, -2] < 0.35 * order[:, -1]
-        score = np.where(lone, order[:, -1], 0)
-        i = int(np.argmax(score))
-        k = int(np.argmax(z[i]))
-        slope = np.abs(np.median(_counts_per_log(session.counts), axis=0))[line.used][k]
-        if score[i] < 10 or abs(alone[i, k]) * slope < 15:
-            return []
-        time = float(line.time[at[i]])
-        unit = np.zeros(c)
-        unit[k] = 1
-        half = 2 * float(line.noise[k]) / np.sqrt(w) + 0.5 * float(moving[i])
-        value = float(alone[i, k]) if line.loaded else float(line.jump_at(at[i], known)[k])
-        shape = ShapeFit("step", time, 0.0, np.inf, value, 0.0, float(min(0.5 * score[i] ** 2 - np.log(n * c), 200)), half, n, 1.0,
-                         {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
-        found = self._finding(session, line, unit, shape, (int(line.used[k]),))
-        found.ties = ("gain",)
-        found.note += f"; the other electrodes stand still meanwhile ({abs(value) * slope:.0f} counts)"
-        return [found]
-
-
-class GainChange(RecordedEffect):
-    id, name, stage, unit = "gain", "per-electrode gain change", "A", "relative gain"
-    physics = "from some time on one electrode's response to load is multiplied by a factor"
-    params = {"gain": Parameter("1", -0.95, 3, "manufacturing scatter 3-15 %, damage more"), "onset": _ONSET}
-    confusable = {"drift": "load the electrode before and after", "saturate": "depth ladder at one place"}
-
-    def find(self, session):
-        line = session.timeline()
-        if not line.loaded:
-            return []
-        best, alone = None, {}
-        n = len(line.time)
-        cuts = np.unique(np.linspace(0.04 * n, 0.96 * n, 48).astype(int))
-        for k in _whole_electrodes(session, line):
-            through = line.explained_by_others(k)
-            residual = through(line.value[:, k] - np.median(line.value[:, k]))
-            signal = line.value[:, k] - np.median(line.value[:, k]) - residual
-            if signal.std() < 4 * line.noise[k]:
-                continue
-            for start, stop in [(c, n) for c in cuts] + [(a, b) for i, a in enumerate(cuts[::4]) for b in cuts[::4][i + 1 :]]:
-                on = np.zeros(n)
-                on[start:stop] = 1
-                share = (stop - start) / n
-                if not 0.1 < share < 0.9 or min(signal[on > 0].std(), signal[on == 0].std()) < 0.4 * signal.std():
-                    continue  # a gain shows where the load changes, on both sides
-                base = np.ones((n, 1))
-                more = np.concatenate([base, through(np.stack([on, on * signal], axis=1))], axis=1)
-                rss0, _ = _least_squares(base, residual)
-                rss1, w = _least_squares(more, residual)
-                alone[k] = max(alone.get(k, 0.0), float(np.log(rss0 / rss1)))
-                if best is None or rss0 / rss1 > best[0]:
-                    best = rss0 / rss1, k, start, stop, w, rss1, residual, signal, more
-        if best is None:
-            return []
-        ratio, k, start, stop, w, rss1, residual, signal, more = best
-        neff = max(4.0, n / correlation_length(residual - more @ w))
-        nats = 0.5 * neff * np.log(ratio) - 2 * np.log(neff) - np.log(19) - 3
-        gain = float(w[2])
-        # Where the place of a contact bends the relations, several electrodes seem to change: a gain is one electrode's.
-        shared = max((v for i, v in alone.items() if i != k), default=0.0) > 0.6 * alone[k]
-        if nats < 25 or ratio < 1.6 or shared or not 0.08 < abs(gain) < 1.2:
-            return []
-        covariance = np.linalg.pinv(more.T @ more) * rss1 / n * n / neff
-        half = 1.96 * float(np.sqrt(covariance[2, 2]))
-        whole = stop >= n
-        first = float(line.time[start] - line.period / 2)
-        last = float(session.recording.time[-1]) if whole else float(line.time[stop - 1] + line.period / 2)
-        channel = int(line.used[k])
-        rest = float(np.median(line.value[:, k]))
-        shift = float(w[1])
-        theta = {"ratio": ratio, "gain": gain, "rest": rest, "start": first, "end": np.inf if whole else last, "shift": shift}
-        parameters = {"gain": (gain, gain - half, gain + half), "onset": (first, first - 2 * line.period, first + 2 * line.period)}
-        note = f"its response to load changes by {gain:+.0%} against what the other electrodes say"
-        return [Finding(self, (channel,), theta, parameters, nats, first, last, float(np.exp(-min(nats, 700))), note=note)]
-
-    def apply(self, counts, time, channels, theta):
-        return self._scale(counts, time, channels, theta, 1 + theta["gain"], theta["shift"], False)
-
-    def correct(self, counts, time, channels, theta):
-        return self._scale(counts, time, channels, theta, 1 / max(1 + theta["gain"], 0.05), theta["shift"], True)
-
-    @staticmethod
-    def _scale(counts, time, channels, theta, factor, shift, inverse):
-        out = counts.copy()
-        rows = (time >= theta["start"]) & (time < theta["end"])
-        z = log_impedance(counts[rows, channels[0]]) - theta["rest"]
-        out[rows, channels[0]] = counts_of(theta["rest"] + ((z - shift) * factor if inverse else z * factor + shift))
-        return out
-
-
-class Thermal(_Common):
+class Thermal(Common):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
     physics = "all impedances follow the core's temperature, with a lag"
     params = {
@@ -385,7 +242,7 @@ class Thermal(_Common):
         for lag in (0.0, 0.5, 1, 2, 4, 8, 16, 32, 64, 128):
             x = np.interp(line.time, recording.time, _lagged(temperature, lag, recording.rate))
             design = np.stack([np.ones(len(x)), x], axis=1)
-            rss, w = _least_squares(design, series)
+            rss, w = least_squares(design, series)
             if best is None or rss < best[0]:
                 best = rss, lag, w, design
         rss, lag, w, design = best
@@ -413,17 +270,12 @@ class Thermal(_Common):
         return theta["slope"] * np.interp(time, np.arange(len(lagged)) / theta["rate"], lagged)
 
 
-def _whole_electrodes(session, line):
-    """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken for a drift."""
-    return [i for i, k in enumerate(line.used) if session.masked[session.fit, k].mean() < 0.03]
-
-
-def _counts_per_log(counts):
+def counts_per_log(counts):
     """dE / d ln Z of raw counts (negative)."""
     return -counts * (1 - counts / 4095)
 
 
-def _least_squares(design, x):
+def least_squares(design, x):
     w, *_ = np.linalg.lstsq(design, x, rcond=None)
     residual = x - design @ w
     return float(residual @ residual) + 1e-30, w

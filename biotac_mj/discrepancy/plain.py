@@ -9,7 +9,8 @@ import dataclasses
 import numpy as np
 import tqdm
 
-from .drifts import CountGain, CountOffset, Drift, GainChange, SharedGain, Thermal
+from .drifts import CountGain, CountOffset, SharedGain, Thermal
+from .electrode_drifts import Drift, GainChange
 from .faults import Freeze, Quantise, Saturate, Spikes, Stuck, Swap
 from .hum import Hum
 from .loads import Hysteresis, Latency, LoadLowPass, Relaxation

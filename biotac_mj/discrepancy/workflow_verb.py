@@ -10,7 +10,8 @@ from ..press_record import replacing
 from .effect import STAGES
 from .simulator import Simulator, load_simulator
 from .trajectories import read_trajectories
-from .workflow import THRESHOLDS, Report, diagnose, phases, threshold_hash
+from .where import phases
+from .workflow import THRESHOLDS, Report, diagnose, threshold_hash
 
 __all__ = ["diagnose_data", "summary", "verdict_dict", "write_report"]
 
