@@ -261,5 +261,59 @@ def test_the_real_unloaded_sensor_warms_up():
 def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert "warmup" in ids(d) and d.locked == 0.3
-    for view in ("electrodes from force", "each electrode from the others"):
-        assert d.gap[view]["after"] < d.gap[view]["before"]
+    assert len(d.gap) == 3
+    for view in d.gap.values():
+        assert view["after"] < view["before"]
+
+
+# --- which amendments a view takes ---------------------------------------------------------------------------------------------------
+
+
+def test_what_is_seen_of_a_force_is_undone():
+    from biotac_mj.discrepancy.loads import Hysteresis, Latency, LoadLowPass, Relaxation
+
+    _, force, _ = pressed(3)
+    force = np.cumsum(force - force.mean(0), axis=0)
+    force = force / force.std(0)  # smooth
+    for effect, theta in (
+        (Latency(), {"delay": 0.073, "start": 0.0, "end": np.inf}),
+        (Latency(), {"delay": 0.073, "start": 20.0, "end": 50.0}),
+        (LoadLowPass(), {"tau": 0.04}),
+        (Relaxation(), {"fraction": 0.3, "tau": 1.5}),
+        (Hysteresis(), {"fraction": 0.2, "width": np.full(3, 0.1)}),  # its loop follows the force that is asked for: the least exact
+    ):
+        seen = effect.see(force, RATE, theta)
+        left = (effect.unsee(seen, RATE, theta) - force)[100:-100].std()
+        assert left < 0.2 * (seen - force).std(), effect.id
+
+
+def test_the_part_kept_aside_does_not_choose():
+    """Choices of amendments are the same whatever the last rows hold."""
+    from biotac_mj.discrepancy.recorded_effect import Session
+    from biotac_mj.discrepancy.recorded_views import choose
+
+    e, force, rng = pressed(8)
+    z = (4095 / e - 1) * np.exp(-0.3 * (1 - np.exp(-np.arange(len(e)) / 2500)))[:, None]
+    counts = noisy(4095 / (z + 1), rng)
+    d = diagnose_recording(Recording(counts, force))
+    assert "warmup" in ids(d)
+    fit, views = d.session.fit, list(d.gap)
+    chosen = choose(d.session, d.session.findings, views)
+    counts[~fit], force[~fit] = counts[~fit][::-1], -force[~fit]
+    other = Session(Recording(counts, force), fit)
+    again = choose(other, d.session.findings, views)
+    assert chosen == again and any(c.time != "none" for v in views for c in chosen[v][0])
+    for name, view in d.gap.items():
+        assert view["after"] < view["before"] or name == "force from electrodes" and view["after"] == view["before"]
+
+
+def test_a_trend_that_turns_round_is_not_carried_on():
+    """A gain that comes and goes: carried on it would be wrong, and earlier turns inside the part fitted say so."""
+    from biotac_mj.discrepancy.recorded_views import Choice, _best
+
+    asked = [Choice("carried on"), Choice("held"), Choice("none")]
+    trials = np.array([[0.0, 0, 0], [0.3, 0.2, 0], [-0.2, -0.2, 0], [0.1, -0.05, 0]])
+    assert asked[_best(asked, trials, trials[1:].mean(0), wary=True)].time == "held"
+    assert asked[_best(asked, trials[:3], trials[:3].mean(0), wary=True)].time == "none"
+    assert asked[_best(asked, trials[:1] - [0.5, 0.6, 0], np.array([-0.5, -0.6, 0]), wary=True)].time == "none"
+    assert asked[_best(asked, 0 * trials, np.zeros(3), wary=False)].time == "carried on"

@@ -70,11 +70,14 @@ class ForceView:
 
 
 class ForceEffect(RecordedEffect):
-    """Subclasses write `see(force, rate, theta)`: the force that the electrodes follow."""
+    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, and its inverse `unsee`."""
 
     unit = "N"
 
     def see(self, force, rate, theta):
+        raise NotImplementedError
+
+    def unsee(self, force, rate, theta):
         raise NotImplementedError
 
 
@@ -138,6 +141,11 @@ class Latency(ForceEffect):
         on = ((time >= theta["start"]) & (time < theta["end"]))[:, None]
         return np.where(on, late, shift(force, theta.get("otherwise", 0.0) * rate))
 
+    def unsee(self, force, rate, theta):
+        time = np.arange(len(force)) / rate
+        on = ((time >= theta["start"]) & (time < theta["end"]))[:, None]
+        return np.where(on, shift(force, -theta["delay"] * rate), shift(force, -theta.get("otherwise", 0.0) * rate))
+
     def apply(self, counts, time, channels, theta):
         rate = (len(time) - 1) / (time[-1] - time[0])
         return shift(counts, theta["delay"] * rate)
@@ -178,6 +186,10 @@ class LoadLowPass(ForceEffect):
 
     def see(self, force, rate, theta):
         return lagged(force, theta["tau"], rate)
+
+    def unsee(self, force, rate, theta):
+        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify the electrodes' noise
+        return force + shift(force, -0.5 * theta["tau"] * rate) - shift(force, 0.5 * theta["tau"] * rate)
 
     def apply(self, counts, time, channels, theta):
         return lagged(counts, theta["tau"], (len(time) - 1) / (time[-1] - time[0]))
@@ -232,6 +244,9 @@ class Relaxation(ForceEffect):
         g, tau = theta["fraction"], theta["tau"]
         return force - g / (1 + g) * (force - lagged(force, tau * (1 + g), rate))
 
+    def unsee(self, force, rate, theta):
+        return force + theta["fraction"] * (force - lagged(force, theta["tau"], rate))
+
 
 class Hysteresis(ForceEffect):
     id, name, stage = "hyster", "rate-independent hysteresis", "C"
@@ -277,6 +292,9 @@ class Hysteresis(ForceEffect):
 
     def see(self, force, rate, theta):
         return force - theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
+
+    def unsee(self, force, rate, theta):
+        return force + theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
 
 
 def shift(x, delay):

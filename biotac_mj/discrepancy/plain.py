@@ -79,7 +79,7 @@ def diagnose_recording(recording: Recording, locked: float | None = None, effect
         result = RecordingDiagnosis(recording, locked, "", session.findings, rejected, [], {}, {}, [], session)
         _settle(result, late)
         result.where = cells(session)
-        result.gap = gap(session, result.findings)
+        result.gap = gap(result.session, [f for f in result.session.findings if f not in late], late)
         result.remainder = remainder(session)
         result.notes = _notes(result)
         result.verdict = _verdict(result)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from .hum import Hum
-from .loads import ForceEffect, ForceView, force_features
+from .loads import ForceEffect, ForceView
 from .noises import CrossTalk, LowPass, _lag_one, quiet, windows
 from .recorded_effect import Session
-from .recording import counts_of, log_impedance
-from .timeline import Timeline, noise_level
+from .recorded_views import VIEWS, Amended, Choice, choose, cross_residual, squares, whole_line
+from .timeline import noise_level
 
 __all__ = ["gap", "statistics"]
 
@@ -75,20 +75,8 @@ def _compare(finding, without, both):
     return {"name": name, "unit": unit, "before": before, "after": after, "part": place}, verified
 
 
-def fitted_line(session, counts):
-    """Timeline of the whole record with mean and covariance of the part fitted: (timeline, deviation (m, c), rows fitted (m,))."""
-    line = session.timeline(slice(0, len(session.recording)), counts)
-    known = session.timeline(None, counts)
-    common = np.intersect1d(line.used, known.used)
-    if len(common) < len(line.used) or len(common) < len(known.used):
-        raise RuntimeError("electrodes differ between the parts")
-    line.covariance = known.covariance
-    inside = line.time < session.recording.time[session.fit][-1]
-    return line, line.value - line.value[inside].mean(0), inside
-
-
 def _pattern_rms(session, finding, rows):
-    line, deviation, _ = _line(session)
+    line, deviation, _ = whole_line(session)
     pattern = finding.theta["pattern"][line.used]
     q = np.linalg.solve(line.covariance, pattern)
     series = deviation @ q / (pattern @ q)
@@ -97,38 +85,12 @@ def _pattern_rms(session, finding, rows):
 
 
 def _electrode_rms(session, channel, rows):
-    line, deviation, _ = _line(session)
+    line, deviation, _ = whole_line(session)
     k = int(np.flatnonzero(line.used == channel)[0])
     residual = cross_residual(line, deviation)[:, k]
     where = np.interp(line.time, session.recording.time, rows.astype(float)) > 0.5
     e = np.median(session.counts[:, channel])
     return float(np.sqrt((residual[where] ** 2).mean()) * e * (1 - e / 4095))
-
-
-def cross_residual(line, deviation):
-    """(m, c) of every electrode against what the others predict [ln Z]."""
-    P = np.linalg.inv(line.covariance)
-    return deviation @ P / np.diag(P)
-
-
-def _line(session):
-    n = len(session.recording)
-    line = Timeline(_as_recording(session), masked=session.masked)
-    inside = line.time < session.recording.time[session.fit][-1]
-    known = session.timeline()
-    place = [int(np.flatnonzero(line.used == k)[0]) for k in known.used if k in line.used]
-    keep = [i for i, k in enumerate(known.used) if k in line.used]
-    line.used, line.value, line.noise = line.used[place], line.value[:, place], line.noise[place]
-    line.covariance = known.covariance[np.ix_(keep, keep)]
-    del n
-    return line, line.value - line.value[inside].mean(0), inside
-
-
-def _as_recording(session):
-    from .recording import Recording
-
-    r = session.recording
-    return Recording(np.clip(session.counts, 0, 4095), None, None, r.rate, r.rate_source, r.name)
 
 
 def _line_amplitude(session, finding, rows):
@@ -157,107 +119,68 @@ def _force_error(session):
     return float(np.exp(0.5 * view.errors(session.force).mean()))
 
 
-def _force_rms(session):
-    """RMS error of force from electrodes, fitted on one part and taken on the other [N]."""
-    z = log_impedance(session.counts)
-    fit, locked = session.fit, ~session.fit
-    mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
-    A = np.concatenate([np.ones((len(z), 1)), (z - mean) / sd], axis=1)
-    target = session.force
-    ridge = 1e-3 * fit.sum() * np.eye(20)
-    ridge[0, 0] = 0
-    w = np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ target[fit])
-    return float(np.sqrt(((target[locked] - A[locked] @ w) ** 2).mean()))
+def gap(session, findings, late=()) -> dict:
+    """Views of the whole model before and after, on the part kept aside: RMS, of electrodes also one by one [counts].
 
+    Args:
+      session: with the rows fitted and the samples masked; findings: accepted on the rows fitted, in that order; late: those that begin
+        in the part kept aside and have been fitted there: they enter `after_with_late` alone.
 
-def gap(session, findings) -> dict:
-    """Views of the whole model before and after: each with per-electrode RMS [counts] on the part kept aside."""
-    recording, fit = session.recording, session.fit
-    locked = ~fit
-    measured = recording.electrodes
+    `amendments` says which of the findings each view takes, `trials` why: see `recorded_views`.
+    """
+    recording = session.recording
+    locked = ~session.fit
     loaded = session.timeline().loaded
-    raw = Session(recording, fit)
-    raw.masked = session.masked
-    views = {}
-    good = ~session.masked
-    noise = noise_level(measured[fit], recording.repeated[fit])
+    names = []
     if recording.force is not None and session.force_view() is not None:
-        before = _from_force(recording.force, measured, fit)
-        after = _forward(_from_force(session.force, session.counts, fit), findings, recording.time)
-        views["electrodes from force"] = _view(measured, before, after, locked, good, noise)
-        one, two = _force_rms(raw), _force_rms(session)
-        views["force from electrodes"] = {"unit": "N", "before": one, "after": two, "variance_removed": 1 - (two / max(one, 1e-12)) ** 2}
+        names += ["electrodes from force", "force from electrodes"]
     elif not loaded:
-        before = np.tile(counts_of(log_impedance(measured[fit]).mean(0)), (len(measured), 1))
-        level = counts_of(log_impedance(session.counts[fit]).mean(0))
-        after = _forward(np.tile(level, (len(measured), 1)), findings, recording.time)
-        views["electrodes at rest"] = _view(measured, before, after, locked, good, noise)
+        names += ["electrodes at rest"]
     if loaded:
-        values = []
-        for s in (raw, session):
-            line, deviation, inside = _line(s)
-            e = np.median(measured, axis=0)[line.used]
-            residual = cross_residual(line, deviation)[~inside] * e * (1 - e / 4095)
-            values.append(np.sqrt((residual**2).mean(0)))
-        before, after = (float(np.sqrt((v**2).mean())) for v in values)
-        views["each electrode from the others"] = {
-            "unit": "counts", "before": before, "after": after, "variance_removed": 1 - (after / max(before, 1e-12)) ** 2,
-            "channels_before": values[0].tolist(), "channels_after": values[1].tolist(),
-        }  # fmt: skip
+        names += ["each electrode from the others"]
+    chosen = choose(session, findings, names)
+    views = {}
+    for name in names:
+        choices, trials = chosen[name]
+        before = _view(name, session, findings, [Choice("none", False)] * len(choices), locked)
+        after = _view(name, session, findings, choices, locked)
+        view = views[name] = {"unit": "N" if name.startswith("force") else "counts", "before": before.pop("rms"), "after": after.pop("rms")}
+        view["variance_removed"] = 1 - (view["after"] / max(view["before"], 1e-12)) ** 2
+        view |= {f"{key}_before": value for key, value in before.items() if key != "wander"}
+        view |= {f"{key}_after": value for key, value in after.items() if key != "wander"}
+        if "wander" in before:
+            floor = float(np.sqrt((noise_level(recording.electrodes[session.fit], recording.repeated[session.fit]) ** 2).mean()))
+            closable = max(view["before"] ** 2 - floor**2, 1e-12)
+            view["noise"] = floor
+            view["closed"] = (
+                float(np.clip((view["before"] ** 2 - view["after"] ** 2) / closable, -9, 1))
+                if view["before"] > 1.05 * floor
+                else float("nan")
+            )  # noqa: E501
+            view["drift_variance_removed"] = 1 - after["wander"] / max(before["wander"], 1e-12)
+        view["amendments"] = [c.text(findings) for c in choices]
+        view["trials"] = trials
+        if late:
+            view["after_with_late"] = _view(name, session, [*findings, *late], choices, locked)["rms"]
     return views
 
 
-def _forward(counts, findings, time):
-    for f in reversed(findings):
-        if not isinstance(f.effect, (ForceEffect, LowPass)):
-            counts = f.apply(counts, time)
-    return counts
-
-
-def _from_force(force, counts, fit):
-    """(n, 19) counts as a quadratic, static function of force says, fitted on the rows to fit; ridge chosen by blocks of time."""
-    y = log_impedance(counts)
-    A = force_features(force)
-    A[:, 1:] = (A[:, 1:] - A[fit, 1:].mean(0)) / np.maximum(A[fit, 1:].std(0), 1e-6)
-    A = np.clip(A, -4, 4)  # no extrapolation of squares
-    rows = np.flatnonzero(fit)
-    block = np.minimum(np.arange(len(rows)) * 12 // len(rows), 11)
-    best = None
-    for strength in (1e-4, 1e-3, 1e-2, 1e-1, 1.0):
-        ridge = strength * len(rows) * np.eye(A.shape[1])
-        ridge[0, 0] = 0
-        error = 0.0
-        for b in range(0, 12, 2):
-            train, test = rows[block != b], rows[block == b]
-            w = np.linalg.solve(A[train].T @ A[train] + ridge, A[train].T @ y[train])
-            error += ((y[test] - A[test] @ w) ** 2).sum()
-        if best is None or error < best[0]:
-            best = error, ridge
-    w = np.linalg.solve(A[rows].T @ A[rows] + best[1], A[rows].T @ y[rows])
-    return counts_of(A @ w)
-
-
-def _view(measured, before, after, locked, good, noise):
-    weight = good[locked]
-
-    def rms(prediction):
-        error = np.where(weight, prediction[locked] - measured[locked], 0)
-        return np.sqrt((error**2).sum(0) / np.maximum(weight.sum(0), 1))
-
-    b, a = rms(before), rms(after)
-    one, two, floor = (float(np.sqrt((v**2).mean())) for v in (b, a, noise))
-    closable = max(one**2 - floor**2, 1e-12)
-    # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset counts.
-    width = max(1, len(measured[locked]) // 60)
-    m = locked.sum() // width
-
-    def wander(prediction):
-        error = (prediction[locked] - measured[locked])[: m * width].reshape(m, width, -1).mean(1)
-        return float(((error - error.mean(0)) ** 2).mean())
-
-    return {
-        "unit": "counts", "before": one, "after": two, "noise": floor, "variance_removed": 1 - (two / max(one, 1e-12)) ** 2,
-        "closed": float(np.clip((one**2 - two**2) / closable, -9, 1)) if one > 1.05 * floor else float("nan"),
-        "drift_variance_removed": 1 - wander(after) / max(wander(before), 1e-12),
-        "channels_before": b.tolist(), "channels_after": a.tolist(),
-    }  # fmt: skip
+def _view(name, session, findings, choices, locked):
+    """RMS of a view on the part kept aside, each of its components amended by its own choice."""
+    found = {c: Amended(session, findings, c) for c in dict.fromkeys(choices)}
+    if name == "force from electrodes":
+        each = np.array([squares(name, found[c], locked)[k] for k, c in enumerate(choices)])
+        return {"rms": float(np.sqrt(each.mean())), "components": np.sqrt(each).tolist()}
+    said, measured, time = VIEWS[name](found[choices[0]])
+    inside = np.interp(time, session.recording.time, locked.astype(float)) > 0.5
+    error = (said - measured)[inside]
+    good = ~session.masked[inside] if len(said) == len(locked) else np.ones(error.shape, bool)
+    channels = np.sqrt((error**2 * good).sum(0) / np.maximum(good.sum(0), 1))
+    out = {"rms": float(np.sqrt((channels**2).mean())), "channels": channels.tolist()}
+    if len(said) == len(locked):
+        # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset counts.
+        width = max(1, len(error) // 60)
+        m = len(error) // width
+        slow = error[: m * width].reshape(m, width, -1).mean(1)
+        out["wander"] = float(((slow - slow.mean(0)) ** 2).mean())
+    return out

@@ -11,7 +11,7 @@ from ..press_record import replacing
 from .drifts import TimeShaped
 from .plain import EFFECTS, RecordingDiagnosis
 from .recorded_effect import STAGES
-from .recorded_gap import _line
+from .recorded_views import whole_line
 
 __all__ = ["summary", "verdict_dict", "write_report"]
 
@@ -97,6 +97,9 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
         lines.append(f"  not confirmed by the part kept aside, left out: {f.effect.name}")
     for name, view in d.gap.items():
         lines.append(f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept aside")
+        lines.append(f"    amended by {_amendments(view)} (walk-forward trials in the part fitted)")
+        if "after_with_late" in view:
+            lines.append(f"    {view['after_with_late']:.4g} with what begins in that part and was fitted there")
         if "drift_variance_removed" in view and view["before"] > 1.05 * view["noise"]:
             lines.append(
                 f"    variance removed {view['variance_removed']:.1%}, of the drift within that part {view['drift_variance_removed']:.1%}"
@@ -111,6 +114,14 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
         )
     lines += [f"  cannot be known: {n}" for n in d.notes[1:]]
     return "\n".join(lines)
+
+
+def _amendments(view):
+    """The view's choices in words; of three force components one by one where they differ."""
+    choices = view["amendments"]
+    if len(set(choices)) == 1:
+        return choices[0]
+    return "; ".join(f"{name}: {c}" for name, c in zip(("Fx", "Fy", "Fz"), choices))
 
 
 def write_report(diagnosis: RecordingDiagnosis, folder) -> list:
@@ -206,7 +217,7 @@ def _shapes(d, shaped):
         for other in d.findings:
             if other is not f:
                 s._take_out(other)
-        line, deviation, _ = _line(s)
+        line, deviation, _ = whole_line(s)
         pattern = f.theta["pattern"][line.used]
         q = np.linalg.solve(line.covariance, pattern)
         ax.plot(line.time, deviation @ q / (pattern @ q), lw=0.7, color="0.4", label="measured, the load filtered out")
@@ -242,7 +253,8 @@ def _page(d, figures):
         for c in d.where[:12]
     )
     gaps = "".join(
-        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{esc(v['unit'])}</td><td>{v['variance_removed']:.1%}</td></tr>"
+        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{esc(v['unit'])}</td><td>{v['variance_removed']:.1%}</td>"
+        f"<td>{esc(_amendments(v))}</td></tr>"
         for n, v in d.gap.items()
     )
     apart = "".join(
@@ -264,7 +276,8 @@ the last {d.locked:.0%} took no part in the fits.</p>
 <h2>2. Where the unamended recording departs</h2><p>{len(d.where)} cells of channel x tenth of the record, family-wise 5 %.</p>
 <table><tr><th>channel</th><th>when</th><th>counts</th><th>p</th></tr>{cells}</table>
 <h2>3. Gap on the part kept aside</h2>
-<table><tr><th>view</th><th>before</th><th>after</th><th>unit</th><th>variance removed</th></tr>{gaps}</table>
+<table><tr><th>view</th><th>before</th><th>after</th><th>unit</th><th>variance removed</th><th>amended by</th></tr>{gaps}</table>
+<p>Walk-forward trials inside the part fitted decided which of the findings a view takes.</p>
 <h2>4. What is left</h2><p>{left}</p>
 <h2>5. What the recording cannot tell</h2><ul>{"".join(f"<li>{esc(n)}</li>" for n in d.notes)}</ul>
 <h2>6. What would tell alike effects apart</h2><ul>{apart or "<li>nothing was found</li>"}</ul>

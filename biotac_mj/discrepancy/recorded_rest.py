@@ -5,7 +5,7 @@ from scipy.stats import norm
 
 from .loads import force_features, lagged
 from .recorded_effect import Session
-from .recorded_gap import _line, cross_residual
+from .recorded_views import cross_residual, whole_line
 from .recording import log_impedance
 from .shapes import correlation_length
 
@@ -19,7 +19,7 @@ def cells(session) -> list:
     %."""
     raw = Session(session.recording, session.fit)
     raw.masked = session.masked
-    line, deviation, inside = _line(raw)
+    line, deviation, inside = whole_line(raw)
     one = np.ones(len(line.used))
     q = np.linalg.solve(line.covariance, one)
     series = np.column_stack([deviation @ q / (one @ q), cross_residual(line, deviation)])
@@ -60,7 +60,7 @@ def remainder(session) -> dict:
 
 
 def _remainder(session):
-    line, deviation, inside = _line(session)
+    line, deviation, inside = whole_line(session)
     slope = np.median(session.counts * (1 - session.counts / 4095), axis=0)[line.used]
     if not line.loaded:
         common = max(
