@@ -274,6 +274,7 @@ def _add_generate(verbs):
     verb.add_argument("--kinds", nargs="+", default=list(INTERACTIONS), choices=INTERACTIONS, metavar="KIND", help="how it moves")
     verb.add_argument("--element", choices=("linear", "quadratic"), help="of the skin (default: the material's, or the mesh's)")
     verb.add_argument("--batch", type=int, default=160, help="worlds at most that are solved together; a shard holds one batch")
+    verb.add_argument("--measured-batch", type=int, default=90, help="the same where the synthetic measured sensor takes part")
     verb.add_argument("--measured-seed", type=int, default=0, help="number of the synthetic measured sensor")
     verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
     verb.add_argument("--workers", type=int, help="processes that compute electrode readings (default: one per core)")
@@ -326,9 +327,7 @@ def _add_data(verbs):
     verb.add_argument("--out", required=True, metavar="DIR", help="folder of the set")
     verb = _verb(verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0.")
     verb.add_argument("set", metavar="SET", help="folder of shards")
-    verb.add_argument(
-        "--measured", action="store_true", help="measured counts, of interactions that have them, not simulated ones"
-    )
+    verb.add_argument("--measured", action="store_true", help="measured counts, of interactions that have them, not simulated ones")
     verb.add_argument("--out", required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import os
 
 import mujoco
 import numpy as np
@@ -11,15 +12,17 @@ import trimesh
 import warp as wp
 
 from biotac_mj import approach, cli, press_indenter
-from biotac_mj.data import TactileSet, nodes_of
+from biotac_mj.data import TactileSet, making, nodes_of
 from biotac_mj.data.clearance import Placed, first_touch, surface_samples
 from biotac_mj.data.generate import GenerateOptions, batches, generate
 from biotac_mj.data.objects import OBJECTS, make_object
 from biotac_mj.data.plan import KINDS, plan_motions, sensing_faces
 from biotac_mj.data.readings import sample
+from biotac_mj.data.simulate import _walk, simulate
 from biotac_mj.geometry import INDENTERS, load_skin
 from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressure
 from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin import SkinModel, SkinOptions
 
 SMALL = GenerateOptions(count=3, labelled=1, steps=8, seed=5, objects=("sphere_7mm", "table_edge"), kinds=("press", "twist"), skin="coarse",
                         measured_skin="coarse", batch=2)  # fmt: skip
@@ -155,6 +158,38 @@ def test_a_small_set_is_physics(small, skin):
             assert (one.measured_counts is not None) == one.labelled == bool(data.labelled[i])
 
 
+def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
+    # three objects in one batch against each alone; the host's solver works world by world, so only sums of other lengths differ
+    names = ["ring_7mm", "table_edge", "sphere_7mm"]
+    motions = [plan_motions(skin, name, [[0, k + 1]], 8)[0] for k, name in enumerate(names)]
+    model = SkinModel(skin, "default", SkinOptions())
+    ticks = []
+    both = simulate(model, names, motions, ticks.append)
+    assert abs(sum(ticks) - 8) < 1e-9 and both.converged.all()
+    for k, name in enumerate(names):
+        alone = simulate(model, name, motions[k : k + 1])
+        assert np.abs(both.displacement[k].astype(int) - alone.displacement[0]).max() <= 1  # rounded to 0.25 um
+        np.testing.assert_allclose(both.contact_force[k], alone.contact_force[0], atol=1e-6)
+        np.testing.assert_allclose(both.wrench[k], alone.wrench[0], atol=1e-5)
+        assert np.abs(both.wrench[k, :, :3]).max() > 0.02
+
+
+def test_a_walk_ends_at_every_time_step_in_steps_of_a_tenth_of_a_millimetre(skin):
+    motion = plan_motions(skin, "cube_14mm", [[3, 5]], 10)[0]
+    pos, mat, row = _walk(motion.pos, motion.mat)
+    assert row[row >= 0].tolist() == list(range(10))
+    np.testing.assert_array_equal(pos[row >= 0], motion.pos)
+    np.testing.assert_array_equal(mat[row >= 0], motion.mat)
+    assert np.linalg.norm(np.diff(pos, axis=0), axis=1).max() < 1.01e-4 < np.linalg.norm(np.diff(motion.pos, axis=0), axis=1).max()
+
+
+def test_several_devices_of_one_kind_only():
+    for device in ("cuda:0,cpu", "cuda:0,cuda:0", "tpu"):
+        with pytest.raises(ValueError, match="choose cpu, cuda:0, or several GPUs once each"):
+            dataclasses.replace(SMALL, device=device)
+    assert GenerateOptions(device="cuda:0, cuda:1").devices == ["cuda:0", "cuda:1"]
+
+
 def test_same_seed_same_file_and_an_interrupted_run_goes_on(small, tmp_path):
     out, _ = small
     names = sorted(p.name for p in out.glob("shard-*.h5"))
@@ -179,6 +214,25 @@ def test_worker_processes_give_the_same_whole_set(small, tmp_path):
 
 
 @pytest.mark.slow
+def test_processes_of_several_devices_make_the_same_set(small, tmp_path, monkeypatch):
+    # their pipeline with the CPU in place of the GPUs: the shards are those of one process
+    out, _ = small
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    with TactileSet(out) as data:
+        settings = data.attributes["settings"]
+    two = dataclasses.replace(SMALL, device="cuda:0,cuda:1")
+    done, told = [], []
+    seconds = making._make_on_all(tmp_path, two, settings, batches(two), 0, done.append, told.append, seen="cpu")
+    assert abs(sum(done) - 8 * 4) < 1e-6 and seconds["skin"] > 0 and os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
+    assert len(told) == 3 and "shard-00000.h5: 1 worlds" in "".join(told)
+    for path in out.glob("shard-*.h5"):
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes()
+    with pytest.raises(ValueError, match=r"cuda:\d: unknown material"):
+        bad = dataclasses.replace(two, material="jelly")
+        making._make_on_all(tmp_path / "bad", bad, settings, batches(bad), 0, done.append, told.append, seen="cpu")
+
+
+@pytest.mark.slow
 def test_recordings_keep_readings_only(tmp_path):
     options = dataclasses.replace(SMALL, count=1, labelled=0, recordings=1, kinds=("tap",))
     report = generate(tmp_path, options, workers=0, progress=False)
@@ -193,9 +247,12 @@ def test_recordings_keep_readings_only(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_same_seed_same_file_on_cuda(tmp_path):
-    options = dataclasses.replace(SMALL, count=24, labelled=8, batch=8, device="cuda:0")
-    for name in ("a", "b"):
-        generate(tmp_path / name, options, workers=0, progress=False)
+    devices = [device.alias for device in wp.get_cuda_devices()]
+    options = dataclasses.replace(SMALL, count=40, labelled=24, batch=20, measured_batch=24)
+    generate(tmp_path / "a", dataclasses.replace(options, device="cuda:0"), workers=0, progress=False)
+    # once more, by as many devices as there are
+    report = generate(tmp_path / "b", dataclasses.replace(options, device=",".join(devices)), workers=2, progress=False)
+    assert report.made == 3 and report.devices == len(devices)
     for path in (tmp_path / "a").glob("shard-*.h5"):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
@@ -213,15 +270,22 @@ def test_condensed_tier(tmp_path):
 
 
 def test_all_objects_take_turns():
-    parts = batches(GenerateOptions(count=100, labelled=20, recordings=30, batch=3))
+    parts = batches(GenerateOptions(count=100, labelled=20, recordings=30, batch=3, measured_batch=10))
     assert sorted(i for part in parts for i in part.members) == list(range(130))
     role = {name: [p for p in parts if (p.simulated, p.measured) == flags] for name, flags in
             dict(labelled=(True, True), plain=(True, False), recorded=(False, True)).items()}  # fmt: skip
     assert {i for part in role["labelled"] for i in part.members} == set(range(20))
-    assert {part.name for part in role["labelled"]} == set(INDENTERS)
-    assert {part.name for part in role["plain"]} == set(OBJECTS)
-    assert {part.name for part in role["recorded"]} == set(OBJECTS) - set(INDENTERS)
-    assert max(len(part.members) for part in parts) <= 3 and len({part.path for part in parts}) == len(parts)
+    assert {name for part in role["labelled"] for name in part.names} == set(INDENTERS)
+    assert {name for part in role["plain"] for name in part.names} == set(OBJECTS)
+    assert {name for part in role["recorded"] for name in part.names} == set(OBJECTS) - set(INDENTERS)
+    assert all(len(set(part.names)) == 1 for part in role["plain"])  # whatever is measured mixes its objects
+    assert [len(part.members) for part in role["labelled"]] == [10, 10] and len(role["recorded"]) == 3
+    assert max(len(part.members) for part in role["plain"]) <= 3 and len({part.path for part in parts}) == len(parts)
+    # an interaction has the same object whatever the batches are
+    other = batches(GenerateOptions(count=100, labelled=20, recordings=30))
+    assert dict(sorted((i, n) for p in parts for i, n in zip(p.members, p.names))) == dict(
+        sorted((i, n) for p in other for i, n in zip(p.members, p.names))
+    )
     assert parts[0].path == "shard-00000.h5" and role["recorded"][0].path == "recordings/shard-00000.h5"
 
 
@@ -251,6 +315,7 @@ def test_example(repo, tmp_path):
     "changes, text",
     [
         (dict(count=0), "count is 0"),
+        (dict(measured_batch=0), "measured_batch is 0"),
         (dict(labelled=9), "labelled is 9: it must lie between 0 and the count, 3"),
         (dict(recordings=-1), "recordings is -1"),
         (dict(rate=0.0), "rate is 0.0 Hz"),

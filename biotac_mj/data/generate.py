@@ -33,9 +33,11 @@ class GenerateOptions:
       objects, kinds: to draw from.
       skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid None: the material's.
       sensor: whose published rest counts the simulated electrodes show.
-      batch: worlds at most in a batch; a shard holds one batch.
+      batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes part in: on a fine mesh a step
+        costs a GPU the same for 20 or 100 worlds, so such a batch mixes its objects. A shard holds one batch.
       measured_seed, measured_skin: number and mesh of the synthetic measured sensor.
-      device: "cpu" or "cuda:0".
+      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as they come free. Devices of one
+        kind make the same files, however many they are.
     """
 
     count: int = 2600
@@ -53,6 +55,7 @@ class GenerateOptions:
     liquid: bool | None = None
     sensor: str = "1"
     batch: int = 160
+    measured_batch: int = 90
     measured_seed: int = 0
     measured_skin: str = "fine"
     device: str = "cpu"
@@ -60,8 +63,13 @@ class GenerateOptions:
     def __post_init__(self):
         object.__setattr__(self, "objects", tuple(self.objects))
         object.__setattr__(self, "kinds", tuple(self.kinds))
-        if self.count < 1 or self.batch < 1:
-            raise ValueError(f"count is {self.count} and batch is {self.batch}: both must be at least 1")
+        if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
+            raise ValueError(
+                f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: all must be at least 1"
+            )
+        kinds = {name.split(":")[0] for name in self.devices}
+        if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
+            raise ValueError(f"device is {self.device!r}: choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1")
         if not 0 <= self.labelled <= self.count:
             raise ValueError(f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}")
         if self.recordings < 0:
@@ -78,6 +86,10 @@ class GenerateOptions:
         if self.labelled and not set(self.objects) & set(INDENTERS):
             raise ValueError("labelled interactions are made with the eight indenters: add one of them to the objects, or take 0 labelled")
 
+    @property
+    def devices(self) -> list[str]:
+        return [name.strip() for name in self.device.split(",")]
+
 
 @dataclasses.dataclass(frozen=True)
 class Report:
@@ -86,7 +98,8 @@ class Report:
     Attributes:
       interactions, steps: in the set. recordings: in that beside it. nonconverged: of these steps.
       made: shards made by this run; those that were there are kept.
-      seconds: wall time of this run, once and per stage. bytes: of the shards. device: its name.
+      seconds: wall time of this run, once and per stage (of several devices together). bytes: of the shards. device: its name.
+      devices: how many worked at once.
     """
 
     interactions: int
@@ -97,6 +110,7 @@ class Report:
     seconds: dict
     bytes: int
     device: str
+    devices: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,12 +118,12 @@ class Batch:
     """What is simulated together and stored in one shard.
 
     Attributes:
-      name: of the object. members: numbers of the interactions.
+      names: of the object of each member. members: numbers of the interactions.
       simulated, measured: whether the simulator and whether the synthetic measured sensor takes part.
       path: of the shard in the set's folder.
     """
 
-    name: str
+    names: list
     members: list
     simulated: bool
     measured: bool
@@ -124,11 +138,13 @@ def batches(options: GenerateOptions) -> list[Batch]:
     roles = ((indenters, True, True), (options.objects, True, False), (others, False, True))
     out, number = [], {True: 0, False: 0}
     for first, end, (names, simulated, measured) in zip([0, *ends], ends, roles):
-        for k, name in enumerate(names):
-            members = np.arange(first + k, end, len(names))
-            for part in np.array_split(members, -(-len(members) // options.batch)) if len(members) else ():
+        size = options.measured_batch if measured else options.batch
+        for k in range(1 if measured else len(names)):
+            members = np.arange(first + k, end, 1 if measured else len(names))
+            for part in np.array_split(members, -(-len(members) // size)) if len(members) else ():
                 path = shard_path("" if simulated else RECORDINGS, number[simulated])
-                out.append(Batch(name, part.tolist(), simulated, measured, path.as_posix()))
+                objects = [names[(i - first) % len(names)] for i in part]
+                out.append(Batch(objects, part.tolist(), simulated, measured, path.as_posix()))
                 number[simulated] += 1
     return out
 
@@ -146,23 +162,17 @@ def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | N
       ValueError: the folder holds a set with other options, or an option is not possible.
       FileNotFoundError: no such skin.
     """
-    from ..skin import SkinModel, SkinOptions
-    from .making import Maker
+    from .making import make_shards
 
     out = pathlib.Path(out)
-    geometry = load_skin(options.skin)
+    load_skin(options.skin)  # refuses one that is not there
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {"device": options.device.split(":")[0]}
     settings = json.loads(json.dumps(settings))
     todo = [batch for batch in batches(options) if not _is_there(out / batch.path, settings)]
     begin = time.perf_counter()
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
-    seconds = {"plan": 0.0, "skin": 0.0, "measured skin": 0.0}
-    if todo:
-        model = SkinModel(geometry, options.material, SkinOptions(element=options.element, liquid=options.liquid), options.device)
-        attributes = {"settings": settings, "skin": options.skin, "material": dataclasses.asdict(model.material), "element": model.element,
-                      "tier": options.tier, "liquid": model.has_liquid, "device": _device_name(model.device)}  # fmt: skip
-        Maker(out, options, model, attributes, seconds).run(todo, workers, progress)
+    seconds = make_shards(out, options, settings, todo, workers, progress) if todo else {}
     seconds["all"] = time.perf_counter() - begin
     with TactileSet(out) as data:
         report = Report(
@@ -174,6 +184,7 @@ def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | N
             seconds={name: round(value, 1) for name, value in seconds.items()},
             bytes=sum(path.stat().st_size for path in out.rglob("shard-*.h5")),
             device=data.attributes["device"],
+            devices=len(options.devices),
         )
     if todo:
         with replacing(out / "generate.json") as temporary:
@@ -191,11 +202,3 @@ def _is_there(path, settings):
     if different:
         raise ValueError(f"{path} was generated with other options ({'; '.join(different)}): use another --out, or delete that set")
     return True
-
-
-def _device_name(device):
-    if device.is_cuda:
-        return device.name
-    import platform
-
-    return platform.processor() or platform.machine()

@@ -1,8 +1,17 @@
-"""The pipeline behind `biotac generate`: while workers read one batch, the next one is planned and simulated."""
+"""The pipeline behind `biotac generate`: while workers read one batch, the next one is planned and simulated.
+
+With several GPUs there is one such pipeline in a process for each; they take the batches one after another.
+"""
 
 import dataclasses
 import gc
+import multiprocessing
+import os
+import platform
+import queue
+import signal
 import time
+import traceback
 
 import numpy as np
 import tqdm
@@ -12,7 +21,101 @@ from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
 from .store import write_shard
 
-__all__ = ["Maker"]
+__all__ = ["Maker", "make_shards"]
+
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
+_AHEAD = 4  # batches that wait for their readings at most: they lie in memory
+
+
+def make_shards(out, options, settings, todo, workers, progress) -> dict:
+    """Makes the shards of batches `todo` in folder `out`, on all of the options' devices.
+
+    Args:
+      settings: kept with every shard. workers: processes for film and readings, shared by the devices. progress: whether to show a bar.
+
+    Returns:
+      seconds of each stage, of all devices together.
+
+    Raises:
+      ValueError: an option is not possible.
+      RuntimeError: a device's process failed; the text is its error.
+    """
+    total = options.steps * sum(batch.simulated + batch.measured for batch in todo)
+    with tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False) as bar:
+
+        def tell(text):
+            if progress:
+                bar.write(text)
+
+        if len(options.devices) == 1:
+            maker = Maker(out, options, settings, options.device, bar.update, tell)
+            maker.run(iter(todo), workers)
+            return maker.seconds
+        return _make_on_all(out, options, settings, todo, workers, bar.update, tell)
+
+
+def _make_on_all(out, options, settings, todo, workers, update, tell, seen="cuda:0"):
+    """A process for each device, in which it is the only one and called `seen`; what they tell comes through one queue."""
+    context = multiprocessing.get_context("spawn")
+    batches, news = context.Queue(), context.Queue()
+    heavy_first = sorted(todo, key=lambda batch: not batch.measured)
+    for batch in [*heavy_first, *[None] * len(options.devices)]:
+        batches.put(batch)
+    share = -(-workers // len(options.devices))
+    visible = os.environ.get(_VISIBLE)
+    names = visible.split(",") if visible else None
+    running, seconds = {}, {}
+    try:
+        for device in options.devices:
+            number = int(device.split(":")[1])
+            os.environ[_VISIBLE] = names[number] if names else str(number)
+            args = (out, options, settings, seen, batches, news, share, device)
+            running[device] = context.Process(target=_make_on_one, args=args)
+            running[device].start()
+        while running:
+            try:
+                device, what, value = news.get(timeout=2.0)
+            except queue.Empty:
+                gone = [f"{d} (exit code {p.exitcode})" for d, p in running.items() if p.exitcode not in (None, 0)]
+                if gone:
+                    raise RuntimeError(f"the process of {', '.join(gone)} ended: run the command again, what is there is kept") from None
+                continue
+            if what == "step":
+                update(value)
+            elif what == "text":
+                tell(f"{device}: {value}")
+            elif what == "error":
+                raise (ValueError if value[0] == "ValueError" else RuntimeError)(f"{device}: {value[1]}")
+            else:
+                running.pop(device).join()
+                seconds = {name: seconds.get(name, 0) + s for name, s in value.items()}
+    finally:
+        os.environ.pop(_VISIBLE, None)
+        if visible is not None:
+            os.environ[_VISIBLE] = visible
+        for process in running.values():
+            process.terminate()
+    return seconds
+
+
+def _make_on_one(out, options, settings, device, batches, news, workers, name):
+    """What the process of one device does."""
+    signal.signal(signal.SIGTERM, _leave)
+    try:
+        maker = Maker(out, options, settings, device, lambda n: news.put((name, "step", n)), lambda text: news.put((name, "text", text)))
+        maker.run(iter(batches.get, None), workers)
+        news.put((name, "end", maker.seconds))
+    except ValueError as error:
+        news.put((name, "error", ("ValueError", str(error))))
+    except Exception:
+        news.put((name, "error", ("RuntimeError", traceback.format_exc())))
+
+
+def _leave(*_):
+    """A process that is told to stop takes its workers with it."""
+    for child in multiprocessing.active_children():
+        child.terminate()
+    os._exit(1)
 
 
 @dataclasses.dataclass
@@ -26,42 +129,58 @@ class _Running:
     answer: object = None
     labels: list = None
 
+    def done(self):
+        return all(one.done() for one in [*(self.reads or []), *(self.labels or [])])
+
 
 class Maker:
-    """Makes the shards of one run.
+    """Makes shards on one device.
 
     Args:
       out: folder of the set.
-      options: GenerateOptions.
-      model: SkinModel of the simulated sensor.
-      attributes: of every shard.
-      seconds: dict of stages, to which the time that they take is added.
+      options: GenerateOptions. settings: what of them is kept with every shard.
+      device: of Warp.
+      update: called with time steps done. tell: called with a line on each batch.
+
+    Attributes:
+      seconds: of each stage.
     """
 
-    def __init__(self, out, options, model, attributes, seconds):
-        self.out, self.options, self.geometry, self.model = out, options, model.geometry, model
-        self.attributes, self.seconds = attributes, seconds
+    def __init__(self, out, options, settings, device="cpu", update=lambda n: None, tell=lambda text: None):
+        from ..geometry import load_skin
+        from ..skin import SkinModel, SkinOptions
+
+        self.out, self.options, self.update, self.tell = out, options, update, tell
+        self.seconds = {"start": 0.0, "plan": 0.0, "skin": 0.0, "measured skin": 0.0, "waiting for readings": 0.0}
+        clock = time.perf_counter()
+        self.geometry = load_skin(options.skin)
+        skin = SkinOptions(element=options.element, liquid=options.liquid)
+        model = self.model = SkinModel(self.geometry, options.material, skin, device)
+        self.attributes = {"settings": settings, "skin": options.skin, "material": dataclasses.asdict(model.material),
+                           "element": model.element, "tier": options.tier, "liquid": model.has_liquid,
+                           "device": _device_name(model.device)}  # fmt: skip
         self.time = np.arange(options.steps) / options.rate
         ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
         parts = [assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))]
         self.split = np.concatenate(parts)
         self.measured = None
+        if options.labelled or options.recordings:
+            from .synthetic_sensor import SyntheticSensor
 
-    def run(self, todo, workers, progress):
-        """Makes the shards of batches `todo` with that many worker processes."""
+            self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
+        self._count("start", clock)
+
+    def run(self, todo, workers):
+        """Makes the shards of an iterator of batches with that many worker processes."""
         from . import readings, synthetic_sensor
 
         o = self.options
-        if any(batch.measured for batch in todo):
-            self.measured = synthetic_sensor.SyntheticSensor(o.measured_seed, o.measured_skin, self.model.device)
         args = (self.geometry, o.sensor, self.measured and self.measured.meter())
-        total = o.steps * sum(batch.simulated + batch.measured for batch in todo)
-        bar = tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False)
-        with bar, readings.readings_pool(self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args) as pool:
+        with readings.readings_pool(self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:
-                waiting.append(self._begin(batch, pool, bar))
-                if len(waiting) > 1:
+                waiting.append(self._begin(batch, pool))
+                while waiting and (len(waiting) > _AHEAD or waiting[0].done()):
                     written.append(self._end(waiting.pop(0), pool))
                 for one in written:  # a shard that could not be written stops the run now, not at its end
                     if one.done():
@@ -70,20 +189,26 @@ class Maker:
             for one in written:
                 one.result()
 
-    def _begin(self, batch, pool, bar) -> _Running:
+    def _begin(self, batch, pool) -> _Running:
         """Plans and simulates a batch and hands its readings to the workers."""
         from . import readings, simulate, synthetic_sensor
 
         o = self.options
         self._free()
+        before = dict(self.seconds)
         clock = time.perf_counter()
-        motions = plan_motions(self.geometry, batch.name, [[o.seed, i] for i in batch.members], o.steps, o.kinds, self.model.device)
+        motions = [None] * len(batch.members)
+        for name in dict.fromkeys(batch.names):
+            mine = [k for k, other in enumerate(batch.names) if other == name]
+            seeds = [[o.seed, batch.members[k]] for k in mine]
+            for k, motion in zip(mine, plan_motions(self.geometry, name, seeds, o.steps, o.kinds, self.model.device)):
+                motions[k] = motion
         running = _Running(batch, motions)
         clock = self._count("plan", clock)
         noise = [int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members]
         if batch.simulated:
             walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
-            fields = running.fields = walk(self.model, batch.name, motions, bar.update)
+            fields = running.fields = walk(self.model, batch.names, motions, self.update)
             clock = self._count("skin", clock)
             running.reads = [
                 pool.submit(readings.read_in_worker, fields.displacement[k], self.time, fields.pressure[k], noise[k])
@@ -91,13 +216,15 @@ class Maker:
             ]
         if batch.measured:
             self._free()
-            answer = running.answer = self.measured.simulate(batch.name, motions, bar.update)
+            answer = running.answer = self.measured.simulate(batch.names, motions, self.update)
             self._count("measured skin", clock)
             # each contact of the session begins some seconds after the last one, while the sensor warms up
             running.labels = [
                 pool.submit(synthetic_sensor.measure_in_worker, answer.displacement[k], self.time, answer.pressure[k], i, noise[k])
                 for k, i in enumerate(batch.members)
             ]
+        spent = ", ".join(f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05)
+        self.tell(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
     def _free(self):
@@ -116,7 +243,8 @@ class Maker:
     def _end(self, running, pool):
         """Waits for the readings of a batch and has its shard written: compressing it takes a core some seconds."""
         batch, ones = running.batch, []
-        for k, (number, motion) in enumerate(zip(batch.members, running.motions)):
+        clock = time.perf_counter()
+        for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):
             columns = {"indenter_pos": motion.pos, "indenter_quat": _quaternions(motion.mat), "converged": np.ones(len(self.time), bool)}
             if batch.simulated:
                 fields, read = running.fields, running.reads[k].result()
@@ -135,7 +263,7 @@ class Maker:
             ones.append(
                 Interaction(
                     id=f"{number:06d}",
-                    object=batch.name,
+                    object=name,
                     kind=motion.kind,
                     split=str(self.split[number]),
                     seed=self.options.seed,
@@ -144,6 +272,7 @@ class Maker:
                     **columns,
                 )
             )
+        self._count("waiting for readings", clock)
         return pool.submit(write_shard, self.out / batch.path, ones, self.geometry if batch.simulated else None, self.attributes)
 
 
@@ -151,3 +280,7 @@ def _quaternions(mat):
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(mat).as_quat(), 1, axis=-1)
+
+
+def _device_name(device):
+    return device.name if device.is_cuda else platform.processor() or platform.machine()

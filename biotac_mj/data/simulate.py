@@ -1,18 +1,24 @@
-"""The skin under a batch of motions of one object: every interaction is a world."""
+"""The skin under a batch of motions: every interaction is a world."""
 
 import dataclasses
 
 import numpy as np
+import warp as wp
 from scipy.spatial.transform import Rotation
 
-from ..skin import SkinData, SkinModel, step
+from ..skin import GeomSet, SkinData, SkinModel, step
+from ..skin.types import real, vec3
 from .clearance import Placed
+from .objects import grid_of, make_object
 from .schema import DISPLACEMENT_SCALE, nodes_of
 
-__all__ = ["Fields", "simulate", "simulate_condensed"]
+__all__ = ["Fields", "Scene", "simulate", "simulate_condensed"]
+
+wp.set_module_options({"enable_backward": False})
 
 _STRIDE = 1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
 _ARM = 4e-3  # [m] lever arm that turns of an object count with
+_AWAY = 1.0  # [m] where a world keeps the objects of other worlds
 
 
 @dataclasses.dataclass
@@ -36,41 +42,45 @@ class Fields:
         return vert + self.displacement[i] * DISPLACEMENT_SCALE
 
 
-def simulate(model: SkinModel, name: str, motions, progress=None) -> Fields:
-    """Walks all motions at once. A step that does not converge keeps the last good state and is marked.
+def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
+    """Walks all motions at once, each world at its own pace. A step that does not converge keeps the last good state and is marked.
 
     Args:
       model: the skin, on any device.
-      name: of the object that they share.
+      names: of the object of each motion, or of the one that all share.
       motions: plan.Motions of equal length.
-      progress: called after each time step.
+      progress: called with the number of time steps that a step of the solver has finished, per motion.
 
     Raises:
       ValueError: an object deep inside the rigid core (plans keep clear of it).
     """
+    names = [names] * len(motions) if isinstance(names, str) else list(names)
     nworld, nstep = len(motions), len(motions[0].pos)
-    pos = np.stack([m.pos for m in motions], 1)  # (n, k, 3)
-    turn = np.stack([m.mat for m in motions], 1)
     data = SkinData(model, nworld)
-    placed = Placed(name, nworld, model.device, model.material.friction)
+    scene = Scene(names, model.device, model.material.friction)
     outer = nodes_of(model.geometry)
     fields = _empty(nworld, nstep, model.nvert, len(outer))
-    placed.place(pos[0], turn[0])
-    for i in range(nstep):
-        for at, mat in _between(pos[max(i - 1, 0)], turn[max(i - 1, 0)], pos[i], turn[i]):
-            placed.place(at, mat)
-            step(model, data, placed.geoms)
+    reader = _Reader(model, outer)
+    walks = [_walk(m.pos, m.mat) for m in motions]
+    scene.place([w[0][0] for w in walks], [w[1][0] for w in walks])
+    for k in range(max(len(w[0]) for w in walks)):
+        at = [min(k, len(w[0]) - 1) for w in walks]  # who has arrived waits there
+        scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
+        step(model, data, scene.geoms)
+        there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
+        if not len(there):
+            continue
+        who, row = there.T
         # whether what is stored is in balance with the object where it is: failures on the way that were made good do not count
-        fields.converged[:, i] = data.converged
-        fields.displacement[:, i] = _units(data.vert_xpos - model.geometry.vert)
-        fields.contact_force[:, i] = data.contact_force[:, outer]
-        fields.wrench[:, i], fields.pressure[:, i] = data.wrench[:, 0], data.pressure
+        fields.converged[who, row] = data.converged[who]
+        fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
+        fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
         if progress:
-            progress()
+            progress(len(there) / nworld)
     return fields
 
 
-def simulate_condensed(model: SkinModel, name: str, motions, progress=None) -> Fields:
+def simulate_condensed(model: SkinModel, names, motions, progress=None) -> Fields:
     """The same with the condensed skin, one interaction after another on one core; it has no contact forces of nodes.
 
     Raises:
@@ -78,23 +88,105 @@ def simulate_condensed(model: SkinModel, name: str, motions, progress=None) -> F
     """
     from ..skin.condensed import CondensedSkin, Memory
 
+    names = [names] * len(motions) if isinstance(names, str) else list(names)
     nstep = len(motions[0].pos)
-    placed = Placed(name, 1, model.device, model.material.friction)
-    skin = CondensedSkin(model, placed.geoms)
     fields = _empty(len(motions), nstep, model.nvert, None)
-    for k, motion in enumerate(motions):
+    skins = {}
+    for k, (name, motion) in enumerate(zip(names, motions)):
+        if name not in skins:
+            placed = Placed(name, 1, model.device, model.material.friction)
+            skins[name] = placed, CondensedSkin(model, placed.geoms)
+        placed, skin = skins[name]
         memory = Memory.rest(1)
-        pos, mat = motion.pos[:, None], motion.mat[:, None]
-        for i in range(nstep):
-            for at, turn in _between(pos[max(i - 1, 0)], mat[max(i - 1, 0)], pos[i], mat[i]):
-                at, turn = placed.pose(at, turn)
-                out = skin.solve(memory, at[0], turn[0])
-                memory = out.memory
-            fields.converged[k, i], fields.wrench[k, i], fields.pressure[k, i] = out.converged, out.wrench[0], memory.pressure
-            fields.displacement[k, i] = _units(out.vert_xpos - model.geometry.vert)
-    if progress:
-        progress(nstep)
+        for pos, mat, row in zip(*_walk(motion.pos, motion.mat)):
+            at, turn = placed.pose(pos[None], mat[None])
+            out = skin.solve(memory, at[0], turn[0])
+            memory = out.memory
+            if row >= 0:
+                fields.converged[k, row], fields.wrench[k, row], fields.pressure[k, row] = out.converged, out.wrench[0], memory.pressure
+                fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
+        if progress:
+            progress(nstep / len(motions))
     return fields
+
+
+class Scene:
+    """All objects of a batch in every world: its own one where it is put, the others out of reach.
+
+    Args:
+      names: of the object of each world. device: of Warp. friction: Coulomb coefficient.
+
+    Attributes:
+      geoms: GeomSet of the different objects, in the order in which they first appear.
+    """
+
+    def __init__(self, names, device="cpu", friction=0.0):
+        kinds = list(dict.fromkeys(names))
+        self._which = np.array([kinds.index(name) for name in names])
+        self._placed = [Placed(name, 1) for name in kinds]
+        shapes, grids = [make_object(name) for name in kinds], [grid_of(name) for name in kinds]
+        self.geoms = GeomSet([s.type for s in shapes], [s.size for s in shapes], friction=[friction] * len(kinds),
+                             rounding=[s.rounding for s in shapes], grids=[g for g in grids if g is not None],
+                             nworld=len(names), device=device)  # fmt: skip
+
+    def place(self, pos, mat):
+        """Puts each world's object at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
+        pos, mat = np.asarray(pos, float), np.asarray(mat, float)
+        at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._placed), 1))
+        turn = np.tile(np.eye(3), (len(pos), len(self._placed), 1, 1))
+        for k, placed in enumerate(self._placed):
+            mine = np.flatnonzero(self._which == k)
+            p, R = placed.pose(pos[mine], mat[mine])
+            at[mine, k], turn[mine, k] = p[:, 0], R[:, 0]
+        self.geoms.set_pose(at, turn)
+
+
+@wp.kernel
+def gather(
+    # In:
+    x: wp.array2d(dtype=vec3),
+    force: wp.array2d(dtype=vec3),
+    vert: wp.array(dtype=vec3),
+    outer: wp.array(dtype=int),
+    world: wp.array(dtype=int),
+    scale: real,
+    # Out:
+    displacement_out: wp.array2d(dtype=wp.vec3s),
+    force_out: wp.array2d(dtype=wp.vec3),
+):
+    """Displacements as the store's integers and forces of the outer nodes, of some worlds."""
+    k, i = wp.tid()
+    w = world[k]
+    u = (x[i, w] - vert[i]) / scale
+    limit = real(32767.0)
+    displacement_out[k, i] = wp.vec3s(
+        wp.int16(wp.rint(wp.clamp(u[0], -limit, limit))),
+        wp.int16(wp.rint(wp.clamp(u[1], -limit, limit))),
+        wp.int16(wp.rint(wp.clamp(u[2], -limit, limit))),
+    )
+    if i < outer.shape[0]:
+        f = force[outer[i], w]
+        force_out[k, i] = wp.vec3(float(f[0]), float(f[1]), float(f[2]))
+
+
+class _Reader:
+    """What is stored of some worlds, made on the device: a tenth of what the state is."""
+
+    def __init__(self, model, outer):
+        self.model, self.count = model, len(outer)
+        with wp.ScopedDevice(model.device):
+            self.vert = wp.array(model.geometry.vert, dtype=vec3)
+            self.outer = wp.array(outer.astype(np.int32), dtype=int)
+
+    def read(self, data, worlds):
+        """displacement (k, nvert, 3) int16 and contact_force (k, nouter, 3) of worlds (k,)."""
+        m, device = self.model, self.model.device
+        displacement = wp.zeros((len(worlds), m.nvert), dtype=wp.vec3s, device=device)
+        force = wp.zeros((len(worlds), self.count), dtype=wp.vec3, device=device)
+        chosen = wp.array(np.asarray(worlds, np.int32), dtype=int, device=device)
+        wp.launch(gather, (len(worlds), m.nvert), [data.x, data.outer.node_force, self.vert, self.outer, chosen, DISPLACEMENT_SCALE],
+                  [displacement, force], device=device)  # fmt: skip
+        return displacement.numpy(), force.numpy()
 
 
 def _empty(nworld, nstep, nvert, nouter):
@@ -111,12 +203,15 @@ def _units(displacement):
     return np.clip(np.rint(displacement / DISPLACEMENT_SCALE), -32767, 32767).astype(np.int16)
 
 
-def _between(pos, mat, next_pos, next_mat):
-    """Poses on the way from one time step to the next, the last one included; all worlds in equally many steps."""
-    vector = Rotation.from_matrix(next_mat @ np.swapaxes(mat, 1, 2)).as_rotvec()
-    way = np.linalg.norm(next_pos - pos, axis=1) + _ARM * np.linalg.norm(vector, axis=1)
-    count = max(1, int(np.ceil(way.max() / _STRIDE - 1e-6)))
-    for k in range(1, count):
-        share = k / count
-        yield pos + share * (next_pos - pos), Rotation.from_rotvec(share * vector).as_matrix() @ mat
-    yield next_pos, next_mat
+def _walk(pos, mat):
+    """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations (m, 3, 3) and the time step
+    (m,) that each pose ends, -1 where it is on the way."""
+    vector = Rotation.from_matrix(mat[1:] @ np.swapaxes(mat[:-1], 1, 2)).as_rotvec()
+    way = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
+    out = [(pos[0], mat[0], 0)]
+    for i, count in enumerate(np.maximum(1, np.ceil(way / _STRIDE - 1e-6)).astype(int)):
+        share = np.arange(1, count) / count
+        turned = Rotation.from_rotvec(share[:, None] * vector[i]).as_matrix() @ mat[i] if count > 1 else []
+        out += [(pos[i] + s * (pos[i + 1] - pos[i]), R, -1) for s, R in zip(share, turned)]
+        out.append((pos[i + 1], mat[i + 1], i + 1))
+    return tuple(np.array(part) for part in zip(*out))

@@ -109,11 +109,11 @@ class SyntheticSensor:
         self.seed = seed
         self.model = SkinModel(load_skin(skin), material, options, device)
 
-    def simulate(self, name: str, motions, progress=None):
-        """Its skin under the same motions of the same object: simulate.Fields, of its own mesh."""
+    def simulate(self, names, motions, progress=None):
+        """Its skin under the same motions of the same objects: simulate.Fields, of its own mesh."""
         from .simulate import simulate
 
-        return simulate(self.model, name, motions, progress)
+        return simulate(self.model, names, motions, progress)
 
     def meter(self) -> "Meter":
         """What turns its skin into counts; light enough to be sent to another process."""

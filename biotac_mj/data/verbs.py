@@ -22,6 +22,7 @@ def generate_verb(args) -> None:
         element=args.element,
         liquid=args.liquid,
         batch=args.batch,
+        measured_batch=args.measured_batch,
         measured_seed=args.measured_seed,
         measured_skin=args.measured_skin,
         device=args.device,
@@ -31,7 +32,7 @@ def generate_verb(args) -> None:
     print(f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not converged")
     if report.recordings:
         print(f"{report.recordings} recordings of the synthetic measured sensor beside them")
-    print(f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.device}")
+    print(f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.devices} x {report.device}")
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
 
 
