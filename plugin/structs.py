@@ -117,7 +117,7 @@ class _View:
     def array(self, name):
         """View of array `name` with the shape that MuJoCo documents."""
         extents = self._field[name][1]
-        return self.pointer(name, tuple(e if isinstance(e, int) else self._size(e) for e in extents))
+        return self.pointer(name, tuple([e if e.__class__ is int else self._size(e) for e in extents]))
 
 
 def _extent(extent):
@@ -171,9 +171,10 @@ class DataView(_View):
     def __init__(self, address, model):
         super().__init__("mjData", address)
         self.model = model
+        self._own = {name for name, *_ in self.struct._fields_}
 
     def _size(self, name):
-        return getattr(self.struct if hasattr(self.struct, name) else self.model.struct, name)
+        return getattr(self.struct if name in self._own else self.model.struct, name)
 
     def __getattr__(self, name):
         if name not in self._field:

@@ -9,7 +9,9 @@ import pytest
 import scipy.sparse.linalg
 
 import biotac_mj
-from biotac_mj.geometry import indenter
+from biotac_mj.coupling import Config, fem
+from biotac_mj.coupling.stepper import Geom
+from biotac_mj.geometry import indenter, load_skin
 
 G = 9.81
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -438,3 +440,73 @@ def test_a_turning_finger_feels_the_centrifugal_force():
     outwards = -(omega**2) * rest * [0, 1, 1]
     moved, expected = skin.vert_xpos[0] - rest, sagging(skin.model, outwards[skin.model.free])
     assert abs(moved - expected).max() < 0.1 * abs(expected).max()
+
+
+# --- a skin at rest
+
+
+def steps_made(monkeypatch):
+    """Counts the full solves from here on."""
+    made, step = [], fem.step
+    monkeypatch.setattr(fem, "step", lambda *args: made.append(1) or step(*args))
+    return made
+
+
+def test_a_skin_that_nothing_reaches_is_not_solved(monkeypatch):
+    """A ball falls onto the pad and is taken away: only steps in which it is within a millimetre ask, only those in contact solve."""
+    model, data, handle = scene(ball(0.02, pos=(0, 0, TOP + RADIUS + 3e-3)), readings="biotac")
+    mujoco.mj_forward(model, data)
+    at_rest, counts = state_of(model, data), handle.read(data, "electrodes")
+    made = steps_made(monkeypatch)
+    while data.qpos[2] > TOP + RADIUS + 1.2e-3:
+        mujoco.mj_step(model, data)
+    assert not made and not handle.read(data, "contact_force").any()
+    mujoco.mj_step(model, data, 10)
+    assert made and handle.read(data, "contact_force")[1] > 0.05
+    data.qpos[2], data.qvel[:] = 1.0, 0.0
+    mujoco.mj_step(model, data)  # back to rest takes one step
+    made.clear()
+    state = state_of(model, data)
+    mujoco.mj_step(model, data, 20)
+    assert not made and not handle.read(data, "contact_force").any()
+    np.testing.assert_allclose(handle.vert_xpos(model, data), load_skin("coarse").vert, atol=1e-15)
+    again = mujoco.MjData(model)
+    mujoco.mj_setState(model, again, state, STATE)
+    mujoco.mj_step(model, again, 20)
+    assert np.array_equal(again.sensordata, data.sensordata) and np.array_equal(state_of(model, again), state_of(model, data))
+    assert np.abs(handle.read(data, "electrodes") - counts).max() < 20  # noise alone; in contact they changed by more
+    mujoco.mj_setState(model, data, at_rest, STATE)
+    mujoco.mj_step(model, data)
+    assert not made
+
+
+@pytest.mark.parametrize("options", [{}, {"fill_volume": 2e-8}])
+def test_a_skin_at_rest_is_what_a_solve_would_leave(options):
+    """The stepper with and without its short cut: near the skin, in contact, and after it."""
+    stepper = fem.FemStepper(
+        Config(skin="coarse", options={"skin": options}), load_skin("coarse"), [Geom("b", "sphere", [RADIUS, 0, 0], 0.5, 0)]
+    )
+    state = np.empty(stepper.nstate)
+    stepper.reset(state)
+    top, where = stepper.vert_xpos(state)[:, 1].min(), np.array([-0.0062, 0.0, 0.0])
+    solved, turn = state.copy(), np.eye(3)[None]
+    for gap in (2e-4, 1e-5, -3e-4, -3e-4, 2e-4, 1e-3, 1e-5):
+        pos = (where + [0, top - RADIUS - gap, 0])[None]
+        short = stepper.solve(state, pos, turn, 2e-3)
+        solved[stepper._slices["resting"]] = 0.0  # forbids the short cut
+        long = stepper.solve(solved, pos, turn, 2e-3)
+        assert short.wrench.any() == (gap < 0) and stepper.resting(short.state) == (gap > 0)
+        np.testing.assert_allclose(short.vert_xpos, long.vert_xpos, atol=1e-8)
+        np.testing.assert_allclose(short.wrench, long.wrench, rtol=1e-3, atol=1e-6)
+        assert abs(short.pressure - long.pressure) < 1.0 + 1e-3 * long.pressure
+        state, solved = short.state, long.state
+
+
+def test_a_geom_inside_the_core_is_refused_though_no_skin_feels_it():
+    stepper = fem.FemStepper(Config(skin="coarse"), load_skin("coarse"), [Geom("b", "sphere", [3e-3, 0, 0], 0.5, 0)])
+    state = np.empty(stepper.nstate)
+    stepper.reset(state)
+    with pytest.raises(ValueError, match="inside the rigid core"):
+        stepper.solve(state, np.array([[-2e-3, 0.0, 0.0]]), np.eye(3)[None], 2e-3)
+    with pytest.raises(ValueError, match="NaN"):
+        stepper.solve(state, np.array([[np.nan, 0, 0]]), np.eye(3)[None], 2e-3)

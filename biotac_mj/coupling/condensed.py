@@ -11,7 +11,7 @@ from .stepper import SkinResult
 __all__ = ["CondensedStepper"]
 
 _MAX_FORCES, _MAX_CONTACTS = 1024, 2048
-_CLEAR = 1e-3  # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms [m]
+_AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
 
 
 class CondensedStepper(FemStepper):
@@ -34,11 +34,16 @@ class CondensedStepper(FemStepper):
         }
         ends = np.cumsum(list(sizes.values()))
         self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self._slices["started"] = slice(0, 1)
         self.nstate = int(ends[-1])
 
     @functools.cached_property
     def _skin(self):
         return CondensedSkin(self._model, self._geom_set)
+
+    @property
+    def _search(self):
+        return self._skin.search
 
     def reset(self, state):
         state[:] = 0
@@ -69,9 +74,12 @@ class CondensedStepper(FemStepper):
             measured=out.measured,
         )
 
-    def clear(self, state, geom_pos, geom_mat) -> bool:
-        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they come in a step [BioTac frame]."""
-        return not self._part(state, "forces")[0] and self._skin.clear(geom_pos, geom_mat, _CLEAR)
+    def resting(self, state):
+        return not self._part(state, "forces")[0]
+
+    def stay(self, state, geom_pos, geom_mat):
+        super().stay(state, geom_pos, geom_mat)
+        self._part(state, "head")[:] = _AT_REST
 
     def key(self, state) -> bytes:
         """All that a solve depends on: a state is mostly unused."""

@@ -4,23 +4,28 @@ import dataclasses
 import functools
 
 import numpy as np
+import warp as wp
 
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
+from ..skin.condensed_search import NearSearch
 from ..skin.model import solved_geometry
+from ..skin.types import vec3
 from .stepper import SkinResult
 
 __all__ = ["FemStepper", "rest_geometry"]
 
 _MAX_CONTACTS = 4096
+_CLEAR = 1e-3  # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms [m]
+_RESTS = 1e-8, 1.0  # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's error
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
 class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
-    The state holds: whether a step was made, nodal positions, the last increment, poses and motion of the geoms in the last
-    step, the sticking contacts (how many, then sample, geom and anchor of each), the liquid's pressure and, with implicit dynamics,
-    nodal velocities.
+    The state holds: whether a step was made, whether the skin rests, nodal positions, the last increment, poses and motion of the
+    geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the liquid's pressure and, with
+    implicit dynamics, nodal velocities.
     """
 
     def __init__(self, config, geometry, geoms):
@@ -30,6 +35,7 @@ class FemStepper:
         n, g = len(self._nodes), len(geoms)
         sizes = {
             "started": 1,
+            "resting": 1,
             "x": 3 * n,
             "increment": 3 * n,
             "geom_pos": 3 * g,
@@ -76,6 +82,7 @@ class FemStepper:
             vert, pressure = self._model.rest.vert, self._model.rest.pressure
         self._part(state, "x")[:] = vert.ravel()
         self._part(state, "pressure")[:] = pressure
+        self._part(state, "resting")[:] = not self.inertial
 
     def vert_xpos(self, state):
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
@@ -86,6 +93,8 @@ class FemStepper:
         Raises:
           ValueError: NaN in a pose, a geom deep inside the core, or more contact than the state can hold.
         """
+        if self._untouched(state, geom_pos, geom_mat):
+            return self._still(state, geom_pos, geom_mat)
         d, geoms = self._data, self._geom_set
         self._unpack(state)
         geoms.set_pose(geom_pos, geom_mat)
@@ -102,6 +111,8 @@ class FemStepper:
             step(self._model, d, geoms, dt)
         new = np.zeros_like(state)
         self._pack(new, geom_pos, geom_mat)
+        if d.converged[0] and self._came_to_rest(new):
+            return self._still(state, geom_pos, geom_mat)
         return SkinResult(
             state=new,
             wrench=d.wrench[0],
@@ -112,6 +123,62 @@ class FemStepper:
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
         )
+
+    # --- a skin at rest ---------------------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _search(self):
+        rest = np.ascontiguousarray(self._model.rest.vert, float)
+        x = wp.array(rest[:, None], dtype=vec3, device="cpu")
+        return NearSearch(self._model, self._geom_set, rest, x, x.numpy())
+
+    def resting(self, state) -> bool:
+        """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
+        return bool(self._part(state, "resting")[0])
+
+    def clear(self, state, geom_pos, geom_mat) -> bool:
+        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they come in a step [BioTac frame]."""
+        return self.resting(state) and not self._model.device.is_cuda and self._search.clear(geom_pos, geom_mat, _CLEAR)
+
+    def stay(self, state, geom_pos, geom_mat):
+        """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
+        last, new = self._part(state, "geom_pos"), np.ravel(geom_pos)
+        started = self._part(state, "started")
+        self._part(state, "motion")[:] = new - last if started[0] else 0.0
+        last[:], self._part(state, "geom_mat")[:], started[:] = new, np.ravel(geom_mat), 1.0
+
+    def _untouched(self, state, geom_pos, geom_mat):
+        if not self.resting(state) or self._model.device.is_cuda or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all()):
+            return False
+        if not self._search.clear(geom_pos, geom_mat, 0.0):
+            return False
+        self._search.refuse_core(geom_pos, geom_mat)
+        return True
+
+    def _came_to_rest(self, state):
+        if self.inertial or self._part(state, "contacts")[0]:
+            return False
+        rest, (far, loud) = self._model.rest, _RESTS
+        off = np.abs(self._part(state, "x") - rest.vert.ravel()).max()
+        return bool(off < far and abs(self._part(state, "pressure")[0] - rest.pressure) < loud)
+
+    def _still(self, state, geom_pos, geom_mat):
+        """Result of a step from `state` that leaves the skin at rest."""
+        new = np.empty_like(state)
+        self.reset(new)
+        for name in ("started", "geom_pos", "geom_mat"):
+            self._part(new, name)[:] = self._part(state, name)
+        self.stay(new, geom_pos, geom_mat)
+        n = 1 + max((g.group for g in self._geoms), default=-1)
+        return SkinResult(new, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.vert_xpos(new))
+
+    def key(self, state) -> bytes:
+        """All that a solve depends on: a state is mostly unused."""
+        start, end = self._slices["contacts"].start, self._slices["contacts"].stop
+        used = start + 1 + 5 * int(state[start])
+        return state[:used].tobytes() + state[end:].tobytes()
+
+    # --- the state as numbers ---------------------------------------------------------------------------------------------------
 
     def _unpack(self, state):
         d, geoms = self._data, self._geom_set

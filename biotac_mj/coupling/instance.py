@@ -15,7 +15,7 @@ import numpy as np
 from . import skins
 from .config import TIERS, Config
 from .metric import Metric
-from .stepper import make_readings, make_stepper
+from .stepper import SkinResult, make_readings, make_stepper
 from .touching import Touching
 
 __all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
@@ -35,6 +35,14 @@ class _Skin:
         self.stepper = make_stepper(config, self.geometry, geoms)
         self.readings = make_readings(config, self.geometry)
         self.lock = threading.Lock()
+        self.ngroup = 1 + max((g.group for g in geoms), default=-1)
+
+    @functools.cached_property
+    def untouched(self):
+        """Result of a step of a skin at rest that nothing reaches."""
+        state, n = np.empty(self.stepper.nstate), self.ngroup
+        self.stepper.reset(state)
+        return SkinResult(None, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.stepper.vert_xpos(state).copy())
 
 
 class _SkinKey:
@@ -149,7 +157,7 @@ class Instance:
                 f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec"
             )
         self._state = slice(start, start + size)
-        self._result = self._reading = self._pose = None
+        self._result = self._reading = self._pose = self._geom_pose = None
         self._solved = {}
         self._error = False
         self._shown = None
@@ -183,13 +191,20 @@ class Instance:
         return getattr(self.setup.skin.stepper, "inertial", False)
 
     def clear(self, pos, mat):
-        """Whether a skin at rest is clear of bodies at (ngroup, 3), (ngroup, 3, 3) by so much that they do not reach it within the step."""
-        stepper = self.setup.skin.stepper
-        if self.inertial or not hasattr(stepper, "clear"):
+        """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not reach it within the step."""
+        stepper, skin = self.setup.skin.stepper, self.setup.parts(self.state)[2]
+        if not hasattr(stepper, "clear") or not stepper.resting(skin):
             return False
-        pose = self.touching.geom_pose(pos, mat)
+        self._geom_pose = self.touching.geom_pose(pos, mat)
         with self.setup.skin.lock:
-            return stepper.clear(self.setup.parts(self.state)[2], *pose)
+            return stepper.clear(skin, *self._geom_pose)
+
+    def rest(self, pos, mat):
+        """Instead of `solve`, after `clear` has found the skin so of bodies at these poses: costs next to nothing."""
+        skin = self.setup.skin
+        with skin.lock:
+            self._result = skin.untouched
+        self._pose, self._reading = (pos, mat), None
 
     def solve(self, pos, mat, core=()):
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings.
@@ -264,9 +279,13 @@ class Instance:
         head, models, skin, readings_state = self.setup.parts(self.state)
         head[:] = head[_FAILED] + (not result.converged), result.converged, result.iterations, result.residual
         n = self.setup.ngroup
-        parts = (result.wrench, result.tangent.reshape(n, 36), self._pose[0], self._pose[1].reshape(n, 9))
-        models[:] = np.concatenate(parts, axis=1)
-        skin[:], readings_state[:] = result.state, readings
+        models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
+        models[:, 42:45], models[:, 45:] = self._pose[0], self._pose[1].reshape(n, 9)
+        if result.state is None:
+            self.setup.skin.stepper.stay(skin, *self._geom_pose)
+        else:
+            skin[:] = result.state
+        readings_state[:] = readings
         self._solved.clear()
 
     def visualize(self):

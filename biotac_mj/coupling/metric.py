@@ -16,6 +16,7 @@ __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+_SILENT = 0.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its derivative: reference acceleration 0
 
 
 class Metric:
@@ -65,27 +66,42 @@ class Metric:
         ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
         layout = ids.tobytes(), kinds.tobytes()
         if layout != self._layout:  # it rarely changes
-            self._layout = layout
-            self._first = {slot: np.flatnonzero((ids == slot) & (kinds == _EQUALITY)) for slot in self.slot.values()}
-        position, impedance = data.efc_pos, data.efc_KBIP
-        for root, slot in self.slot.items():
-            index = self._first[slot]
-            if len(index) != 6:
-                raise ValueError(
-                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, "
-                    "or use coupling='one-way'"
-                )
-            here = slice(int(index[0]), int(index[0]) + 6)
-            self._rows[root] = here, data.map_efc2iefc[here] if data.nisland else None
-            position[here] = 0.0
-            impedance[here] = (0.0, 0.0, 1.0, 0.0)  # stiffness, damping, impedance, its derivative: reference acceleration 0
+            self._places, self._layout = self._find(ids, kinds), layout
+        islands = data.map_efc2iefc if data.nisland else None
+        for root, here in self._places.items():
+            self._rows[root] = here, None if islands is None else islands[here]
+        data.efc_pos[self._all] = 0.0
+        data.efc_KBIP[self._all] = _SILENT
         self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
-        if data.nisland:
+        if islands is not None:
             self._island_weight, self._island_regular = data.iefc_D, data.iefc_R
         self._columns = None
         if model.is_sparse:
             self._columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
         self._filled = dict.fromkeys(self._rows, True)  # by MuJoCo
+
+    def _find(self, ids, kinds):
+        places = {}
+        for root, slot in self.slot.items():
+            index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
+            if len(index) != 6:
+                raise ValueError(
+                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, "
+                    "or use coupling='one-way'"
+                )
+            places[root] = slice(int(index[0]), int(index[0]) + 6)
+        rows = np.concatenate([np.arange(here.start, here.stop) for here in places.values()])
+        # neighbours as a rule; a slice is written faster than numbered rows
+        self._all = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) == np.ptp(rows) + 1 else rows
+        return places
+
+    def release(self):
+        """Leaves the rows without any stiffness."""
+        for root, filled in self._filled.items() if self.slot else ():
+            if filled:
+                self._fill(root, 0.0, _MINVAL)
+        if self.slot:
+            self._filled = dict.fromkeys(self._rows, False)
 
     def write(self, jacobian, tangent, horizon):
         """Puts the stiffness of tangents (ngroup, 6, 6) over `horizon` [s] into the rows."""
@@ -104,13 +120,17 @@ class Metric:
                 rows = (basis * (stiffness > 1e-12 * stiffness[-1])).T @ relative
                 self._fill(root, rows, value)
             elif self._filled[root]:
-                self._fill(root, np.zeros((6, self.model.nv)), np.full(6, _MINVAL))
+                self._fill(root, 0.0, _MINVAL)
             self._filled[root] = root in total
 
     def _fill(self, root, rows, value):
+        """Rows (6, nv) or one number for all entries; values (6,) or one for all."""
         here, place = self._rows[root]
         if self._columns is None:
-            self._stiff[here.start * self.model.nv : here.stop * self.model.nv] = rows.ravel()
+            self._stiff[here.start * self.model.nv : here.stop * self.model.nv] = np.ravel(rows)
+        elif np.ndim(rows) == 0:
+            count, start, _ = self._columns
+            self._stiff[start[here.start] : start[here.stop - 1] + count[here.stop - 1]] = rows
         else:
             count, start, column = self._columns
             for k, row in enumerate(rows, start=here.start):

@@ -48,7 +48,7 @@ class SkinResult:
     """A skin solved for the poses at the end of a step, in the BioTac frame.
 
     Attributes:
-      state: (nstate,) the new state, committed by the caller.
+      state: (nstate,) the new state, committed by the caller; None: the skin rests as before (see `SkinStepper.stay`).
       wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin [N, N m].
       tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric positive semi-definite.
       vert_xpos: (nvert, 3) deformed nodes [m].
@@ -57,7 +57,7 @@ class SkinResult:
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
-    state: np.ndarray
+    state: np.ndarray | None
     wrench: np.ndarray
     tangent: np.ndarray
     vert_xpos: np.ndarray
@@ -84,6 +84,17 @@ class SkinStepper(Protocol):
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
+
+    # A stepper may have the three methods below; a skin that rests then costs next to nothing.
+
+    def resting(self, state: np.ndarray) -> bool:
+        """Whether the state is exactly that of the skin at rest."""
+
+    def clear(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
+        """Whether the skin rests and no geom at these poses reaches it by a step's acceleration."""
+
+    def stay(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
+        """Makes `state`, of a skin that is `clear`, what `solve` would return."""
 
 
 class Readings(Protocol):

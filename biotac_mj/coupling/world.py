@@ -136,12 +136,12 @@ class _Coupled:
         self.instance, self.data, self.horizon = instance, data, instance.horizon
         instance.metric.begin(data)
         self.pose = instance.touching.predict(data, self.horizon)
-        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
-        # nothing touched, and what comes is too far for this step's accelerations to matter: the skin rests, where exactly does not matter
-        self.idle = not (self.wrench0.any() or self.tangent.any()) and instance.clear(*self.pose)
+        # the skin rests, and what comes is too far for this step's accelerations to matter
+        self.idle = instance.clear(*self.pose)
         self.core, self.jacobian = (), None
         if self.idle:
             return
+        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
@@ -151,8 +151,8 @@ class _Coupled:
         self.converged = True
 
     def rest(self):
-        """Solves a skin that nothing reaches, and takes its rows away."""
-        self.instance.solve(*self.pose)
+        """Leaves a skin that nothing reaches as it is, and takes its rows away."""
+        self.instance.rest(*self.pose)
         self.let_go()
 
     def follow(self, acceleration):
@@ -190,4 +190,4 @@ class _Coupled:
             self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
 
     def let_go(self):
-        self.instance.metric.write(self.jacobian, np.zeros_like(self.tangent), self.horizon)
+        self.instance.metric.release()

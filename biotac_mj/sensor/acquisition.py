@@ -7,6 +7,7 @@ Slot k lies at time k / 4400 s, so what is sampled when depends on the time alon
 state vector that the caller owns; noise is a function of (seed, slot), so a replay from a saved state is bit-equal.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -17,6 +18,7 @@ __all__ = ["Acquisition", "FRAME_TIME", "SLOTS_PER_FRAME", "SLOT_RATE"]
 
 SLOT_RATE = 4400.0  # [Hz]
 SLOTS_PER_FRAME = 44
+_DRAWN = 1024  # slots whose noise is drawn at once
 FRAME_TIME = SLOTS_PER_FRAME / SLOT_RATE  # [s]
 
 _LOW_PASS, _HIGH_PASS, _TAC_LOW_PASS = (2 * np.pi * hertz for hertz in (1040.0, 10.0, 22.6))  # [rad/s], manual
@@ -174,10 +176,12 @@ class Acquisition:
         return value
 
     def _noise(self, first, electrode, value):
-        """White noise (nslot,): one Philox counter block per slot, so a slot's draw does not depend on how steps cut the time."""
-        raw = np.random.Philox(key=self.seed, counter=first % 2**64).random_raw(4 * len(value)).reshape(-1, 4)[:, :2]
-        uniform = ((raw >> np.uint64(11)) + 0.5) * 2.0**-53
-        normal = np.sqrt(-2 * np.log(uniform[:, 0])) * np.cos(2 * np.pi * uniform[:, 1])  # Box-Muller: a fixed number of draws per slot
+        """White noise (nslot,)."""
+        block, start = divmod(first, _DRAWN)
+        normal = _normals(self.seed, block)[start : start + len(value)]
+        while len(normal) < len(value):
+            block += 1
+            normal = np.append(normal, _normals(self.seed, block)[: len(value) - len(normal)])
         return np.where(electrode, channels.electrode_noise(value), channels.OTHER_NOISE) * normal
 
     def _check_state(self, state):
@@ -202,6 +206,14 @@ class Acquisition:
         if not (math.isfinite(pressure) and math.isfinite(temperature)):
             raise ValueError(f"pressure is {pressure} Pa and temperature {temperature} C: both must be finite; keep the last good values")
         return float(pressure), float(temperature)
+
+
+@functools.lru_cache(maxsize=64)
+def _normals(seed, block):
+    """Standard normal draws (_DRAWN,) of a block of slots: one Philox counter per slot, whatever steps cut the time into."""
+    raw = np.random.Philox(key=seed, counter=block * _DRAWN % 2**64).random_raw(4 * _DRAWN).reshape(-1, 4)[:, :2]
+    uniform = ((raw >> np.uint64(11)) + 0.5) * 2.0**-53
+    return np.sqrt(-2 * np.log(uniform[:, 0])) * np.cos(2 * np.pi * uniform[:, 1])  # Box-Muller: a fixed number of draws per slot
 
 
 def _slots(time, dt):
