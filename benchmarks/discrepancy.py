@@ -1,55 +1,67 @@
 """Blind benchmark of the discrepancy workflow: hidden effects, none, pairs, outside the catalogue, and a mildly wrong base model.
 
-    python benchmarks/discrepancy.py --seeds practice --kinds none single --count 1 --json out/discrepancy.json
+    python benchmarks/discrepancy.py --seeds practice --counts none=2,single=1 --json out/discrepancy.json
+    python benchmarks/discrepancy.py --seeds blind --jobs 8 --counts none=60,single=10,outside=40,pair=40,wrong-base=20
 
-Every case is drawn, measured by `discrepancy_generator` and sealed (a hash of the truth is printed before its verdict); run again, it
-goes on
-where it stopped. Beside the verdicts stand two baselines: least RMS in sample, and BIC with samples taken as independent.
+Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed (a hash of the truth stands in its record); run again, it
+goes on where it stopped. Beside the verdicts stand two baselines: least RMS in sample, and BIC with samples taken as independent.
+Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the catalogue, for calibration.
+Counts are for each effect with single and left-out, else for the kind. Kernels are compiled and fields of the plans solved before the
+work is shared out.
 """
 
 import argparse
-import collections
 import hashlib
 import json
+import multiprocessing
 import pathlib
+import time
 
 import numpy as np
 from discrepancy_generator import HIDDEN, OUTSIDE, Generator, plan
+from discrepancy_table import confusion, table
 
 SEEDS = {"development": 0, "practice": 10_000, "blind": 700_000}
-KINDS = ("none", "single", "outside", "pair", "wrong base")
+KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
+PLANS = 4  # sets of trajectories of one seed, taken in turn
 
 
-def cases(kinds, count, seeds):
-    """(kind, name, effects, seed, generator settings)."""
+def cases(counts, seeds):
+    """Dicts: kind, case, effects (list of name, size), seed, settings of the generator, plan; kinds mixed, so that a part is a sample."""
     out = []
-    for kind in kinds:
+    for kind, count in counts.items():
         if kind not in KINDS:
             raise ValueError(f"unknown kind {kind!r}: choose from {', '.join(KINDS)}")
-        table = {"single": list(HIDDEN), "outside": list(OUTSIDE)}.get(kind, [kind])
-        for name in table:
-            for i in range(count):
-                seed = SEEDS[seeds] + int(hashlib.sha256(f"{kind}{name}{i}".encode()).hexdigest()[:6], 16) % 9_000
-                rng = np.random.default_rng(seed)
-                settings = {"modulus": float(rng.uniform(0.85, 1.15)), "skin": "coarse", "footprint": 0.0}
-                if kind == "wrong base":
-                    settings.update({"skin": "default"} if i % 2 else {"footprint": 0.05})
-                names = {"single": [name], "outside": [name], "pair": list(rng.choice(list(HIDDEN), 2, replace=False))}.get(kind, [])
-                sizes = {**HIDDEN, **OUTSIDE}
-                effects = [(str(n), float(np.exp(rng.uniform(*np.log(sizes[n]))))) for n in names]
-                out.append((kind, f"{kind}: {name} #{i}", effects, seed, settings))
-    return out
+        names = {"single": list(HIDDEN), "left-out": list(HIDDEN), "outside": list(OUTSIDE)}.get(kind, [kind])
+        if kind == "outside":
+            drawn = [(names[i % len(names)], i // len(names)) for i in range(count)]
+        else:
+            drawn = [(name, i) for i in range(count) for name in names]
+        for order, (name, i) in enumerate(drawn):
+            seed = SEEDS[seeds] + int(hashlib.sha256(f"{kind}{name}{i}".encode()).hexdigest()[:8], 16) % 600_000
+            rng = np.random.default_rng([seed, SEEDS[seeds]])
+            settings = {"modulus": float(rng.uniform(0.85, 1.15)), "skin": "coarse", "footprint": 0.0}
+            if kind == "wrong-base":
+                settings.update({"skin": "default"} if i % 2 else {"footprint": 0.05})
+            hidden = {"pair": list(rng.choice(list(HIDDEN), 2, replace=False)), "none": [], "wrong-base": []}.get(kind, [name])
+            sizes = {**HIDDEN, **OUTSIDE}
+            effects = [(str(n), float(np.exp(rng.uniform(*np.log(sizes[n]))))) for n in hidden]
+            out.append(
+                {"kind": kind, "case": f"{kind}: {name} #{i}", "effects": effects, "seed": seed, "settings": settings,
+                 "plan": (order + i) % PLANS, "at": (order + 0.5) / len(drawn)}
+            )  # fmt: skip
+    return sorted(out, key=lambda c: c["at"])
 
 
 def baselines(comparison, chosen):
     """Names by least RMS in sample and by BIC with every sample independent, both on the linearised signatures."""
     from biotac_mj.discrepancy.catalogue import CATALOGUE
     from biotac_mj.discrepancy.fitting import fit_effects
-    from biotac_mj.discrepancy.workflow import _columns, _nuisance
+    from biotac_mj.discrepancy.screening import columns, nuisance_space
 
     null = fit_effects(comparison, [], chosen)
     base = null.residuals(comparison)
-    q = _nuisance(comparison, null, base, chosen)
+    q = nuisance_space(comparison, null, base, chosen)
     y = np.concatenate([base[i].ravel() for i in chosen])
     y = y - q @ (q.T @ y)
     out = []
@@ -57,7 +69,7 @@ def baselines(comparison, chosen):
         if effect.applicable([comparison.trajectories[i] for i in chosen]):
             continue
         for shape in effect.grid:
-            S = _columns(comparison, null, effect, shape, base, chosen)
+            S = columns(comparison, null, effect, shape, base, chosen)
             S = S - q @ (q.T @ S)
             w, *_ = np.linalg.lstsq(S, y, rcond=None)
             rss = float(((y - S @ w) ** 2).sum())
@@ -67,127 +79,165 @@ def baselines(comparison, chosen):
     return min(out)[2], best[2] if best[1] < none else "none"
 
 
+def comparable(name, size) -> dict:
+    """True values of the catalogue's parameters; (value, whether both laws are the same). Cross-talk, saturation and adhesion have none."""
+    same = {
+        "asper": {"log_p": np.log(1 + size)}, "latency": {"delay": size}, "radius": {"log_radius": np.log(1 + size)},
+        "mount": {"compliance": size}, "depth0": {"dz": size}, "misalign": {"x": size, "z": 0.6 * size},
+        "gain": {f"e{k + 1}": g for k, g in enumerate(size * np.random.default_rng(int(size * 1e6)).standard_normal(19))},
+    }  # fmt: skip
+    other = {
+        "relax": {"g": size}, "hyster": {"fraction": size}, "stiffen": {"c2": size}, "mullins": {"softening": size},
+        "fluidloss": {"rate": 36 * size}, "warmup": {"a": -size}, "lowpass": {"tau": size}, "drift": {"rate": size},
+    }  # fmt: skip
+    return {k: (float(v), name in same) for k, v in {**same, **other}.get(name, {}).items()}
+
+
+class Worker:
+    """One process: its simulator, generators, and the fields of the plans."""
+
+    def __init__(self, args):
+        import warp as wp
+
+        wp.config.quiet = True
+        from biotac_mj.discrepancy import Simulator
+
+        self.args, self.generators, self.fields = args, {}, {}
+        self.plans = [plan(SEEDS[args.seeds] + 5 + k, args.trajectories) for k in range(PLANS)]
+        self.sim = Simulator(cache=args.cache, tier=args.tier, device=args.device)
+
+    def trajectories(self, k, measured):
+        from biotac_mj.discrepancy import Trajectory
+
+        return [
+            Trajectory(p["id"], p["tool"], p["clock"], p["time"], p["pos"], np.tile(p["turn"], (len(p["time"]), 1, 1)), e, pdc, None, f)
+            for p, (e, pdc, f) in zip(self.plans[k], measured)
+        ]
+
+    def fields_of(self, k):
+        if k not in self.fields:
+            blank = [
+                (np.full((len(p["time"]), 19), 2000.0), np.full(len(p["time"]), 2000.0), np.zeros((len(p["time"]), 3)))
+                for p in self.plans[k]
+            ]
+            self.fields[k] = self.sim.fields(self.trajectories(k, blank), progress=False)
+        return self.fields[k]
+
+    def generator(self, skin):
+        if skin not in self.generators:
+            self.generators[skin] = Generator(skin, tier=self.args.tier, device=self.args.device)
+        return self.generators[skin]
+
+    def run(self, case) -> dict:
+        """The record of a case: truth, verdict and all numbers that thresholds are set on."""
+        from biotac_mj.discrepancy import CATALOGUE, diagnose
+        from biotac_mj.discrepancy.workflow import threshold_hash
+
+        began = time.process_time()
+        effects, settings = case["effects"], case["settings"]
+        generator = self.generator(settings["skin"])
+        generator.modulus, generator.footprint = settings["modulus"], settings["footprint"]
+        data = self.trajectories(case["plan"], generator.measure(self.plans[case["plan"]], effects, case["seed"]))
+        catalogue = [e for e in CATALOGUE if case["kind"] != "left-out" or e.id != effects[0][0]]
+        report = diagnose(self.sim, data, effects=catalogue, fields=self.fields_of(case["plan"]), progress=False)
+        least, bic = ("", "") if self.args.no_baselines or case["kind"] == "left-out" else baselines(report.comparison, report.selection)
+        return {
+            "case": case["case"], "kind": case["kind"], "seeds": self.args.seeds, "tier": self.args.tier, "thresholds": threshold_hash(),
+            "plan": case["plan"], "seed": case["seed"], "settings": settings, "truth": [e for e, _ in effects],
+            "sizes": [s for _, s in effects],
+            "seal": hashlib.sha256(json.dumps([effects, settings, case["seed"]]).encode()).hexdigest()[:12],
+            "verdict": report.verdict, "named": [e["id"] for e in report.effects], "ties": [e["ties"] for e in report.effects],
+            "confidence": [e["confidence"] for e in report.effects], "closed": report.closed,
+            "nats": report.ranking[0][1] if report.ranking else 0.0, "trace": report.trace, "where": len(report.where),
+            "before": report.before, "after": report.after,
+            "parameters": [{p["name"]: [p["value"], *p["interval95"]] for p in e["parameters"]} for e in report.effects],
+            "comparable": {e: comparable(e, s) for e, s in effects},
+            "least_rms": least, "bic": bic, "seconds": time.process_time() - began,
+        }  # fmt: skip
+
+
+_worker = None
+
+
+def _begin(args):
+    global _worker
+    _worker = Worker(args)
+
+
+def _solve(k):
+    _worker.fields_of(k)
+
+
+def _one(case):
+    try:
+        return _worker.run(case)
+    except Exception as error:  # one bad case must not end the run: it is reported and tried again next time
+        return {"case": case["case"], "error": f"{type(error).__name__}: {error}"}
+
+
+def _write(path, rows):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(rows))
+    temporary.replace(path)
+
+
+def _counts(text):
+    return {k: int(v) for k, v in (part.split("=") for part in text.split(","))}
+
+
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    args.add_argument("--kinds", nargs="+", default=list(KINDS), metavar="KIND")
-    args.add_argument("--count", type=int, default=1, help="cases of each effect, or of the kind")
+    args.add_argument("--counts", type=_counts, default=dict.fromkeys(KINDS[:5], 1), metavar="KIND=N,...")
     args.add_argument("--seeds", choices=SEEDS, default="development")
+    args.add_argument("--jobs", type=int, default=1, help="processes")
+    args.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th on")
     args.add_argument("--trajectories", type=int, default=16)
+    args.add_argument("--tier", choices=("condensed", "full"), default="condensed")
+    args.add_argument("--device", default="cpu", help="of the full tier")
     args.add_argument("--cache", default="out/discrepancy_fields")
     args.add_argument("--json", default="out/discrepancy.json")
-    args.add_argument("--figure", default="out/discrepancy.png")
+    args.add_argument("--figure", default="", help="PNG of the confusion matrix")
     args.add_argument("--no-baselines", action="store_true")
     args = args.parse_args(argv)
-    from biotac_mj.discrepancy import Simulator, Trajectory, diagnose
     from biotac_mj.discrepancy.workflow import threshold_hash
 
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text()) if path.exists() else []
-    done = {(r["case"], r["seeds"], r["thresholds"]) for r in rows}
-    plans = plan(5, args.trajectories)
-    sim = Simulator(cache=args.cache)
-    generators, fields = {}, None
-    print(f"thresholds {threshold_hash()}")
-    for kind, name, effects, seed, settings in cases(args.kinds, args.count, args.seeds):
-        if (name, args.seeds, threshold_hash()) in done:
-            continue
-        seal = hashlib.sha256(json.dumps([effects, settings, seed]).encode()).hexdigest()[:12]
-        key = settings["skin"]
-        if key not in generators:
-            generators[key] = Generator(key)
-        generator = generators[key]
-        generator.modulus, generator.footprint = settings["modulus"], settings["footprint"]
-        measured = generator.measure(plans, effects, seed)
-        data = [
-            Trajectory(p["id"], p["tool"], p["clock"], p["time"], p["pos"], np.tile(p["turn"], (len(p["time"]), 1, 1)), e, pdc, None, f)
-            for p, (e, pdc, f) in zip(plans, measured)
-        ]
-        fields = sim.fields(data, progress=False) if fields is None else fields
-        report = diagnose(sim, data, fields=fields, progress=False)
-        named = [e["id"] for e in report.effects]
-        ties = sorted({t for e in report.effects for t in e["ties"]})
-        least, bic = ("", "") if args.no_baselines else baselines(report.comparison, report.selection)
-        rows.append(
-            {
-                "case": name, "kind": kind, "seeds": args.seeds, "thresholds": threshold_hash(), "seal": seal, "verdict": report.verdict, "named": named,  # noqa: E501
-                "ties": ties, "truth": [e for e, _ in effects], "sizes": [s for _, s in effects], "settings": settings, "closed": report.closed,  # noqa: E501
-                "nats": report.ranking[0][1] if report.ranking else 0.0, "confidence": [e["confidence"] for e in report.effects],
-                "least_rms": least, "bic": bic,
-            }
-        )  # fmt: skip
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(rows, indent=1))
-        temporary.replace(path)
-        print(f"{seal} {name:<28} {report.verdict[:110]} | least RMS {least}, BIC {bic}", flush=True)
-    rows = [r for r in rows if r["seeds"] == args.seeds and r["thresholds"] == threshold_hash()]
+    done = {(r["case"], r["seeds"], r["tier"], r["thresholds"]) for r in rows}
+    i, n = (int(v) for v in args.share.split("/"))
+    todo = [c for c in cases(args.counts, args.seeds)[i::n] if (c["case"], args.seeds, args.tier, threshold_hash()) not in done]
+    print(f"thresholds {threshold_hash()}, {len(todo)} cases to do", flush=True)
+    if todo:
+        began = time.time()
+        _begin(args)  # compiles kernels and fills the first plan's cache before anybody else needs them
+        _solve(0)
+        for skin in sorted({c["settings"]["skin"] for c in todo}):
+            _worker.generator(skin)
+        if args.jobs > 1:
+            with multiprocessing.get_context("spawn").Pool(args.jobs, _begin, (args,)) as pool:
+                pool.map(_solve, range(PLANS), chunksize=1)
+                print(f"fields there after {time.time() - began:.0f} s", flush=True)
+                _collect(pool.imap_unordered(_one, todo, chunksize=1), rows, path)
+        else:
+            _collect(map(_one, todo), rows, path)
+    rows = [r for r in rows if (r["seeds"], r["tier"], r["thresholds"]) == (args.seeds, args.tier, threshold_hash())]
     print(table(rows))
-    confusion(rows, args.figure)
+    if args.figure:
+        confusion(rows, args.figure)
 
 
-def table(rows) -> str:
-    """Counts against the bars."""
-    lines = []
-    by = collections.defaultdict(list)
-    for r in rows:
-        by[r["kind"]].append(r)
-    single = by["single"]
-    given = [r for r in rows if r["named"] and "unknown" not in r["verdict"]]
-    right = [r for r in given if r["named"][0] in r["truth"] or set(r["ties"]) & set(r["truth"])]
-    lines.append(f"a given name is right: {len(right)}/{len(given)}")
-    if single:
-        strong = [r for r in single if r["nats"] >= 10]
-        lines.append(f"top-1, single effects: {sum(r['named'][:1] == r['truth'] for r in single)}/{len(single)}")
-        lines.append(f"  of them 10 nats per trajectory: {sum(r['named'][:1] == r['truth'] for r in strong)}/{len(strong)}")
-        lines.append(
-            f"  baseline least RMS: {sum([r['least_rms']] == r['truth'] for r in single)}/{len(single)}, BIC: {sum([r['bic']] == r['truth'] for r in single)}/{len(single)}"  # noqa: E501
-        )
-        closed = [r["closed"] for r in single if r["closed"] == r["closed"] and r["named"]]
-        lines.append(f"  gap closed on trajectories kept aside, median: {np.median(closed):.0%}" if closed else "  nothing named")
-    for kind in ("none", "wrong base"):
-        if by[kind]:
-            named = sum(bool(r["named"]) for r in by[kind])
-            lines.append(
-                f"{kind}: named something {named}/{len(by[kind])}; BIC {sum(r['bic'] not in ('none', '') for r in by[kind])}, least RMS always"  # noqa: E501
-            )
-    if by["outside"]:
-        lines.append(f"outside the catalogue: abstained {sum('unknown' in r['verdict'] for r in by['outside'])}/{len(by['outside'])}")
-    if by["pair"]:
-        lines.append(f"pairs: both named {sum(set(r['truth']) <= set(r['named']) for r in by['pair'])}/{len(by['pair'])}, "
-                     f"one {sum(bool(set(r['truth']) & set(r['named'])) for r in by['pair'])}/{len(by['pair'])}")  # fmt: skip
-    return "\n".join(lines)
-
-
-def confusion(rows, path):
-    """Truth against the first name, as a figure."""
-    from matplotlib.figure import Figure
-
-    truths = [*HIDDEN, *OUTSIDE, "none", "wrong base"]
-    names = sorted({r["named"][0] for r in rows if r["named"]} | set(HIDDEN)) + ["unknown", "no disagreement"]
-    matrix = np.zeros((len(truths), len(names)), int)
-    for r in rows:
-        if r["kind"] == "pair":
+def _collect(results, rows, path):
+    for row in results:
+        if "error" in row:
+            print(f"FAILED {row['case']}: {row['error']}", flush=True)
             continue
-        truth = r["truth"][0] if r["truth"] else r["kind"]
-        name = (
-            "no disagreement"
-            if r["verdict"].startswith("no significant")
-            else "unknown"
-            if r["verdict"].startswith("unknown") or not r["named"]
-            else r["named"][0]
+        rows.append(row)
+        _write(path, rows)
+        print(
+            f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:100]} | {row['least_rms']}, {row['bic']}",
+            flush=True,
         )
-        matrix[truths.index(truth), names.index(name)] += 1
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    ax = figure.subplots()
-    ax.imshow(matrix, cmap="Blues")
-    for i, j in zip(*np.nonzero(matrix)):
-        ax.text(j, i, matrix[i, j], ha="center", va="center", fontsize=8)
-    ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-    ax.set_yticks(range(len(truths)), truths, fontsize=8)
-    ax.set_xlabel("first name given")
-    ax.set_ylabel("hidden (synthetic data)")
-    pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

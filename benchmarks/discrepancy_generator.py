@@ -53,7 +53,7 @@ def plan(seed, count, skin="coarse"):
 class Generator:
     """The skin of a mesh under plans; `footprint` widens what the electrodes see of a contact (a mildly wrong base model)."""
 
-    def __init__(self, skin="coarse", modulus=1.0, footprint=0.0):
+    def __init__(self, skin="coarse", modulus=1.0, footprint=0.0, tier="condensed", device="cpu"):
         from biotac_mj.geometry import load_skin
         from biotac_mj.sensor.film import FilmConduction
         from biotac_mj.skin.material import material
@@ -62,7 +62,7 @@ class Generator:
         self.geometry = load_skin(skin)
         self.film = FilmConduction(self.geometry, sensor="1")
         self.model = SkinModel(self.geometry, material("default"), SkinOptions(liquid=True))
-        self.modulus, self.footprint = modulus, footprint
+        self.modulus, self.footprint, self.tier = modulus, footprint, tier
         self._solved = {}
 
     def skin(self, one, pos, radius=None):

@@ -52,7 +52,7 @@ def measure(sim, trajectories, effect, seed):
     """The same trajectories with what a sensor with that effect reads (synthetic)."""
     rng = np.random.default_rng(seed)
     slips = [rng.normal(0, 2e-5, 3) for _ in trajectories]
-    runs = sim.run(trajectories, None, True, [effect], 1.1, 0.0, slips)
+    runs = sim.run(trajectories, None, True, [effect], 1.1, slips)
     out = []
     for t, r in zip(trajectories, runs):
         counts = np.clip(np.rint(r.counts + 3.5 * rng.standard_normal(r.counts.shape)), 0, 4095)

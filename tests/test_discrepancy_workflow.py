@@ -61,7 +61,7 @@ def measured(effects, seed=1, **kw):
     rng = np.random.default_rng(seed)
     data = plans(**kw)
     slips = [rng.normal(0, 15e-6, 3) for _ in data]
-    runs = Springs().run(data, None, True, effects, 1.07, 0.0, slips)
+    runs = Springs().run(data, None, True, effects, 1.07, slips)
     return [
         Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),  # noqa: E501
                    np.rint(r.pdc + rng.standard_normal(len(t.time))), None, r.force + 0.005 * rng.standard_normal(r.force.shape))

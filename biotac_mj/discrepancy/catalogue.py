@@ -123,7 +123,7 @@ class Bubble(Effect):
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
     physics = "the film gets thinner with the session's clock: every impedance rises in proportion"
-    params = {"rate": Param("1/h", 0.0, 2.0, "0-15 % a day from permeability; leaks more", 0.1)}
+    params = {"rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)}
     confusable = {"warmup": "log TDC; wait an hour", "gain": "the same probe at the beginning and the end of the session"}
 
     def apply(self, run, theta):
@@ -212,7 +212,7 @@ class Mount(Effect):
     confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
 
     def apply(self, run, theta):
-        run.offset = run.offset - np.outer(theta["compliance"] * run.normal_force, run.heading)
+        run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
 
 
 class Rocking(Effect):

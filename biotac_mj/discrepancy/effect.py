@@ -47,6 +47,7 @@ class Run:
       bubble: volume of trapped air [m3].
       force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is solved those without effects.
       counts (n, 19), pdc (n,): after the converter, before rounding. temperature: (n,) above the first row of the session [C], or None.
+      stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
       session: dict that the effects of one simulation share from trajectory to trajectory.
     """
 
@@ -69,11 +70,17 @@ class Run:
     rest_log_z: np.ndarray | None = None
     counts: np.ndarray | None = None
     pdc: np.ndarray | None = None
+    stiffness: np.ndarray | None = None
 
     @property
     def normal_force(self) -> np.ndarray:
         """(n,) against the heading, positive while pressed [N]."""
         return np.maximum(-self.force @ self.heading, 0)
+
+    def give(self, compliance) -> np.ndarray:
+        """(n,) x = compliance F(depth - x): how far something in series gives way [m]."""
+        stiffness = 0.0 if self.stiffness is None else self.stiffness
+        return compliance * self.normal_force / (1 + max(compliance, 0) * stiffness)
 
     def scale_load(self, factor):
         """Multiplies what the rubber bears: force and the liquid's pressure (n,)."""

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 from scipy.optimize import least_squares
 
+from .nuisance import HIGH, LOW, PRIOR, Nuisance
+
 __all__ = ["Fit", "evidence", "fit_effects", "mean_square"]
 
-_NUISANCE = ("log_modulus", "log_friction")
-_PRIOR = np.array([0.4, 0.4])
+_N = len(PRIOR)
 
 
 @dataclasses.dataclass
@@ -16,22 +17,21 @@ class Fit:
     """Effects with their parameters and the nuisance fitted with them.
 
     Attributes:
-      effects: list of (Effect, theta). log_modulus, log_friction. covariance: of the free parameters, by trajectory (sandwich).
+      effects: list of (Effect, theta). nuisance: fitted with them. covariance: of the free parameters, by trajectory (sandwich).
       names: of the free parameters: (effect id, name); cost.
     """
 
     effects: list
-    log_modulus: float
-    log_friction: float
+    nuisance: Nuisance
     names: list
     covariance: np.ndarray
     cost: float
 
     def residuals(self, comparison, exact=False):
-        return comparison.residuals(self.effects, float(np.exp(self.log_modulus)), self.log_friction, exact)
+        return comparison.residuals(self.effects, self.nuisance, exact)
 
     def raw(self, comparison, exact=False):
-        return comparison.raw(self.effects, float(np.exp(self.log_modulus)), self.log_friction, exact)
+        return comparison.raw(self.effects, self.nuisance, exact)
 
     def interval(self, k):
         """95 % interval of free parameter k, from the covariance by trajectory."""
@@ -75,36 +75,35 @@ def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
                     x0.append(np.clip(value / p.scale, low[-1] + 1e-6, high[-1] - 1e-6)),
                 )
     scale = np.array(scale)
-    nuisance = np.zeros(2) if start is None else np.array([start.log_modulus, start.log_friction])
+    nuisance = np.zeros(_N) if start is None else start.nuisance.vector()
     sliding = any(e.id == "friction" for e, _ in effects)
     x = np.concatenate([nuisance, x0])
-    bounds = (np.concatenate([[-1.5, -1.5], low]), np.concatenate([[1.5, 1.5], high]))
+    bounds = (np.concatenate([LOW, low]), np.concatenate([HIGH, high]))
     prior = np.array([2.5 if not e.params[n].shape else 1.0 for i, (eid, n) in enumerate(names) for e, _ in effects if e.id == eid])
     centre = np.array([0.0 if not _param(effects, nm).shape else np.log({e.id: th for e, th in effects}[nm[0]][nm[1]]) for nm in names])
 
     def unpack(v):
         filled = [(e, dict(th)) for e, th in effects]
         table = {e.id: th for e, th in filled}
-        for (eid, name), value, s in zip(names, v[2:], scale):
+        for (eid, name), value, s in zip(names, v[_N:], scale):
             table[eid][name] = float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
-        return filled, float(v[0]), 0.0 if sliding else float(v[1])
+        return filled, Nuisance(float(v[0]), 0.0 if sliding else float(v[1]), float(v[2]), float(v[3]))
 
     weight = None
 
     def function(v):
-        filled, log_modulus, log_friction = unpack(v)
-        r = comparison.residuals(filled, float(np.exp(log_modulus)), log_friction)
+        r = comparison.residuals(*unpack(v))
         parts = [r[i].ravel() * np.sqrt(weight[i] / r[i].shape[1]) for i in keep]
-        penalty = np.concatenate([v[:2] / _PRIOR, (v[2:] - centre) / prior]) if len(names) else v[:2] / _PRIOR
+        penalty = np.concatenate([v[:_N] / PRIOR, (v[_N:] - centre) / prior]) if len(names) else v[:_N] / PRIOR
         return np.concatenate([*parts, penalty])
 
     weight = np.ones(len(comparison.trajectories))
     for round_ in range(2):
-        c = mean_square(comparison.residuals(unpack(x)[0], float(np.exp(x[0])), unpack(x)[2]))
+        c = mean_square(comparison.residuals(*unpack(x)))
         weight = 1 / np.maximum(c, 0.5)
         out = least_squares(function, x, bounds=bounds, method="trf", diff_step=1e-3, max_nfev=8 if round_ == 0 else 6, x_scale="jac")
         x = out.x
-    filled, log_modulus, log_friction = unpack(x)
+    filled, nuisance = unpack(x)
     # Sandwich by trajectory: bread of Gauss-Newton, meat of the trajectories' own scores.
     sizes = [comparison.measured[i].size for i in keep]
     edges = np.concatenate([[0], np.cumsum(sizes)])
@@ -113,10 +112,10 @@ def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
     score = np.array([J[a:b].T @ r[a:b] for a, b in zip(edges[:-1], edges[1:])])
     n = len(keep)
     sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
-    covariance = np.maximum(np.diag(sandwich)[2:], np.diag(bread)[2:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)))
+    covariance = np.maximum(np.diag(sandwich)[_N:], np.diag(bread)[_N:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)))
     jacobian = np.array([1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]] for nm in names])
     covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
-    return Fit(filled, log_modulus, log_friction, names, covariance, float(out.cost))
+    return Fit(filled, nuisance, names, covariance, float(out.cost))
 
 
 def _param(effects, name):

@@ -16,6 +16,7 @@ import tqdm
 from ..press_record import replacing
 from .catalogue import by_id
 from .effect import STAGES, Run
+from .nuisance import KNOWN, OTHER_MESH, widen
 
 __all__ = ["SCHEMA", "Simulator", "load_simulator"]
 
@@ -43,6 +44,7 @@ class Simulator:
     effects: list = dataclasses.field(default_factory=list)
     modulus: float = 1.0
     cache: str | None = None
+    device: str = "cpu"
     intervals: dict = dataclasses.field(default_factory=dict)
 
     def with_effects(self, effects, modulus=None) -> "Simulator":
@@ -118,12 +120,19 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories, progress=True) -> "Fields":
-        """The skin along the trajectories and its differences: 7 solutions of the data set, kept in `cache`."""
+        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
-        with tqdm.tqdm(total=(6 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False) as bar:
+        with tqdm.tqdm(total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
             slopes = {}
+            if self.skin in OTHER_MESH:
+                here, there = (
+                    dataclasses.replace(self, skin=skin, tier="condensed").solve(trajectories)
+                    for skin in (self.skin, OTHER_MESH[self.skin])
+                )
+                slopes["mesh"] = [{k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)]
+                tick(len(trajectories))
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
@@ -139,16 +148,18 @@ class Simulator:
 
     # --- all stages ------------------------------------------------------------------------------------------------------------------
 
-    def run(self, trajectories, fields=None, exact=True, effects=None, modulus=None, log_friction=0.0, offsets=None) -> list[Run]:
+    def run(self, trajectories, fields=None, exact=True, effects=None, modulus=None, offsets=None, nuisance=KNOWN) -> list[Run]:
         """What the sensor would read, without noise and rounding.
 
         Args:
           fields: Fields of the trajectories; None solves them.
-          exact: solve the skin anew where effects move the object; False uses the fields' differences.
-          effects, modulus, log_friction: None takes the simulator's; offsets: list of (3,) further shifts of the poses [m].
+          exact: solve the skin anew where effects move the object; False uses the fields' differences; a list of indices does so for
+            those trajectories alone.
+          effects, modulus: None takes the simulator's; offsets: list of (3,) further shifts of the poses [m].
+          nuisance: what the base model is off by; its modulus is a factor on the simulator's.
         """
         effects = self.effects if effects is None else effects
-        modulus = self.modulus if modulus is None else modulus
+        modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
         base = fields.base if fields is not None else self.solve(trajectories)
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
         before = [(e, th) for e, th in ordered if e.stage in "SB" or e.id == "friction"]
@@ -158,13 +169,22 @@ class Simulator:
         for i, t in enumerate(trajectories):
             run = _begin(i, t, base[i], session, first)
             run.scale_load(modulus)
-            run.log_friction = log_friction
+            run.stiffness = modulus * _stiffness(base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t)
+            run.log_friction = nuisance.log_friction
             if offsets is not None:
                 run.offset = run.offset + offsets[i]
             for effect, theta in before:
                 effect.apply(run, theta)
             runs.append(run)
         self._mechanics(trajectories, runs, base, fields, exact, modulus)
+        for i, run in enumerate(runs):
+            if nuisance.mesh and fields is not None and "mesh" in fields.slopes:
+                other = fields.slopes["mesh"][i]
+                run.force = run.force + nuisance.mesh * modulus * other["force"]
+                run.pressure = run.pressure + nuisance.mesh * modulus * other["pressure"]
+                run.log_z = run.log_z + nuisance.mesh * other["log_z"]
+            if nuisance.footprint:
+                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint)
         for run in runs:
             for stage in ("K", "C", "T"):
                 for effect, theta in after:
@@ -178,26 +198,26 @@ class Simulator:
         return runs
 
     def _mechanics(self, trajectories, runs, base, fields, exact, modulus):
-        moved = any(np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble for r in runs)
-        if not moved:
-            return
-        if not exact:
-            for i, run in enumerate(runs):
-                change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
-                parts = [("x", run.offset[:, 0]), ("y", run.offset[:, 1]), ("z", run.offset[:, 2]), ("radius", run.log_radius),
-                         ("friction", run.log_friction), ("bubble", run.bubble)]  # fmt: skip
-                for name, amount in parts:
-                    if name in fields.slopes and np.any(amount):
-                        for k in change:
-                            slope = fields.slopes[name][i][k]
-                            change[k] = change[k] + (slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount))
-                run.force = modulus * (base[i]["force"] + change["force"])
-                run.pressure = modulus * (base[i]["pressure"] + change["pressure"])
-                run.log_z = base[i]["log_z"] + change["log_z"]
-            return
-        solved = self.solve(trajectories, [r.offset for r in runs], [r.log_radius for r in runs], runs[0].log_friction, runs[0].bubble)
-        for run, one in zip(runs, solved):
-            run.force, run.pressure, run.log_z = modulus * one["force"], modulus * one["pressure"], one["log_z"].copy()
+        """Force, pressure and ln Z of runs whose object or contact has changed."""
+        changed = [i for i, r in enumerate(runs) if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble]
+        anew = changed if exact is True else [i for i in changed if i in set(np.atleast_1d(exact).tolist())] if exact is not False else []
+        for i in changed:
+            run = runs[i]
+            if i in anew:
+                one = self.solve([trajectories[i]], [run.offset], [run.log_radius], run.log_friction, run.bubble)[0]
+                run.force, run.pressure, run.log_z = modulus * one["force"], modulus * one["pressure"], one["log_z"].copy()
+                continue
+            change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
+            parts = [("x", run.offset[:, 0]), ("y", run.offset[:, 1]), ("z", run.offset[:, 2]), ("radius", run.log_radius),
+                     ("friction", run.log_friction), ("bubble", run.bubble)]  # fmt: skip
+            for name, amount in parts:
+                if name in fields.slopes and np.any(amount):
+                    for k in change:
+                        slope = fields.slopes[name][i][k]
+                        change[k] = change[k] + (slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount))
+            run.force = modulus * (base[i]["force"] + change["force"])
+            run.pressure = modulus * (base[i]["pressure"] + change["pressure"])
+            run.log_z = base[i]["log_z"] + change["log_z"]
 
     # --- YAML ------------------------------------------------------------------------------------------------------------------------
 
@@ -225,7 +245,8 @@ class Simulator:
 
 @dataclasses.dataclass
 class Fields:
-    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log (radius, friction), per m3."""
+    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log (radius, friction), per m3;
+    "mesh": of another mesh, about rest."""
 
     base: list
     slopes: dict
@@ -280,6 +301,14 @@ def _begin(order, t, base, session, first_tdc):
         offset=np.zeros((len(t.time), 3)), force=base["force"].copy(), pressure=base["pressure"].copy(), log_z=base["log_z"].copy(),
         temperature=warm, session=session, rest_log_z=base["log_z"][0].copy(),
     )  # fmt: skip
+
+
+def _stiffness(base, slopes, t):
+    """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
+    if slopes is None:
+        return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
+    along = sum(h * s["force"] for h, s in zip(t.heading, slopes))
+    return np.maximum(-along @ t.heading, 0)
 
 
 def _impedance(film, vert_xpos):

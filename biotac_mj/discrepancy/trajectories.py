@@ -119,12 +119,26 @@ def read_trajectories(path) -> list[Trajectory]:
 
 
 def measurement_noise(trajectories) -> dict:
-    """Standard deviations: electrodes (19,) [counts], pdc [counts], force (3,) [N], from the smoothest quarter of the rows."""
-    electrodes = np.median([np.maximum(noise_level(t.electrodes), 1.0) for t in trajectories], axis=0)
-    pdc = [noise_level(t.pdc[:, None])[0] for t in trajectories if t.pdc is not None]
-    force = [noise_level(t.force, None, 1e-4) for t in trajectories if t.force is not None]
-    return {
-        "electrodes": np.maximum(electrodes, 2.0),
-        "pdc": max(float(np.median(pdc)), 2.0) if pdc else None,
-        "force": np.maximum(np.median(force, axis=0), 0.005) if force else None,
-    }
+    """Standard deviations: electrodes (19,) [counts], pdc [counts], force (3,) [N].
+
+    From second differences of rows while the object rests, in air or held; where there are too few of them, of all rows.
+    """
+    out = {"electrodes": _noise([t.electrodes for t in trajectories], trajectories, 2.0), "pdc": None, "force": None}
+    if any(t.pdc is not None for t in trajectories):
+        out["pdc"] = float(_noise([None if t.pdc is None else t.pdc[:, None] for t in trajectories], trajectories, 1.0)[0])
+    if any(t.force is not None for t in trajectories):
+        out["force"] = _noise([t.force for t in trajectories], trajectories, 0.005)
+    return out
+
+
+def _noise(values, trajectories, least):
+    pairs = [(x, t) for x, t in zip(values, trajectories) if x is not None]
+    rest = []
+    for x, t in pairs:
+        still = np.abs(np.diff(t.pos, axis=0)).max(1) < 1e-6
+        even = np.abs(np.diff(t.time, n=2)) < 0.2 * np.minimum(np.diff(t.time)[1:], np.diff(t.time)[:-1])
+        rest.append(np.diff(x, n=2, axis=0)[still[1:] & still[:-1] & even])
+    rest = np.concatenate(rest)
+    if len(rest) >= 20:
+        return np.maximum(np.median(np.abs(rest), axis=0) / (0.6745 * np.sqrt(6)), least)
+    return np.maximum(np.median([noise_level(x, None, 1e-4) for x, _ in pairs], axis=0), least)

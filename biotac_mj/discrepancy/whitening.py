@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from .nuisance import KNOWN
 from .simulator import Fields, Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
@@ -82,12 +83,12 @@ class Comparison:
         u, shrink = self._basis[i]
         return (r - u @ (shrink * (u.T @ r))).reshape(residual.shape)
 
-    def residuals(self, effects, modulus, log_friction, exact=False) -> list:
+    def residuals(self, effects, nuisance=KNOWN, exact=False) -> list:
         """Whitened residuals of every trajectory."""
-        runs = self.sim.run(self.trajectories, self.fields, exact, effects, modulus, log_friction)
+        runs = self.sim.run(self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance)
         return [self.whiten(i, m - p) for i, (m, p) in enumerate(zip(self.measured, self.predict(runs)))]
 
-    def raw(self, effects, modulus, log_friction, exact=False) -> list:
+    def raw(self, effects, nuisance=KNOWN, exact=False) -> list:
         """Residuals (n, width) in counts, counts and newtons."""
-        runs = self.sim.run(self.trajectories, self.fields, exact, effects, modulus, log_friction)
+        runs = self.sim.run(self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance)
         return [m - p for m, p in zip(self.measured, self.predict(runs))]

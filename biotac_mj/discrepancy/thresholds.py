@@ -1,0 +1,38 @@
+"""Thresholds of acceptance and abstention, and the confidence of a name: constants that were fitted on practice seeds, with their hash."""
+
+import hashlib
+import json
+
+import numpy as np
+
+__all__ = ["THRESHOLDS", "confidence", "threshold_hash"]
+
+THRESHOLDS = {
+    "p": 0.02,  # sign flips over trajectories
+    "gain": 1.0,  # [nats per trajectory] mean gain of evidence on trajectories left out
+    "share": 0.15,  # of the closable log mean square that one effect has to close
+    "energy": 0.02,  # of the mean square that all effects take away, that each has to take away by itself
+    "named": 0.7,  # of the closable log mean square that all have to close, else the rest is unknown
+    "significant": 2.0,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
+    "peak": 4.0,  # the same of the worst channel
+    "most": 3,  # effects
+    "refit": 6,  # effects that are refitted after the screen
+}
+# Logistic of a name's confidence: constant, log1p(nats), share of the excess closed, log of what is left, lead over the runner-up [z].
+CONFIDENCE = (-1.0, 0.8, 1.5, 0.0, 0.0)
+
+
+def threshold_hash() -> str:
+    """Names the thresholds that a verdict was reached with."""
+    return hashlib.sha256(json.dumps([THRESHOLDS, CONFIDENCE], sort_keys=True).encode()).hexdigest()[:12]
+
+
+def confidence(nats, closed, left, lead, ties) -> float:
+    """Probability that a name is right.
+
+    Args:
+      nats: per trajectory, left out. closed: share of the excess that all effects close. left: mean log mean square that remains.
+      lead: over the runner-up, in standard errors over trajectories. ties: how many others do as well.
+    """
+    x = np.dot(CONFIDENCE, [1.0, np.log1p(max(nats, 0.0)), closed, max(left, 0.0), min(max(lead, 0.0), 10.0)])
+    return float(1 / (1 + np.exp(-x)) / (1 + ties))
