@@ -7,6 +7,7 @@ import warp as wp
 
 from .liquid import Liquid
 from .model import SkinModel
+from .stress_memory import StressMemory
 from .types import mat33, real, vec3
 
 __all__ = ["ContactState", "SkinData", "view"]
@@ -94,6 +95,7 @@ class SkinData:
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
+      memory: StressMemory of skin with `prony` or `mullins`, or None; `reset` forgets.
     """
 
     converged = _Scalar("reason", lambda reason: reason == 0)
@@ -106,8 +108,15 @@ class SkinData:
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
+        if any((m.prony, m.mullins) != (model.material.prony, model.material.mullins) for m in materials):
+            raise ValueError("prony and mullins are the model's: give the worlds' materials the same")
         self.nworld, self.model = nworld, model
         self.resident = model.device.is_cuda if resident is None else resident
+        if self.resident and model.material.remembers:
+            raise ValueError(
+                "skin that remembers (prony, mullins) is solved on the CPU's full tier only: choose device='cpu' and resident=False, "
+                "or leave both out of the material"
+            )
         if model.device.is_cuda and not self.resident:
             raise ValueError("on CUDA the state is always resident: leave resident out, or make the model on the CPU")
         second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
@@ -128,6 +137,7 @@ class SkinData:
         if self.resident:
             self._allocate_device()
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
+        self.memory = StressMemory(model, nworld, self.mu, self.lam) if model.material.remembers else None
         self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
         self.core_pos = np.zeros((nworld, 3))
         self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
@@ -196,6 +206,8 @@ class SkinData:
             self.core.reset()
         if self.liquid:
             self.liquid.reset()
+        if self.memory:
+            self.memory.reset(self.x)
         self.converged = np.ones(self.nworld, bool)
         self.nonconverged = np.zeros(self.nworld, int)
         self.iterations = np.zeros(self.nworld, int)
@@ -368,7 +380,7 @@ class SkinData:
         return made
 
     def stress(self):
-        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
+        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa], of the elastic law alone."""
         cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
         return _leading(cauchy), _leading(mises)
 

@@ -35,6 +35,8 @@ class Material:
       density: [kg/m^3]; used by implicit dynamics only.
       liquid: whether the preset fills the space between skin and core with the liquid.
       element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see `SkinOptions`.
+      prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term modulus. Steps need their dt.
+      mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `stress_memory` for both. CPU, full tier.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -47,8 +49,11 @@ class Material:
     density: float = 1000.0
     liquid: bool = True
     element: str | None = None
+    prony: tuple = ()
+    mullins: tuple | None = None
 
     def __post_init__(self):
+        self._check_memory()
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
         if self.element not in (None, *ELEMENTS):
@@ -65,6 +70,29 @@ class Material:
             )
         if self.friction < 0:
             raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
+
+    def _check_memory(self):
+        try:  # lists, as YAML and JSON give them, become tuples: a material is a key
+            object.__setattr__(self, "prony", tuple((float(g), float(tau)) for g, tau in self.prony))
+            if self.mullins is not None:
+                r, m, beta = (float(v) for v in self.mullins)
+                object.__setattr__(self, "mullins", (r, m, beta))
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and (r, m, beta) or None"
+            ) from None  # noqa: E501
+        for g, tau in self.prony:
+            if not (math.isfinite(g) and g >= 0 and math.isfinite(tau) and tau > 0):
+                raise ValueError(
+                    f"a Prony term of g {g} and tau {tau} s: g must be >= 0 and tau positive, else energy would come from nothing"
+                )  # noqa: E501
+        if self.mullins is not None and not (r > 1 and m > 0 and beta >= 0 and math.isfinite(r + m + beta)):
+            raise ValueError(f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0")
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the stress depends on the past."""
+        return bool(self.prony) or self.mullins is not None
 
     @property
     def mu(self) -> float:

@@ -1,6 +1,7 @@
 """One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate gradients."""
 
 import contextlib
+import functools
 
 import numpy as np
 import warp as wp
@@ -33,7 +34,7 @@ def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = No
     Args:
       model, data: the skin.
       geoms: touching geoms, poses in the BioTac frame at the end of the step.
-      dt: time step [s]; needed by implicit dynamics.
+      dt: time step [s]; needed by implicit dynamics and by skin with a Prony series.
       core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of the step, for the inertia of
         implicit dynamics; None means that it does not move.
 
@@ -96,6 +97,9 @@ class _Step:
         if not hasattr(data, "preconditioner"):
             data.preconditioner = Preconditioner(model, data.stiffness_scale)
         self.M = data.preconditioner
+        if data.memory:
+            data.memory.begin(dt)
+            self.M.scale = data.stiffness_scale * data.memory.stiffening
         self.products = 0
         self.inertia = None
         if model.options.dynamics == "implicit":
@@ -247,6 +251,8 @@ class _Step:
         n, w = m.nvert, d.nworld
         launch = _launcher(m.device)
         m.elasticity.force(d.elastic, d.mu, d.lam, d.x, d.force)
+        if d.memory:
+            d.memory.add_force(d.x, d.force)
         if d.external is not None:
             self.force += d.external
         self._contact(d.outer, self.geoms)
@@ -284,6 +290,8 @@ class _Step:
         m, d = self.m, self.d
         view(d.direction)[...] = p
         m.elasticity.product(d.elastic, d.mu, d.lam, d.x, d.direction, d.product)
+        if d.memory:
+            d.memory.add_product(d.direction, d.product)
         return view(d.product)
 
     def _product(self, p):
@@ -373,6 +381,8 @@ class _Step:
         d.outer.commit()
         if d.liquid:
             d.liquid.commit(good)
+        if d.memory:
+            d.memory.commit(d.x, good)
         d.motion = self._motion()
         view(d.increment)[...] = self.x - self.start
         self.geoms.advance()
@@ -387,7 +397,4 @@ class _Step:
 
 
 def _launcher(device):
-    def launch(kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
-
-    return launch
+    return functools.partial(wp.launch, device=device)

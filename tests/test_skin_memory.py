@@ -1,0 +1,282 @@
+"""Relaxation and Mullins softening inside the elements, against closed forms of bars and of prescribed homogeneous deformations."""
+
+import numpy as np
+import pytest
+import warp as wp
+from blocks import box, nodal_areas, place, shell, skin
+from scipy.special import erf
+
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.data import view
+from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.types import vec3
+
+NOTHING = GeomSet([], [])
+E, G, TAU = 1e6, 0.4, 0.7
+LENGTH, AREA = 20e-3, 25e-6
+NOW = 1e-9  # [s] of a step that is a jump
+
+
+def bar(law="linear", element="linear", nu=0.0, prony=((G, TAU),), mullins=None, held=True, **options):
+    """20 mm long, 5 mm x 5 mm, held at x = 0 and, if asked, at the other end, which tests then move."""
+    vert, elem = box([np.linspace(0, LENGTH, 5), np.linspace(0, 5e-3, 2), np.linspace(0, 5e-3, 2)])
+    fixed = np.flatnonzero((vert[:, 0] == 0) | (held & (vert[:, 0] == LENGTH)))
+    options = SkinOptions(element=element, tolerance=1e-7, max_newton=60, max_cg=300, **options)
+    return SkinModel(skin(vert, elem, fixed), Material(law, E, nu, prony=prony, mullins=mullins), options)
+
+
+def pull(model, data, stretch, dt):
+    """Moves the end of the bar; the force that this takes [N]."""
+    end = np.flatnonzero(model.geometry.vert[:, 0] == LENGTH)
+    to = model.geometry.vert[end] * [stretch, 1, 1]
+    place(data, end, to)
+    step(model, data, NOTHING, dt)
+    assert data.converged.all()
+    return -view(data.force)[end, 0, 0].sum()
+
+
+def cube(law, element, **memory):
+    """A jittered cube whose whole surface is held: homogeneous deformations are prescribed and exact."""
+    vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, jitter=0.2)
+    fixed = np.flatnonzero(((vert == 0) | (vert == 1e-2)).any(1))
+    options = SkinOptions(element=element, tolerance=1e-8, max_newton=60, max_cg=400)
+    return SkinModel(skin(vert, elem, fixed), Material(law, E, 0.3, **memory), options)
+
+
+def deform(model, data, F, dt):
+    """First Piola stress (3, 3) [Pa] after a step to the homogeneous F: mean over the cube of f x X on its surface."""
+    for array in (data.x, data.x_last):
+        view(array)[:, 0] = model.geometry.vert @ F.T
+    step(model, data, NOTHING, dt)
+    assert data.converged.all()
+    fixed = model.fixed
+    return -np.einsum("ni,nj->ij", view(data.force)[fixed, 0], model.geometry.vert[fixed]) / 1e-6
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["linear", "svk", "corotational"])
+def test_force_of_a_stretched_bar_relaxes_as_the_series_says(law, element):
+    prony = ((0.4, 0.7), (0.2, 8.0))
+    model = bar(law, element, prony=prony)
+    data, elastic = SkinData(model), SkinModel(model.geometry, Material(law, E, 0.0), model.options)
+    stretch = 1.2
+    long_term = pull(elastic, SkinData(elastic), stretch, None)
+    exact = {"linear": E * 0.2, "corotational": E * 0.2, "svk": E * stretch * (stretch**2 - 1) / 2}[law] * AREA
+    assert long_term == pytest.approx(exact, rel=1e-6)
+    time = 0.0
+    for dt in (NOW, 0.05, 0.4, 2.0, 0.1, 30.0):
+        time += dt
+        expected = long_term * (1 + sum(g * np.exp(-time / tau) for g, tau in prony))
+        assert pull(model, data, stretch, dt) == pytest.approx(expected, rel=1e-6)
+
+
+def test_faster_is_stiffer():
+    """A ramp of the `linear` law: F = E A k (t + g tau (1 - exp(-t / tau))), whatever the steps."""
+    for rate, n in ((1e-3, 7), (0.1, 7), (10.0, 3)):
+        model = bar()
+        data = SkinData(model)
+        end = 0.01 / rate
+        for k in range(n):
+            force = pull(model, data, 1 + 0.01 * (k + 1) / n, end / n)
+        expected = E * AREA * rate * (end + G * TAU * (1 - np.exp(-end / TAU)))
+        assert force == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_loaded_bar_creeps():
+    """Compliance of the standard solid: (1 - g / (1 + g) exp(-t / (tau (1 + g)))) / E."""
+    model = bar(held=False)
+    data = SkinData(model)
+    vert = model.geometry.vert
+    end = vert[:, 0] == LENGTH
+    face = np.array([f for f in model.geometry.outer_face if end[f].all()])
+    load = np.zeros((1, model.nvert, 3))
+    load[0, :, 0] = 1e4 * nodal_areas(vert, face)
+    data.set_external(load)
+    step(model, data, NOTHING, NOW)
+    time, dt = 0.0, 0.02
+    for k in range(60):
+        strain = (data.vert_xpos[0, end, 0].mean() - LENGTH) / LENGTH
+        expected = 1e4 / E * (1 - G / (1 + G) * np.exp(-time / (TAU * (1 + G))))
+        assert strain == pytest.approx(expected, rel=2e-4), k  # second order in dt
+        step(model, data, NOTHING, dt)
+        time += dt
+    assert data.converged.all()
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
+def test_two_jumps_and_a_turn(law, element):
+    """Large strains: P = F (S + sum of g (jumps of what remembers) exp(-their age / tau)), turned with the body."""
+    rng = np.random.default_rng(2)
+    first, second = (np.eye(3) + 0.15 * rng.standard_normal((3, 3)) for _ in range(2))
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    model, elastic = cube(law, element, prony=((G, TAU),)), cube(law, element)
+
+    def piola(F):
+        return np.linalg.solve(F, deform(elastic, SkinData(elastic), F, None))
+
+    def memory(F):
+        if law != "neo_hookean":
+            return piola(F)
+        C = F.T @ F
+        return elastic.material.mu * np.linalg.det(F) ** (-2 / 3) * (np.eye(3) - np.trace(C) / 3 * np.linalg.inv(C))
+
+    data = SkinData(model)
+    deform(model, data, first, NOW)
+    deform(model, data, first, 0.5)
+    deform(model, data, second, NOW)
+    got = deform(model, data, second, 0.3)
+    over = G * (memory(first) * np.exp(-0.8 / TAU) + (memory(second) - memory(first)) * np.exp(-0.3 / TAU))
+    expected = second @ (piola(second) + over)
+    np.testing.assert_allclose(got, expected, atol=1e-6 * abs(expected).max())
+    turned = deform(model, data, turn @ second, NOW)
+    np.testing.assert_allclose(turned, turn @ expected, atol=1e-6 * abs(expected).max())
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", LAWS)
+def test_the_tangent_is_the_forces_derivative(law, element):
+    model = cube(law, element, prony=((G, TAU), (0.1, 3.0)), mullins=(1.6, 2e3, 0.1))
+    data, rng = SkinData(model), np.random.default_rng(4)
+    memory, rest = data.memory, model.geometry.vert
+    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T
+    memory.begin(0.3)
+    memory.commit(data.x, np.array([True]))  # a past, and a largest energy to be below of
+    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
+    memory.begin(0.2)
+    x, p = view(data.x).copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
+
+    def force(shift):
+        out = wp.zeros_like(data.force)
+        memory.add_force(wp.array(x + shift * p, dtype=vec3, ndim=2), out)
+        return out.numpy()
+
+    h = 1e-3
+    expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
+    force(0.0)
+    product = wp.zeros_like(data.force)
+    memory.add_product(wp.array(p, dtype=vec3, ndim=2), product)
+    assert (memory.softening.numpy() < 0.999).any()
+    np.testing.assert_allclose(product.numpy(), expected, atol=2e-7 * abs(expected).max())
+    q = rng.standard_normal(p.shape)
+    other = wp.zeros_like(data.force)
+    memory.add_product(wp.array(q, dtype=vec3, ndim=2), other)
+    assert np.vdot(q, product.numpy()) == pytest.approx(np.vdot(p, other.numpy()), rel=1e-9)
+
+
+@pytest.mark.parametrize("law", ["corotational", "neo_hookean", "svk"])
+def test_no_energy_comes_out_of_a_cycle(law):
+    """Work of closed cycles of the deformation: zero for the elastic law, positive with memory, at any speed."""
+    rng = np.random.default_rng(5)
+    kinds = {"elastic": {}, "prony": {"prony": ((G, TAU), (0.3, 0.05))}, "mullins": {"mullins": (1.5, 3e3, 0.0)}}
+    for name, memory in kinds.items():
+        model = cube(law, "linear", **memory)
+        for dt in (0.002, 0.05, 1.0):
+            a, b = 0.12 * rng.standard_normal((2, 3, 3))
+            angle = np.linspace(0, 2 * np.pi, 49)
+            path = np.eye(3) + (1 - np.cos(angle))[:, None, None] * a + np.sin(angle)[:, None, None] * b
+            data = SkinData(model)
+            P = np.array([deform(model, data, F, dt) for F in path])
+            work = np.einsum("tij,tij->", (P[1:] + P[:-1]) / 2, np.diff(path, axis=0))
+            scale = np.einsum("tij,tij->t", (P[1:] + P[:-1]) / 2, np.diff(path, axis=0)).clip(0).sum()
+            assert abs(work) < 2e-3 * scale if name == "elastic" else work > 5e-3 * scale, (name, dt)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_softening_of_a_cycle(element):
+    """A bar of svk without lateral strain: W = E (s^2 - 1)^2 / 8, P = eta E s (s^2 - 1) / 2 below the largest stretch, eta = 1 beyond."""
+    r, m, beta = 1.8, 5e3, 0.2
+    model = bar("svk", element, prony=(), mullins=(r, m, beta))
+    data = SkinData(model)
+    worst = 0.0
+    for stretch in (1.1, 1.2, 1.3, 1.2, 1.05, 1.0, 1.15, 1.29, 1.3, 1.4, 1.2):
+        energy = E * (stretch**2 - 1) ** 2 / 8
+        worst = max(worst, energy)
+        eta = 1 - erf((worst - energy) / (m + beta * worst)) / r
+        expected = eta * E * stretch * (stretch**2 - 1) / 2 * AREA
+        assert pull(model, data, stretch, None) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    data.reset()
+    assert pull(model, data, 1.2, None) == pytest.approx(E * 1.2 * 0.22 * AREA, rel=1e-6)
+
+
+def test_both_together():
+    """The softened stress relaxes: after a jump, a hold and a jump back P = s (eta S2 + g (S1 e1 + (eta S2 - S1) e2))."""
+    r, m = 2.0, 1e4
+    model = bar("svk", prony=((G, TAU),), mullins=(r, m, 0.0))
+    data = SkinData(model)
+    pull(model, data, 1.3, NOW)
+    pull(model, data, 1.3, 0.4)
+    pull(model, data, 1.1, NOW)
+    force = pull(model, data, 1.1, 0.2)
+    one, two = E * (1.3**2 - 1) / 2, E * (1.1**2 - 1) / 2
+    two *= 1 - erf(E * (0.69**2 - 0.21**2) / 8 / m) / r
+    over = G * (one * np.exp(-0.6 / TAU) + (two - one) * np.exp(-0.2 / TAU))
+    assert force == pytest.approx(1.1 * (two + over) * AREA, rel=1e-6)
+
+
+def test_memory_is_saved_replayed_and_forgotten():
+    model = bar("corotational", "quadratic", nu=0.3, mullins=(2.0, 1e4, 0.1))
+    data = SkinData(model)
+    path = [(1.2, 0.1), (1.25, 0.3), (1.1, 0.2)]
+    once = [pull(model, data, *p) for p in path]
+    saved, x = data.memory.state(), data.vert_xpos[0]
+    assert len(saved) == data.memory.nstate
+    went_on = pull(model, data, 1.15, 0.5)
+    again = SkinData(model)
+    for array in (again.x, again.x_last):
+        view(array)[:, 0] = x
+    again.memory.load(saved, again.x)
+    assert pull(model, again, 1.15, 0.5) == pytest.approx(went_on, rel=1e-9)
+    data.reset()
+    assert [pull(model, data, *p) for p in path] == once  # bit by bit
+    assert abs(SkinData(model).memory.state()).max() < 1e-15  # rounding of the energy at rest
+
+
+def test_worlds_remember_each_their_own():
+    model = bar("corotational")
+    data, alone = SkinData(model, 2), SkinData(model)
+    end = np.flatnonzero(model.geometry.vert[:, 0] == LENGTH)
+    for stretch, dt in ((1.2, 0.1), (1.2, 0.3), (1.1, 0.1)):
+        place(data, end, model.geometry.vert[end])
+        for array in (data.x, data.x_last):
+            view(array)[end, 1] = model.geometry.vert[end] * [stretch, 1, 1]
+        step(model, data, GeomSet([], [], nworld=2), dt)
+        force = pull(model, alone, stretch, dt)
+    reactions = -view(data.force)[end, :, 0].sum(0)
+    assert abs(reactions[0]) < 1e-9 and reactions[1] == pytest.approx(force, rel=1e-9)
+
+
+def test_filled_skin_rests():
+    """Rest on the filling is relaxed and virgin: nothing moves when time passes."""
+    vert, elem, inner = shell(10e-3, 7e-3, subdivisions=1, layers=2)
+    material = Material("corotational", E, 0.3, liquid=True, prony=((G, TAU),), mullins=(2.0, 1e3, 0.0))
+    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 0] > 5e-3), inner_face=inner), material, SkinOptions(rest_pressure=2e4))
+    data = SkinData(model)
+    at_rest = data.vert_xpos.copy()
+    for dt in (1e-3, 1.0):
+        step(model, data, NOTHING, dt)
+        assert data.converged.all() and data.iterations[0] == 0
+    np.testing.assert_array_equal(data.vert_xpos, at_rest)
+
+
+def test_what_cannot_be_is_refused():
+    nothing = "energy would come"
+    for prony, text in ((((0.1,),), "pass \\(\\(g, tau\\), ...\\)"), (((-0.1, 1.0),), nothing), (((0.1, 0.0),), nothing)):
+        with pytest.raises(ValueError, match=text):
+            Material(prony=prony)
+    with pytest.raises(ValueError, match="r must be above 1"):
+        Material(mullins=(0.9, 1.0, 0.0))
+    assert Material(prony=[[0.1, 2]], mullins=[2, 1e3, 0]) == Material(prony=((0.1, 2.0),), mullins=(2.0, 1e3, 0.0))
+    model = bar()
+    for dt in (None, 0.0, np.nan):
+        with pytest.raises(ValueError, match="relaxes in time: pass the time step"):
+            step(model, SkinData(model), NOTHING, dt)
+    with pytest.raises(ValueError, match="CPU's full tier only"):
+        SkinData(model, resident=True)
+    with pytest.raises(ValueError, match="give the worlds' materials the same"):
+        SkinData(model, material=[Material("linear", E, 0.0)])
+    from biotac_mj.skin.condensed import CondensedSkin
+
+    with pytest.raises(ValueError, match="condensed tier is elastic"):
+        CondensedSkin(model, NOTHING)
