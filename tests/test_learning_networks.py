@@ -48,8 +48,29 @@ def test_chebyshev_convolution_is_the_dense_polynomial(inputs, outputs):
         polynomial = vector @ np.diag(np.cos(k * np.arccos(np.clip(value, -1, 1)))) @ vector.T
         wanted += np.einsum("nm,mbi,io->nbo", polynomial, x.numpy(), conv.weight[k].detach().numpy())
     np.testing.assert_allclose(conv(x).detach().numpy(), wanted, atol=2e-5)
-    keep = torch.tensor([3, 20, 5])
-    np.testing.assert_allclose(conv(x, keep).detach().numpy(), wanted[[3, 20, 5]], atol=2e-5)
+    conv.keep = torch.tensor([3, 20, 5])
+    np.testing.assert_allclose(conv(x).detach().numpy(), wanted[[3, 20, 5]], atol=2e-5)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(3, 7), (7, 3)])
+@pytest.mark.parametrize("way", ["coarser", "finer"])
+def test_dense_matrices_of_a_gpu_are_the_recurrence(inputs, outputs, way):
+    # values and gradients; `dense` runs anywhere, `forward` takes it on CUDA
+    matrix = random_laplacian()
+    up = csr_matrix(np.random.default_rng(3).random((23, 6)))
+    torch.manual_seed(0)
+    change = dict(keep=np.array([3, 20, 5])) if way == "coarser" else dict(up=SparseMatrix(up))
+    conv = ChebConv(SparseMatrix(matrix, symmetric=True), inputs, outputs, order=6, bias=False, **change)
+    found = []
+    for product in (conv, conv.dense):
+        x = torch.randn(23 if way == "coarser" else 6, 4, inputs, generator=torch.Generator().manual_seed(1)).requires_grad_()
+        conv.weight.grad = None
+        y = product(x)
+        (y * torch.linspace(-1, 1, y.numel()).view_as(y)).sum().backward()
+        found.append((y.detach(), x.grad, conv.weight.grad.clone()))
+    assert found[0][0].shape == (3 if way == "coarser" else 23, 4, outputs)
+    for a, b in zip(*found):
+        np.testing.assert_allclose(a.numpy(), b.numpy(), atol=3e-5 * float(a.abs().max()))
 
 
 def test_sparse_product_has_the_right_gradient():

@@ -87,11 +87,20 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
 @pytest.mark.slow
 def test_the_papers_networks_train_too(folder, tmp_path):
     config = LearningConfig(
-        steps=60, batch=64, mesh_steps=6, mesh_batch=4, mesh_first=8, mesh_channels=(8, 8, 8, 8), mesh_last=8, pod=16, members=1
+        steps=60,
+        batch=64,
+        mesh_steps=6,
+        mesh_batch=4,
+        mesh_first=8,
+        mesh_channels=(8, 8, 8, 8),
+        mesh_last=8,
+        pod=16,
+        members=1,
+        paper_steps=60,
     )
     train_all(folder, tmp_path, (0,), ("trajectory",), config, only=("pod_log",), progress=False)
     report = json.loads((tmp_path / "trajectory-0.json").read_text())
-    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {"pod_inverse", "latent_inverse"} == set(report["inverse"])
+    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {"pod_inverse", "pod_inverse_taught", "latent_inverse"} == set(report["inverse"])
     assert {"latent_projection", "pointnet", "electrode_vae"} <= set(evaluate_models(tmp_path)["splits"]["trajectory"]["models"])
 
 

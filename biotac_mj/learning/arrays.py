@@ -21,7 +21,7 @@ class Arrays:
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
       counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the interaction's first row.
       simulated: (n, 19) counts of the simulation's own film, without noise where the set has its impedances.
-      force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N] on labelled rows, 0 elsewhere.
+      force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
       geometry: SkinGeometry. path: of the set.
     """
 
@@ -109,9 +109,8 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         measured = data["measured_counts"][keep][:, :19]
         labelled = np.asarray(data.labelled[:stop])
         force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
-        rows = np.flatnonzero(labelled[owner])
-        for a in range(0, len(rows), 2048):
-            force[rows[a : a + 2048]] = np.linalg.norm(data["contact_force"][keep[rows[a : a + 2048]]], axis=2)
+        for a in range(0, len(keep), 2048):
+            force[a : a + 2048] = np.linalg.norm(data["contact_force"][keep[a : a + 2048]], axis=2)
         time = data["time"][keep]
         simulated = counts_from_impedance(data["impedance"][keep]) if "impedance" in data.columns else data["counts"][keep][:, :19]
         tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731

@@ -23,7 +23,8 @@ class LearningConfig:
       projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
       dropout: of the projections, the paper's.
       learning_rate, decay: Adam's, and the factor per epoch; 20 epochs' worth of decay is spread over a training whatever its length [9].
-      batch, steps, mesh_batch, mesh_steps: the paper gives none [10]. The best state on the validation interactions is kept.
+      batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++, with the same batch;
+        mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best state on the validation interactions is kept.
       hierarchy: nodes by geodesic farthest points, affine-exact interpolation [12]; the only one there is.
       tare: row 0 of each interaction, before touch, is subtracted [17]; counts are divided by `scale` = 2048 for the paper's unit.
       pod: modes of the principal components of the mesh. width: of our networks. mirror: they also see every touch mirrored in z.
@@ -35,7 +36,7 @@ class LearningConfig:
     mesh_scale: float = 1e-3
     reconstruction: str = "mse"
     mesh_kl: float = 1e-3
-    electrode_kl: float = 1e-4
+    electrode_kl: float = 1e-5
     mesh_first: int = 128
     mesh_channels: tuple = (128, 128, 256, 64)
     mesh_factors: tuple = (4, 4, 4, 2)
@@ -53,8 +54,9 @@ class LearningConfig:
     decay: float = 0.95
     batch: int = 256
     steps: int = 1000
+    paper_steps: int = 4000
     mesh_batch: int = 64
-    mesh_steps: int = 700
+    mesh_steps: int = 4000
     hierarchy: str = "geodesic"
     tare: str = "row 0"
     scale: float = 2048.0

@@ -111,13 +111,15 @@ def train_split(arrays, features, path, split, seed, config, out, names, paper=T
         members = [models[best], *more]
         predictions["ensemble"] = torch.stack([m(both) for m in members]).mean(0)
 
-    inverse = timed("inverse", lambda: train_inverse(arrays, train, validation, config, pod, seed))
+    inverses = {name: timed(name, lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach))
+                for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))}  # fmt: skip
+    best_inverse = min(inverses, key=lambda name: inverses[name].validation)
     report = {"split": split, "seed": seed, "config": dataclasses.asdict(config), "set": str(path), "interactions": len(arrays.objects),
               "labelled": int(arrays.labelled.sum()), "test_interactions": len(np.unique(arrays.owner[rows].cpu())),
               "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device)}  # fmt: skip
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
-    back = {"pod_inverse": lambda r: inverse(arrays.log_change(r))}
+    back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
     if paper:
         lp = timed("latent_projection", lambda: train_latent_projection(arrays, train, validation, config, seed))
         unit = 1e-3 / config.mesh_scale
@@ -138,7 +140,7 @@ def train_split(arrays, features, path, split, seed, config, out, names, paper=T
             save_forward(
                 out / f"forward-{split}.safetensors", members, basis, config, FORWARD[best], arrays.geometry, kept | {"model": best}
             )
-        save_inverse(out / f"inverse-{split}.safetensors", inverse, arrays.geometry, kept)
+        save_inverse(out / f"inverse-{split}.safetensors", inverses[best_inverse], arrays.geometry, kept | {"model": best_inverse})
     _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
 
 

@@ -43,10 +43,14 @@ class InverseHead(nn.Module):
         return field.view(len(u), self.pod.nvert, 3), ((f * self.force_scale[0]) @ self.force_basis.T).clamp(min=0)
 
 
-def train_inverse(arrays, train, validation, config, pod, seed=0, progress=None) -> InverseHead:
+def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, progress=None) -> InverseHead:
     """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or None).
 
-    The loss weighs components by their size, so it is the error of the fields themselves.
+    The loss weighs components by their size, so it is the error of the fields themselves. teach: first learn from the simulation's own
+    film on all interactions of the training part, labelled or not.
+
+    Returns:
+      the head; its attribute `validation` is its error on the validation part [unit of the loss].
     """
     torch.manual_seed(seed)
     basis, now, then = pod
@@ -60,22 +64,30 @@ def train_inverse(arrays, train, validation, config, pod, seed=0, progress=None)
     both = torch.cat([rows, check])
     log_change[both] = arrays.log_change(both)
     head.scale.copy_(log_change[rows].square().mean(0).sqrt() + 1e-3)
+    every = arrays.rows(train) if teach else rows
     forces = torch.zeros(len(log_change), modes, device=arrays.device)
-    forces[both] = arrays.force[both].float() @ head.force_basis / head.force_scale[0]
+    for part in torch.cat([every, check]).split(4096):
+        forces[part] = arrays.force[part].float() @ head.force_basis / head.force_scale[0]
     size = basis.scale / basis.scale[0]
     order = torch.as_tensor(ELECTRODE_MIRROR, device=arrays.device)
 
-    def error(r, flip=False):
-        x = log_change[r]
+    def error(r, flip=False, source=log_change):
+        x = source[r]
         u, f = head.codes(x[:, order] if flip else x)
         value = root_mean_square(u - (then if flip else now)[r] * size)
         return value if flip else value + 0.3 * root_mean_square(f - forces[r])
 
-    def loss(r):
-        return error(r) + (0.5 * error(r, True) if then is not None else 0)
+    def loss(r, source=log_change):
+        return error(r, source=source) + (0.5 * error(r, True, source) if then is not None else 0)
 
-    cycle(head, loss, rows, config.batch, config.steps, config.learning_rate, lambda: error(check), weight_decay=0.01, seed=seed,
-          progress=progress)  # fmt: skip
+    if teach:
+        film = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device)
+        film = film - film[arrays.first]
+        cycle(head, lambda r: loss(r, film), every, 2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed,
+              progress=progress)  # fmt: skip
+    rate = config.learning_rate * (0.5 if teach else 1)
+    head.validation = cycle(head, loss, rows, config.batch, config.steps, rate, lambda: error(check), weight_decay=0.01, seed=seed,
+                            progress=progress)  # fmt: skip
     return head
 
 

@@ -27,20 +27,19 @@ class MeshVAE(nn.Module):
         self.nvert, self.latent, self.order = levels[0].laplacian.shape[0], latent, order
         self.coarsest = levels[-1].laplacian.shape[0]
         graphs = [SparseMatrix(level.laplacian, symmetric=True) for level in levels]
-        self.ups = nn.ModuleList(SparseMatrix(level.up) for level in levels[:-1])
-        for i, level in enumerate(levels[:-1]):
-            self.register_buffer(f"keep{i}", torch.as_tensor(level.keep), persistent=False)
+        ups = [SparseMatrix(level.up) for level in levels[:-1]]
+        stages = list(zip(graphs, [level.keep for level in levels[:-1]], ups))
         widths = [first, *channels]
         self.encode_convs = nn.ModuleList(
             [ChebConv(graphs[0], 3, first, order)]
-            + [ChebConv(g, a, b, order) for g, a, b in zip(graphs, widths, widths[1:])]
+            + [ChebConv(g, a, b, order, keep=keep) for (g, keep, _), a, b in zip(stages, widths, widths[1:])]
             + [ChebConv(graphs[-1], channels[-1], last, order)]
         )
         self.encode_dense = nn.Sequential(nn.Linear(self.coarsest * last, hidden), nn.ELU(), nn.Linear(hidden, 2 * latent))
         self.decode_dense = nn.Sequential(nn.Linear(latent, hidden), nn.ELU(), nn.Linear(hidden, self.coarsest * last), nn.ELU())
         self.decode_convs = nn.ModuleList(
             [ChebConv(graphs[-1], last, channels[-1], order)]
-            + [ChebConv(g, b, a, order) for g, a, b in reversed(list(zip(graphs, widths, widths[1:])))]
+            + [ChebConv(g, b, a, order, up=up) for (g, _, up), a, b in reversed(list(zip(stages, widths, widths[1:])))]
             + [ChebConv(graphs[0], first, 3, order, bias=False)]
         )
         self.last = last
@@ -52,18 +51,16 @@ class MeshVAE(nn.Module):
           u: (batch, nvert, 3) displacements, divided by their scale.
         """
         x = nn.functional.elu(self.encode_convs[0](u.transpose(0, 1).contiguous()))
-        for i, conv in enumerate(self.encode_convs[1:-1]):
-            x = nn.functional.elu(conv(x, getattr(self, f"keep{i}")))
-        x = nn.functional.elu(self.encode_convs[-1](x))
+        for conv in self.encode_convs[1:]:
+            x = nn.functional.elu(conv(x))
         mean, log_variance = self.encode_dense(x.transpose(0, 1).flatten(1)).chunk(2, -1)
         return mean, log_variance.clamp(-14, 4)
 
     def decode(self, z):
         """(batch, nvert, 3) of codes z (batch, latent)."""
         x = self.decode_dense(z).view(len(z), self.coarsest, self.last).transpose(0, 1)
-        x = nn.functional.elu(self.decode_convs[0](x))
-        for up, conv in zip(reversed(self.ups), self.decode_convs[1:-1]):
-            x = nn.functional.elu(conv(up(x)))
+        for conv in self.decode_convs[:-1]:
+            x = nn.functional.elu(conv(x))
         return self.decode_convs[-1](x).transpose(0, 1)
 
     def forward(self, u):

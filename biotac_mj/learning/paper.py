@@ -73,7 +73,7 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
     def electrode_loss(r):
         return _vae_loss(y[r], *electrode(y[r]), config.electrode_kl, config.reconstruction)
 
-    cycle(electrode, electrode_loss, rows, config.batch, config.steps, config.learning_rate,
+    cycle(electrode, electrode_loss, rows, config.batch, config.paper_steps, config.learning_rate,
           lambda: (electrode(y[check])[0] - y[check]).square().mean(), decay=config.decay, seed=seed, progress=progress)  # fmt: skip
 
     model = LatentProjection(vae, electrode, config).to(device)
@@ -104,7 +104,7 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
         a, b = codes_of(r)
         return root_mean_square(model.to_mesh(b) - a)
 
-    kind = dict(batch=config.batch, steps=config.steps, learning_rate=config.learning_rate, decay=config.decay, seed=seed)
+    kind = dict(batch=config.batch, steps=config.paper_steps, learning_rate=config.learning_rate, decay=config.decay, seed=seed)
     kind["progress"] = progress
     cycle(model.to_electrode, forward_loss, rows, validate=lambda: forward_loss(check), **kind)
     cycle(model.to_mesh, inverse_loss, rows, validate=lambda: inverse_loss(check), **kind)
@@ -126,7 +126,8 @@ def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> 
     def validate():
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
 
-    cycle(net, loss, rows, config.batch, config.steps, config.learning_rate, validate, decay=config.decay, seed=seed, progress=progress)
+    cycle(net, loss, rows, config.batch, config.paper_steps, config.learning_rate, validate, decay=config.decay, seed=seed,
+          progress=progress)  # fmt: skip
     return net
 
 

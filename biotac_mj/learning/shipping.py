@@ -65,7 +65,7 @@ def _card(name, meta, size, result):
             text = ", ".join(f"{k} {row['median']:.1f} ({row['median'] / UNIT:.4f})" for k, row in rows.items())
             lines.append(f"- unseen {split}: median RMS per interaction in counts (/ 2048): {text}; noise {found['noise_floor']:.1f}")
         else:
-            row = found["inverse_mm"]["pod_inverse"]
+            row = found["inverse_mm"][meta.get("model", "pod_inverse")]
             centre = f", patch centre {row['centre_median']:.2f} mm (median)" if "centre_median" in row else ""
             lines.append(f"- unseen {split}: nodes {row['mean']:.4f} mm, where the skin moves {row['moved']:.4f} mm{centre}")
     return "\n".join(lines) + "\n"

@@ -43,7 +43,7 @@ def _train(args):
     if unknown:
         raise ValueError(f"{args.config} sets {', '.join(sorted(unknown))}: LearningConfig has no such settings")
     if args.steps:
-        settings |= {"steps": args.steps, "mesh_steps": max(1, int(0.7 * args.steps))}
+        settings |= {"steps": args.steps, "paper_steps": 4 * args.steps, "mesh_steps": 4 * args.steps}
     train_all(args.set, args.out, args.seeds, args.splits, LearningConfig(**settings), args.device, args.paper, args.only, args.limit,
               progress=not args.quiet)  # fmt: skip
     print(f"written: {args.out}; judge it with `biotac evaluate {args.out}`")
