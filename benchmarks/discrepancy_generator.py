@@ -61,56 +61,81 @@ class Generator:
 
         self.geometry = load_skin(skin)
         self.film = FilmConduction(self.geometry, sensor="1")
-        self.model = SkinModel(self.geometry, material("default"), SkinOptions(liquid=True))
+        self.model = SkinModel(self.geometry, material("default"), SkinOptions(liquid=True), "cpu" if tier == "condensed" else device)
         self.modulus, self.footprint, self.tier = modulus, footprint, tier
-        self._solved = {}
 
-    def skin(self, one, pos, radius=None):
-        """force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]."""
-        key = (one["id"], one["tool"], radius, np.round(pos, 8).tobytes())
-        if key not in self._solved:
-            self._solved[key] = self._solve(one, pos, radius)
-        return [x.copy() for x in self._solved[key]]
-
-    def _solve(self, one, pos, radius):
+    def skin(self, plans, poses, radii) -> list:
+        """Per plan force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]; poses: lists of (n, 3); radii: factors or None."""
         from biotac_mj.data.objects import make_object
+
+        size = [float(make_object(one["tool"]).size[0]) * (radius or 1.0) for one, radius in zip(plans, radii)]
+        if self.tier == "condensed":
+            return [self._condensed(one, pos, r) for one, pos, r in zip(plans, poses, size)]
+        return self._full(plans, poses, size)
+
+    def _condensed(self, one, pos, r):
         from biotac_mj.skin.condensed import CondensedSkin, Memory
         from biotac_mj.skin.geoms import GeomSet
 
-        r = float(make_object(one["tool"]).size[0]) * (radius or 1.0)
         skin = self.__dict__.setdefault("_skins", {}).get(r)
         if skin is None:
             skin = self._skins[r] = CondensedSkin(
                 self.model, GeomSet(["sphere"], [(r,)], friction=[self.model.material.friction], device="cpu")
             )
+            while len(self._skins) > 4:
+                del self._skins[next(iter(self._skins))]
         memory, force, pressure, impedance = Memory.rest(1), [], [], []
-        before = pos[0]
-        for p in pos:
-            parts = max(1, int(np.ceil(np.linalg.norm(p - before) / 0.6e-4)))  # finer than the fitter's way
-            for k in range(1, parts + 1):
-                centre = before + (p - before) * k / parts - r * one["heading"]
-                out = skin.solve(memory, centre[None], np.eye(3)[None])
-                memory = out.memory
-            before = p
-            force.append(out.wrench[0, :3]), pressure.append(memory.pressure)
-            impedance.append(self.film.impedance(out.vert_xpos[: self.geometry.nvert]))
+        for centre, there in _way(one, pos, r):
+            out = skin.solve(memory, centre[None], np.eye(3)[None])
+            memory = out.memory
+            if there:
+                force.append(out.wrench[0, :3]), pressure.append(memory.pressure)
+                impedance.append(self.film.impedance(out.vert_xpos[: self.geometry.nvert]))
         return np.array(force), np.array(pressure), np.array(impedance)
+
+    def _full(self, plans, poses, size):
+        """Full finite elements, every plan a world; spheres of all sizes are in every world, those not used a metre away."""
+        from biotac_mj.skin import GeomSet, SkinData, step
+
+        kinds = sorted(set(size))
+        geoms = GeomSet(["sphere"] * len(kinds), [(r,) for r in kinds], friction=[self.model.material.friction] * len(kinds),
+                        nworld=len(plans), device=self.model.device)  # fmt: skip
+        data = SkinData(self.model, len(plans))
+        ways = [list(_way(one, pos, r)) for one, pos, r in zip(plans, poses, size)]
+        out = [([], [], []) for _ in plans]
+        for k in range(max(map(len, ways))):
+            centre = np.full((len(plans), len(kinds), 3), 1.0)
+            for w, way in enumerate(ways):
+                centre[w, kinds.index(size[w])] = way[min(k, len(way) - 1)][0]
+            geoms.set_pose(centre, np.tile(np.eye(3), (len(plans), len(kinds), 1, 1)))
+            step(self.model, data, geoms)
+            if any(k < len(way) and way[k][1] for way in ways):
+                x, force, pressure = data.vert_xpos, data.wrench, data.pressure
+                for w, way in enumerate(ways):
+                    if k < len(way) and way[k][1]:
+                        out[w][0].append(force[w, 0, :3].copy()), out[w][1].append(float(pressure[w]))
+                        out[w][2].append(self.film.impedance(x[w]))
+        return [tuple(np.array(part) for part in one) for one in out]
 
     def measure(self, plans, effects, seed, repeatability=0.02e-3):
         """Per plan: counts (n, 19), pdc (n,), force (n, 3) with noise and rounding; effects: list of (name, size)."""
         rng = np.random.default_rng(seed)
         memory, out = {}, []
-        for one in plans:
-            s = _State(one, self, rng.normal(0, repeatability, 3), memory)
+        states = [_State(one, self, rng.normal(0, repeatability, 3), memory) for one in plans]
+        for s in states:
             for name, size in effects:
                 if name in _BEFORE:
                     _BEFORE[name](s, size)
-            pos = one["pos"] + s.offset
-            for _ in range(4 if s.compliance else 1):
-                s.force, s.pressure, s.impedance = self.skin(one, pos, s.radius)
-                if s.compliance:
-                    pos = one["pos"] + s.offset - 0.8 * s.compliance * np.outer(np.maximum(-s.force @ one["heading"], 0), one["heading"]) + 0.2 * (  # noqa: E501
-                        pos - one["pos"] - s.offset)  # fmt: skip
+        poses = [s.one["pos"] + s.offset for s in states]
+        for _ in range(4 if states[0].compliance else 1):
+            for s, solved in zip(states, self.skin(plans, poses, [s.radius for s in states])):
+                s.force, s.pressure, s.impedance = solved
+            wanted = [
+                s.one["pos"] + s.offset - s.compliance * np.outer(np.maximum(-s.force @ s.one["heading"], 0), s.one["heading"])
+                for s in states
+            ]
+            poses = [0.8 * new + 0.2 * old for new, old in zip(wanted, poses)]  # the mount gives way: most of the way to balance each time
+        for s in states:
             s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
             s.rest = s.impedance[0]
             if self.footprint:
@@ -130,6 +155,16 @@ class Generator:
             counts = np.clip(np.rint(s.counts + 3.5 * rng.standard_normal(s.counts.shape)), 0, 4095)
             out.append((counts, np.rint(s.pdc + rng.standard_normal(len(s.pdc))), s.force + 0.006 * rng.standard_normal(s.force.shape)))
         return out
+
+
+def _way(one, pos, r):
+    """Centres of the sphere on the way through poses, finer than the fitter's; and whether a pose is reached."""
+    before = pos[0]
+    for p in pos:
+        parts = max(1, int(np.ceil(np.linalg.norm(p - before) / 0.6e-4)))
+        for k in range(1, parts + 1):
+            yield before + (p - before) * k / parts - r * one["heading"], k == parts
+        before = p
 
 
 class _State:
@@ -252,15 +287,25 @@ def _leak(s, size):
     s.counts = s.counts + size * np.outer(0.5 * s.pressure / 5000 + 0.5 * seen, np.sin(2.1 * np.arange(19)))
 
 
+def _ring(s, size):
+    """Outside: the force sensor's mount rings while it is loaded."""
+    s.force = s.force * (1 + size * np.sin(2 * np.pi * 1.7 * s.t + 0.4))[:, None]
+
+
+def _squeeze(s, size):
+    """Outside: the pressure channel answers to speed, through a narrow duct."""
+    s.pdc = s.pdc + size * np.tanh(np.gradient(s.depth, s.t) / 2e-3)
+
+
 _BEFORE = {"radius": _set("radius"), "mount": _set("compliance"), "depth0": _set("depth0"), "misalign": _set("misalign")}
 _LOAD = {"relax": _relax, "hyster": _hyster, "stiffen": _stiffen, "mullins": _mullins, "adhesion": _adhesion, "fluidloss": _fluidloss,
          "warmup": _warmup, "asper": _asper}  # fmt: skip
 _READ = {"gain": _gain, "crosstalk": _crosstalk, "saturate": _saturate, "lowpass": _lowpass, "latency": _latency, "drift": _drift, "ripple": _ripple,  # noqa: E501
-         "leak": _leak}  # fmt: skip
+         "leak": _leak, "ring": _ring, "squeeze": _squeeze}  # fmt: skip
 # Smallest and largest size of each hidden effect.
 HIDDEN = {
     "relax": (0.15, 0.4), "hyster": (0.08, 0.25), "stiffen": (0.2, 0.5), "mullins": (0.2, 0.4), "adhesion": (0.06, 0.15), "fluidloss": (0.03, 0.1),  # noqa: E501
     "warmup": (0.06, 0.25), "asper": (0.15, 0.4), "gain": (0.1, 0.25), "crosstalk": (0.06, 0.15), "saturate": (150, 400), "lowpass": (0.04, 0.15),  # noqa: E501
     "latency": (0.03, 0.1), "drift": (4, 15), "radius": (0.12, 0.25), "mount": (4e-5, 12e-5), "depth0": (6e-5, 15e-5), "misalign": (1.5e-4, 4e-4),  # noqa: E501
 }  # fmt: skip
-OUTSIDE = {"ripple": (20, 60), "leak": (40, 120)}
+OUTSIDE = {"ripple": (20, 60), "leak": (40, 120), "ring": (0.1, 0.3), "squeeze": (10, 40)}

@@ -6,6 +6,7 @@ displacement-controlled object and an elastic field that keeps its form, a separ
 """
 
 import numpy as np
+from scipy.special import erf
 
 from .effect import Effect, Param
 from .noises import electrode_positions
@@ -72,17 +73,22 @@ class Hysteresis(Effect):
 
 class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
-    physics = "Ogden-Roxburgh in the work of the contact: softer below the largest load seen before at that place"
-    params = {"softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15)}
+    physics = "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) below the deepest press before"
+    params = {
+        "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
+        "width": Param("1", 0.1, 3, "m + b Wmax over Wmax", 1.0, 1.0, True),
+        "reach": Param("m", 0.5e-3, 10e-3, "radius of a contact", 3e-3, 3e-3, True),
+    }
+    grid = tuple({"width": w, "reach": r} for w in (0.3, 1.0) for r in (1.5e-3, 4e-3))
     confusable = {"hyster": "a third cycle to the same depth", "adhesion": "talc on the skin"}
 
     def apply(self, run, theta):
         seen = run.session.setdefault("mullins", [])
-        before = max((d for p, d in seen if np.linalg.norm(p - run.place) < 4e-3), default=0.0)
+        before = max((d * np.exp(-((np.linalg.norm(p - run.place) / theta["reach"]) ** 2)) for p, d in seen), default=0.0)
         depth = np.maximum(run.depth, 0)
         largest = np.maximum(before, np.maximum.accumulate(depth))
         ratio = np.where(largest > 1e-6, depth / np.maximum(largest, 1e-6), 1.0)
-        run.scale_load(1 - theta["softening"] * np.clip(1 - ratio**2, 0, 1))
+        run.scale_load(1 - theta["softening"] * erf(np.clip(1 - ratio**2, 0, 1) / theta["width"]))
         seen.append((run.place, float(depth.max())))
 
 
@@ -314,8 +320,7 @@ class LowPass(Effect):
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def apply(self, run, theta):
-        if theta["tau"] > 1e-4:
-            run.counts = _smooth(run, run.counts, theta["tau"])
+        run.counts = _smooth(run, run.counts, max(theta["tau"], 1e-9))
 
 
 class Latency(Effect):

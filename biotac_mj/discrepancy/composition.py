@@ -106,11 +106,11 @@ def _round(comparison, current, null, effects, chosen, seed):
     excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     out = []
-    for _, effect, shape in short:
-        trial = [*current.effects, (effect, {**effect.default(), **shape})]
-        held = _left_out(comparison, trial, current, chosen, seed)[chosen]
-        gain = held - reference[chosen]
+    for _, effect, start in short:
+        trial = [*current.effects, (effect, start)]
         fit = fit_effects(comparison, trial, chosen, current)
+        held = _left_out(comparison, fit, chosen, seed)[chosen]
+        gain = held - reference[chosen]
         left = mean_square(fit.residuals(comparison))[chosen]
         energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
         one = Candidate(
@@ -123,12 +123,12 @@ def _round(comparison, current, null, effects, chosen, seed):
     return sorted(out, key=lambda c: -c.nats)
 
 
-def _left_out(comparison, effects, start, chosen, seed, folds=3):
-    """Evidence of every chosen trajectory with parameters fitted on the other folds."""
+def _left_out(comparison, whole, chosen, seed, folds=3):
+    """Evidence of every chosen trajectory with parameters fitted on the other folds, from where the fit to all of them ended."""
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
-        fit = fit_effects(comparison, effects, chosen[fold != f], start, shapes=False)
+        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, shapes=False)
         values = evidence(fit.residuals(comparison))
         out[chosen[fold == f]] = values[chosen[fold == f]]
     return out

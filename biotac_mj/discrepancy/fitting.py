@@ -101,7 +101,9 @@ def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
     for round_ in range(2):
         c = mean_square(comparison.residuals(*unpack(x)))
         weight = 1 / np.maximum(c, 0.5)
-        out = least_squares(function, x, bounds=bounds, method="trf", diff_step=1e-3, max_nfev=8 if round_ == 0 else 6, x_scale="jac")
+        out = least_squares(
+            function, x, bounds=bounds, method="trf", diff_step=1e-3, max_nfev=8 if round_ == 0 else 6, x_scale="jac", ftol=1e-5, xtol=1e-5
+        )
         x = out.x
     filled, nuisance = unpack(x)
     # Sandwich by trajectory: bread of Gauss-Newton, meat of the trajectories' own scores.

@@ -11,18 +11,21 @@ _STEPS = {"log_modulus": 0.05, "log_friction": 0.1, "footprint": 0.02, "mesh": 0
 
 
 def columns(comparison, current, effect, shape, base, chosen):
-    """Signature columns of an effect about the present model, whitened and stacked: secants at a realistic size."""
+    """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a realistic size."""
     out = []
-    present = {e.id: dict(th) for e, th in current.effects}
-    for name in effect.free:
-        p = effect.params[name]
-        theta = {**effect.default(), **shape, **present.get(effect.id, {})}
-        sign = 1.0 if p.high > 0 else -1.0
-        theta[name] = theta[name] + sign * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
-        others = [(e, th) for e, th in current.effects if e.id != effect.id]
-        r = comparison.residuals([*others, (effect, theta)], current.nuisance)
+    for name, size in _sizes(effect):
+        theta = {**effect.default(), **shape}
+        theta[name] = theta[name] + size
+        r = comparison.residuals([*current.effects, (effect, theta)], current.nuisance)
         out.append(np.concatenate([(base[i] - r[i]).ravel() for i in chosen]))
     return np.stack(out, axis=1)
+
+
+def _sizes(effect):
+    """(name, step) of the free parameters."""
+    for name in effect.free:
+        p = effect.params[name]
+        yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
 
 
 def nuisance_space(comparison, current, base, chosen):
@@ -36,7 +39,7 @@ def nuisance_space(comparison, current, base, chosen):
 
 
 def screen(comparison, current, effects, chosen):
-    """Linearised, cross-validated by trajectory: mean share of log c removed, and the shape values that did best, best first."""
+    """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may start), best first."""
     base = current.residuals(comparison)
     q = nuisance_space(comparison, current, base, chosen)
     sizes = [base[i].size for i in chosen]
@@ -59,10 +62,15 @@ def screen(comparison, current, effects, chosen):
                 for a, b, g in zip(edges[:-1], edges[1:], folds):
                     if g == f:
                         gain.append(np.log(max((y[a:b] ** 2).mean(), 1e-9)) - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).mean(), 1e-9)))
-            out.append((float(np.mean(gain)), effect, shape))
+            w = np.linalg.solve(S.T @ S + 0.2 * np.eye(S.shape[1]), S.T @ y)
+            start = {**effect.default(), **shape}
+            for (name, size), share in zip(_sizes(effect), w):
+                p = effect.params[name]
+                start[name] = float(np.clip(start[name] + np.clip(share, -3, 3) * size, p.low + 0.01 * p.scale, p.high - 0.01 * p.scale))
+            out.append((float(np.mean(gain)), effect, start))
     best = {}
-    for score, effect, shape in sorted(out, key=lambda o: -o[0]):
-        best.setdefault(effect.id, (score, effect, shape))
+    for score, effect, start in sorted(out, key=lambda o: -o[0]):
+        best.setdefault(effect.id, (score, effect, start))
     return sorted(best.values(), key=lambda o: -o[0])
 
 

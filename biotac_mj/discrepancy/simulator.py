@@ -24,6 +24,7 @@ SCHEMA = "biotac_mj.sensor/1"
 _SHIFT = 40e-6  # [m] of the poses for differences
 _RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
 _AIR = 101325.0  # [Pa]
+_WORLDS = 64  # trajectories solved at once
 
 
 @dataclasses.dataclass
@@ -33,6 +34,7 @@ class Simulator:
     Attributes:
       skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
+      device: of the full tier, "cpu" or "cuda:0": trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
     """
@@ -62,11 +64,7 @@ class Simulator:
         Args:
           offset: list of (n, 3) [m], or None; log_radius: list of floats, or None.
         """
-        from ..data.plan import Motion
-        from ..data.simulate import simulate, simulate_condensed
-
-        walk = simulate_condensed if self.tier == "condensed" else simulate
-        out = []
+        out, todo = [None] * len(trajectories), []
         for i, t in enumerate(trajectories):
             shift = 0.0 if offset is None else offset[i]
             grow = 0.0 if log_radius is None else float(log_radius[i])
@@ -83,19 +81,35 @@ class Simulator:
             path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"
             if path is not None and path.exists():
                 with np.load(path) as file:
-                    out.append({k: file[k] for k in ("force", "pressure", "log_z")})
+                    out[i] = {k: file[k] for k in ("force", "pressure", "log_z")}
+                if progress:
+                    progress()
             else:
-                model, film = self._model(log_friction, bubble)  # kept: made once
-                fields = walk(model, tool, [Motion("recorded", {}, pos, t.mat)])
-                impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, 0))
-                one = {"force": fields.wrench[0, :, :3].copy(), "pressure": fields.pressure[0].copy(), "log_z": np.log(impedance)}
-                out.append(one)
-                if path is not None:
-                    with replacing(path) as temporary:
-                        np.savez(temporary, **one)
+                todo.append((i, tool, pos, t.mat, path))
+        for part in range(0, len(todo), _WORLDS):
+            self._walk(todo[part : part + _WORLDS], out, log_friction, bubble, progress)
+        return out
+
+    def _walk(self, todo, out, log_friction, bubble, progress):
+        """Solves trajectories (index, tool, pos, mat, path of the cache), each one world, and files what they gave."""
+        from ..data.plan import Motion
+        from ..data.simulate import simulate, simulate_condensed
+
+        model, film = self._model(log_friction, bubble)  # kept: made once
+        walk = simulate_condensed if self.tier == "condensed" else simulate
+        longest = max(len(pos) for _, _, pos, _, _ in todo)
+        rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _ in todo]  # who has arrived waits there
+        motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _) in zip(rows, todo)]
+        fields = walk(model, [tool for _, tool, _, _, _ in todo], motions)
+        for w, (i, _, pos, _, path) in enumerate(todo):
+            n = len(pos)
+            impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
+            out[i] = {"force": fields.wrench[w, :n, :3].copy(), "pressure": fields.pressure[w, :n].copy(), "log_z": np.log(impedance)}
+            if path is not None:
+                with replacing(path) as temporary:
+                    np.savez(temporary, **out[i])
             if progress:
                 progress()
-        return out
 
     def _model(self, log_friction, bubble):
         from ..geometry.skins import load_skin
@@ -111,7 +125,7 @@ class Simulator:
                 volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
                 # liquid and air in series: V / K + V0 / p0
                 options = dataclasses.replace(options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume)))
-            store[bubble] = SkinModel(geometry, material(self.material), options)
+            store[bubble] = SkinModel(geometry, material(self.material), options, "cpu" if self.tier == "condensed" else self.device)
             store.setdefault("film", FilmConduction(geometry, sensor=self.sensor))
         model = store[bubble]
         if log_friction:
@@ -201,12 +215,14 @@ class Simulator:
         """Force, pressure and ln Z of runs whose object or contact has changed."""
         changed = [i for i, r in enumerate(runs) if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble]
         anew = changed if exact is True else [i for i in changed if i in set(np.atleast_1d(exact).tolist())] if exact is not False else []
-        for i in changed:
-            run = runs[i]
-            if i in anew:
-                one = self.solve([trajectories[i]], [run.offset], [run.log_radius], run.log_friction, run.bubble)[0]
+        if anew:
+            kept = [runs[i] for i in anew]
+            solved = self.solve([trajectories[i] for i in anew], [r.offset for r in kept], [r.log_radius for r in kept],
+                                kept[0].log_friction, kept[0].bubble)  # fmt: skip
+            for run, one in zip(kept, solved):
                 run.force, run.pressure, run.log_z = modulus * one["force"], modulus * one["pressure"], one["log_z"].copy()
-                continue
+        for i in sorted(set(changed) - set(anew)):
+            run = runs[i]
             change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
             parts = [("x", run.offset[:, 0]), ("y", run.offset[:, 1]), ("z", run.offset[:, 2]), ("radius", run.log_radius),
                      ("friction", run.log_friction), ("bubble", run.bubble)]  # fmt: skip
