@@ -1,16 +1,20 @@
 """Plain recordings with a hidden effect: what `biotac diagnose --electrodes` names, over many recordings of our own making.
 
-    python benchmarks/discrepancy_recordings.py --count 4 --seeds practice --json out/recordings.json
+    python benchmarks/discrepancy_recordings.py --count 2 --null 10 --seeds practice --json out/recordings.json
 
-Base signals are synthetic (unloaded or pressed by a simulated hand) and, where `../shared/data/epfl_flat_press` exists, real. The generator
-below is written in numpy alone: it shares no code and no formula's form with the effects that are fitted.
+Base signals are synthetic (unloaded or pressed by a simulated hand) and, where `../shared/data/epfl_flat_press` exists, pieces of real
+recordings of 40 s or more. The generator below is written in numpy alone: it shares no code and no formula's form with the effects that are
+fitted. A run goes on where its JSON ends.
 """
 
 import argparse
 import collections
+import functools
+import hashlib
 import json
 import pathlib
 import tempfile
+import time
 
 import numpy as np
 
@@ -62,9 +66,14 @@ def hand(rng, rate, seconds):
     return 4095 / (1 + np.exp(z)), force
 
 
-def real(name):
-    e = np.loadtxt(REAL / name)
-    return e, np.loadtxt(REAL / "ForceData.txt") if name == "SynImpF1.txt" else None
+def real(rng, name):
+    """A piece of a recording: counts (n, 19) and, of the pressed sensor, force."""
+    e, force = np.loadtxt(REAL / name), None
+    if name == "SynImpF1.txt":
+        force = np.loadtxt(REAL / "ForceData.txt")
+    length = int(rng.uniform(40 * 117, len(e)))
+    start = rng.integers(len(e) - length + 1)
+    return e[start : start + length], None if force is None else force[start : start + length]
 
 
 def bases():
@@ -255,7 +264,7 @@ def make_case(effect, base, seed, with_force):
     elif base == "loaded, synthetic":
         e, force = hand(rng, rate, seconds)
     else:
-        e, force = real("SynImpF2.txt" if base.startswith("unloaded") else "SynImpF1.txt")
+        e, force = real(rng, "SynImpF2.txt" if base.startswith("unloaded") else "SynImpF1.txt")
     function, when, _ = EFFECTS[effect]
     synthetic = "synthetic" in base
     level = rng.uniform(0.5, 1.2)
@@ -273,8 +282,8 @@ def make_case(effect, base, seed, with_force):
     return e, force if with_force else None, rate, {"effect": effect, "channels": [int(k) for k in channels], "base": base}
 
 
-def hide(count, seeds, only=None, on=None):
-    """Yields (name, electrodes, force, rate, truth)."""
+def hide(count, seeds, only=None, on=None, null=None):
+    """Yields (name, function that makes electrodes, force, rate, truth); null: how many without effect on each base, None: count."""
     for effect, (_, _, where) in EFFECTS.items():
         if only and effect not in only:
             continue
@@ -288,9 +297,10 @@ def hide(count, seeds, only=None, on=None):
                     continue
                 if not with_force and kind not in where:
                     continue
-                for i in range(1 if effect == "none" and "real" in base else count):
+                for i in range(null if effect == "none" and null is not None else count):
                     seed = SEEDS[seeds] + hash_of(effect, base, with_force, i)
-                    yield f"{effect} on {base}{' with force' if with_force else ''} #{i}", *make_case(effect, base, seed, with_force)
+                    yield (f"{effect} on {base}{' with force' if with_force else ''} #{i}",
+                           functools.partial(make_case, effect, base, seed, with_force))  # fmt: skip
 
 
 def hash_of(*parts):
@@ -299,14 +309,21 @@ def hash_of(*parts):
     return zlib.crc32(repr(parts).encode()) % 90_000
 
 
+def right(effect, truth):
+    """Whether an effect of a verdict is the hidden one, on its channel."""
+    wanted = ALSO.get(truth["effect"], {truth["effect"]})
+    if not (effect["id"] in wanted or wanted & set(effect["ties"])):
+        return False
+    single = truth["effect"] in ("drift", "jump", "gain", "stuck", "noise", "spikes", "saturate", "swap")
+    return bool(not single or {f"e{k + 1}" for k in truth["channels"]} & set(effect["channels"]))
+
+
 def score(verdict, truth):
     """hit, extra ids, whether the gap or the effect's own number shrank."""
     named = [e["id"] for e in verdict["effects"]]
     natural = NATURAL.get(truth["base"], set())
     wanted = ALSO.get(truth["effect"], {truth["effect"]})
-    ok = [e for e in verdict["effects"] if e["id"] in wanted or wanted & set(e["ties"])]
-    if truth["effect"] in ("drift", "jump", "gain", "stuck", "noise", "spikes", "saturate", "swap"):
-        ok = [e for e in ok if {f"e{k + 1}" for k in truth["channels"]} & set(e["channels"])]
+    ok = [e for e in verdict["effects"] if right(e, truth)]
     extra = [i for i in named if i not in natural and i not in wanted]
     if truth["effect"] == "none":
         return (not extra and (bool(natural) or verdict["verdict"] == "no significant disagreement")), extra, True
@@ -319,43 +336,88 @@ def score(verdict, truth):
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("--count", type=int, default=3)
+    args.add_argument("--null", type=int, help="recordings without effect on each base, default: count")
     args.add_argument("--seeds", choices=SEEDS, default="development")
     args.add_argument("--only", nargs="*")
     args.add_argument("--base")
     args.add_argument("--json")
     args.add_argument("--verbose", action="store_true")
     args = args.parse_args(argv)
+    rows = []
+    path = pathlib.Path(args.json) if args.json else None
+    if path and path.exists():
+        rows = json.loads(path.read_text())["cases"]
+    done = {(r["seeds"], r["case"]) for r in rows}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, make in hide(args.count, args.seeds, args.only, args.base, args.null):
+            if (args.seeds, name) in done:
+                continue
+            rows.append({"case": name, "seeds": args.seeds, **diagnose(make, pathlib.Path(folder))})
+            r = rows[-1]
+            if args.verbose or not r["hit"] or r["extra"]:
+                print(
+                    f"{'ok  ' if r['hit'] else 'MISS'} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: {r['verdict'][:230]}",
+                    flush=True,
+                )  # noqa: E501
+            if path:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                part = path.with_suffix(".part")
+                part.write_text(json.dumps({"code": code_hash(), "cases": rows}, indent=1))
+                part.replace(path)
+    print(table(rows))
+
+
+def diagnose(make, folder):
+    """Runs one case as a user would, through text files, and scores it."""
     from biotac_mj.discrepancy import diagnose_recording, read_recording
     from biotac_mj.discrepancy.recorded_report import verdict_dict
 
-    table = collections.defaultdict(list)
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, e, force, rate, truth in hide(args.count, args.seeds, args.only, args.base):
-            paths = {"electrodes": pathlib.Path(folder) / "e.txt", "force": pathlib.Path(folder) / "f.txt"}
-            np.savetxt(paths["electrodes"], e, fmt="%d")
-            if force is not None:
-                np.savetxt(paths["force"], force, fmt="%.5f")
-            recording = read_recording(paths["electrodes"], None if force is None else paths["force"], None, rate)
-            verdict = verdict_dict(diagnose_recording(recording))
-            hit, extra, shrunk = score(verdict, truth)
-            table[truth["effect"]].append((hit, len(extra), shrunk))
-            rows.append({"case": name, **truth, "hit": hit, "extra": extra, "shrunk": shrunk, "verdict": verdict["verdict"]})
-            if args.verbose or not hit or extra:
-                print(
-                    f"{'ok  ' if hit else 'MISS'} {name} {truth['channels'][:3]} {rate:g} Hz extra {extra}: {verdict['verdict'][:230]}",
-                    flush=True,
-                )
-    print(f"\n{'effect':<14}{'cases':>6}{'right':>7}{'with extras':>13}{'gap shrank':>12}")
-    for effect, values in table.items():
-        n = len(values)
-        print(f"{effect:<14}{n:>6}{sum(v[0] for v in values):>7}{sum(v[1] > 0 for v in values):>13}{sum(v[2] for v in values):>12}")
-    total = [v for values in table.values() for v in values]
-    print(f"{'all':<14}{len(total):>6}{sum(v[0] for v in total):>7}{sum(v[1] > 0 for v in total):>13}{sum(v[2] for v in total):>12}")
-    if args.json:
-        path = pathlib.Path(args.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(rows, indent=1))
+    e, force, rate, truth = make()
+    paths = folder / "e.txt", folder / "f.txt"
+    np.savetxt(paths[0], e, fmt="%d")
+    if force is not None:
+        np.savetxt(paths[1], force, fmt="%.5f")
+    began = time.process_time()
+    verdict = verdict_dict(diagnose_recording(read_recording(paths[0], None if force is None else paths[1], None, rate)))
+    hit, extra, shrunk = score(verdict, truth)
+    natural = NATURAL.get(truth["base"], set())
+    named = [
+        {"id": f["id"], "nats": f["nats"], "ties": f["ties"], "confirmed": f["confirmed"], "confidence": f["confidence"],
+         "natural": f["id"] in natural and f["id"] != truth["effect"], "right": right(f, truth)} for f in verdict["effects"]
+    ]  # fmt: skip
+    views = {k: (v["before"], v["after"]) for k, v in verdict["gap"].items()}
+    return {**truth, "force": force is not None, "rate": rate, "rows": len(e), "seconds": time.process_time() - began, "hit": bool(hit),
+            "extra": extra, "shrunk": bool(shrunk), "verdict": verdict["verdict"], "named": named, "views": views}  # fmt: skip
+
+
+def code_hash():
+    """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
+    folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
+    names = "drifts electrode_drifts faults hum loads noises plain recorded_effect recorded_gap recorded_rest recorded_views recording shapes timeline"  # noqa: E501
+    return hashlib.sha256(b"".join((folder / f"{n}.py").read_bytes() for n in names.split())).hexdigest()[:12]
+
+
+def table(rows):
+    """Rows by base: without effect, inside and outside the catalogue."""
+    lines = [
+        f"{'base':<30}{'no effect':>11}{'false':>7}{'hidden':>8}{'right':>7}{'with extras':>13}{'outside':>9}{'unknown':>9}{'worse view':>12}"
+    ]  # noqa: E501
+    groups = collections.defaultdict(list)
+    for r in rows:
+        groups[r["base"] + (" with force" if r["force"] else "")].append(r)
+    for base, members in [*groups.items(), ("all", rows)]:
+        none = [r for r in members if r["effect"] == "none"]
+        outside = [r for r in members if r["effect"] in OUTSIDE]
+        inside = [r for r in members if r["effect"] != "none" and r["effect"] not in OUTSIDE]
+        worse = sum(any(after > 1.02 * before for before, after in r["views"].values()) for r in members)
+        lines.append(f"{base:<30}{len(none):>11}{sum(bool(r['extra']) for r in none):>7}{len(inside):>8}{sum(r['hit'] for r in inside):>7}"
+                     f"{sum(bool(r['extra']) for r in inside):>13}{len(outside):>9}{sum(r['hit'] for r in outside):>9}{worse:>12}")  # fmt: skip
+    lines.append("")
+    for effect in dict.fromkeys(r["effect"] for r in rows):
+        mine = [r for r in rows if r["effect"] == effect]
+        wrong = collections.Counter(i for r in mine for i in r["extra"])
+        lines.append(f"{effect:<14}{sum(r['hit'] for r in mine):>4} of {len(mine):<4}{', '.join(f'{k} {v}' for k, v in wrong.items())}")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

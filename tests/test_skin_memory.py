@@ -1,5 +1,7 @@
 """Relaxation and Mullins softening inside the elements, against closed forms of bars and of prescribed homogeneous deformations."""
 
+import copy
+
 import numpy as np
 import pytest
 import warp as wp
@@ -221,7 +223,7 @@ def test_memory_is_saved_replayed_and_forgotten():
     path = [(1.2, 0.1), (1.25, 0.3), (1.1, 0.2)]
     once = [pull(model, data, *p) for p in path]
     saved, x = data.memory.state(), data.vert_xpos[0]
-    assert len(saved) == data.memory.nstate
+    assert len(saved) == data.memory.size(model.material, len(data.memory.worst))
     went_on = pull(model, data, 1.15, 0.5)
     again = SkinData(model)
     for array in (again.x, again.x_last):
@@ -258,6 +260,41 @@ def test_filled_skin_rests():
         step(model, data, NOTHING, dt)
         assert data.converged.all() and data.iterations[0] == 0
     np.testing.assert_array_equal(data.vert_xpos, at_rest)
+
+
+def test_memory_is_in_the_plugins_state():
+    """Pressed and held, the force relaxes in mj_step; a copy of mjData replays it bit by bit, and a reset forgets."""
+    import mujoco
+
+    import biotac_mj
+
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="finger"/>
+        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body></worldbody></mujoco>"""
+    )
+    material = {"prony": [[0.5, 0.1]], "element": "linear"}
+    pose = {"pos": [0.0062, 0, 0], "quat": [0.5**0.5, -(0.5**0.5), 0, 0]}  # pad up
+    handle = biotac_mj.attach(spec, body="finger", skin="coarse", material=material, readings="none", **pose)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    force = []
+    for k in range(8):
+        data.mocap_pos[0, 2] -= 2e-4 * (k < 3)
+        mujoco.mj_step(model, data)
+        force.append(abs(handle.read(data, "contact_force")[1]))
+    # held since the third step; its overstress of about 0.5 (1 - exp(-0.6)) / 0.6 falls by exp(-0.2) a step, the rest stays
+    over = np.diff(force[2:])
+    assert (over < 0).all() and force[2] > 1.2 * force[7]
+    np.testing.assert_allclose(over[1:] / over[:-1], np.exp(-0.2), rtol=0.05)
+    twin = copy.copy(data)
+    for _ in range(2):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(model, twin)
+    np.testing.assert_array_equal(data.plugin_state, twin.plugin_state)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "contact_force")[1] == 0
+    biotac_mj.plugin.check()
 
 
 def test_what_cannot_be_is_refused():

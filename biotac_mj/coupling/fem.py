@@ -9,6 +9,7 @@ import warp as wp
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
 from ..skin.condensed_search import NearSearch
 from ..skin.model import solved_geometry
+from ..skin.stress_memory import StressMemory
 from ..skin.types import vec3
 from .stepper import SkinResult
 
@@ -31,7 +32,8 @@ class FemStepper:
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
         self._material, self._options = _choices(config)
-        self._nodes = solved_geometry(geometry, self._material, self._options)[0].vert  # maybe with more nodes behind the geometry's
+        solved, element = solved_geometry(geometry, self._material, self._options)
+        self._nodes = solved.vert  # maybe with more nodes behind the geometry's
         n, g = len(self._nodes), len(geoms)
         sizes = {
             "started": 1,
@@ -47,6 +49,9 @@ class FemStepper:
         self.inertial = self._options.dynamics == "implicit"
         if self.inertial:
             sizes |= {"velocity": 3 * n}
+        if self._material.remembers:
+            points = 4 * len(solved.elem) if element == "quadratic" else len(solved.tets)
+            sizes |= {"memory": StressMemory.size(self._material, points)}
         ends = np.cumsum(list(sizes.values()))
         self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
         self.nstate = int(ends[-1])
@@ -82,7 +87,7 @@ class FemStepper:
             vert, pressure = self._model.rest.vert, self._model.rest.pressure
         self._part(state, "x")[:] = vert.ravel()
         self._part(state, "pressure")[:] = pressure
-        self._part(state, "resting")[:] = not self.inertial
+        self._part(state, "resting")[:] = not (self.inertial or self._material.remembers)
 
     def vert_xpos(self, state):
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
@@ -156,7 +161,7 @@ class FemStepper:
         return True
 
     def _came_to_rest(self, state):
-        if self.inertial or self._part(state, "contacts")[0]:
+        if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:
             return False
         rest, (far, loud) = self._model.rest, _RESTS
         off = np.abs(self._part(state, "x") - rest.vert.ravel()).max()
@@ -189,6 +194,8 @@ class FemStepper:
             contacts=_contacts(self._part(state, "contacts")),
             pressure=self._part(state, "pressure")[0],
         )
+        if d.memory:
+            d.memory.load(self._part(state, "memory"), d.x)
         geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
         geoms.advance()
 
@@ -212,6 +219,8 @@ class FemStepper:
         buffer[1 : 1 + contacts.size] = contacts.ravel()
         if self.inertial:
             self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
+        if d.memory:
+            self._part(state, "memory")[:] = d.memory.state()
 
 
 def rest_geometry(config, geometry):

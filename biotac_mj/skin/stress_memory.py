@@ -296,13 +296,13 @@ class StressMemory:
         if self.mullins[0] > 0:
             self.worst[:, good] = np.maximum(self.worst, self.energy.numpy())[:, good]
 
-    @property
-    def nstate(self):
+    @staticmethod
+    def size(material, npoint) -> int:
         """Doubles of one world's memory."""
-        return 6 * len(self.prony) * len(self.worst) + len(self.worst)
+        return (6 * len(material.prony) + 1) * npoint
 
     def state(self) -> np.ndarray:
-        """(nstate,) memory of the first world, to be saved."""
+        """(size,) memory of the first world, to be saved."""
         six = self.overstress[:, :, 0][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         return np.concatenate([six.ravel(), self.worst[:, 0]])
 
