@@ -1,6 +1,7 @@
 """Scores of the tasks: their scripted controllers, which act on touch alone, and a random policy, over seeds.
 
-    python benchmarks/tasks.py --json out/tasks.json [--tasks press,lift] [--policies scripted,random] [--seeds 20] [--markdown]
+    python benchmarks/tasks.py --json out/tasks.json [--tasks press,lift] [--policies scripted,random] [--seeds 20]
+    python benchmarks/tasks.py --markdown out/tasks.json [out/more.json ...]
 
 The score of an episode is its mean reward per step (0 to 1); solved: the mean over its last second is at least 0.8. Episodes that the JSON
 file already holds are not run again, so an interrupted run goes on where it was. Seconds are processor time of the thread per episode.
@@ -52,9 +53,9 @@ def episode(env, controller, seed) -> dict:
 
 def table(rows) -> str:
     """Markdown: one line per task."""
-    lines = ["| task | scripted: score | solved | random: score | solved | seeds (scripted, random) |", "|---|---|---|---|---|---|"]
+    lines = ["| task | scripted: score | solved | random: score | solved | seeds | processor s | not converged |", "|" + "---|" * 8]
     for domain, task in suite.tasks():
-        cells, counts = [], []
+        cells, counts, seconds, failed = [], [], [], 0
         for policy in ("scripted", "random"):
             found = [r for r in rows if (r["domain"], r["task"], r["policy"]) == (domain, task, policy)]
             counts.append(str(len(found)))
@@ -63,18 +64,37 @@ def table(rows) -> str:
                 continue
             score = [r["score"] for r in found]
             solved = np.mean([r["last_second"] >= SOLVED for r in found])
+            seconds.append(f"{np.mean([r['seconds'] for r in found]):.1f}")
+            failed += sum(r["failed_steps"] for r in found)
             cells += [f"{np.mean(score):.2f} +- {np.std(score):.2f}", f"{100 * solved:.0f} %"]
-        lines.append(f"| {domain}/{task} | {' | '.join(cells)} | {', '.join(counts)} |")
+        lines.append(f"| {domain}/{task} | {' | '.join(cells)} | {', '.join(counts)} | {', '.join(seconds)} | {failed} |")
     return "\n".join(lines)
+
+
+def merged(paths) -> list[dict]:
+    """Rows of several files; a task that is in two is taken from the last."""
+    rows = {}
+    for path in paths:
+        found = json.loads(path.read_text())["rows"]
+        rows |= {task: [r for r in found if r["task"] == task] for task in {r["task"] for r in found}}
+    return [r for of_task in rows.values() for r in of_task]
 
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write, and to go on from")
+    parser.add_argument("--json", type=pathlib.Path, help="file to write, and to go on from")
+    parser.add_argument(
+        "--markdown", type=pathlib.Path, nargs="+", help="print the table of these files and stop; of a task in two, the last counts"
+    )
     parser.add_argument("--tasks", default=",".join(task for _, task in suite.tasks()), help="comma-separated")
     parser.add_argument("--policies", default="scripted,random", help="comma-separated")
     parser.add_argument("--seeds", type=int, default=20)
     options = parser.parse_args(arguments)
+    if options.markdown:
+        print(table(merged(options.markdown)))
+        return 0
+    if options.json is None:
+        parser.error("--json FILE is missing: where to write")
     rows = json.loads(options.json.read_text())["rows"] if options.json.exists() else []
     done = {(r["task"], r["policy"], r["seed"]) for r in rows}
     known = {task: domain for domain, task in suite.tasks()}
@@ -86,7 +106,7 @@ def main(arguments=None) -> int:
             continue
         env = suite.load(known[task], task)
         for policy, seed in tqdm(todo, desc=task):
-            controller = make_controller(task) if policy == "scripted" else Random(env.action_spec(), seed)
+            controller = make_controller(task, env) if policy == "scripted" else Random(env.action_spec(), seed)
             rows.append({"domain": known[task], "task": task, "policy": policy, "seed": seed, **episode(env, controller, seed)})
             write_json(options.json, {"rows": rows})
         env.close()

@@ -33,7 +33,8 @@ def camera(task):
 
 def run(domain, task, seconds, seed=0):
     """Acts for some seconds; the environment, and the mean reward."""
-    env, controller, rewards = load(domain, task, task_kwargs={"random": seed}), make_controller(task), []
+    env, rewards = load(domain, task, task_kwargs={"random": seed}), []
+    controller = make_controller(task, env)
     step = env.reset()
     controller.reset()
     while env.physics.data.time < seconds and not step.last():

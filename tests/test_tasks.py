@@ -181,6 +181,57 @@ def test_estimator_recovers_a_map_and_names_its_error():
         touch.Estimator.fit(x[:300], truth[:300], np.repeat(range(3), 100))
 
 
+def test_every_estimator_says_what_it_was_fitted_on():
+    """The package's estimators fit the tasks' own BioTac: no warning; the digest is one of the skin's content."""
+    stored, config = touch.load_calibration(), BioTac().handle.config
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for controller in scripted.SCRIPTED.values():
+            touch.check_fitted_on(controller().fit, stored, config)
+            assert touch.load_estimator(controller().fit).error.min() > 0 if controller.task != "explore" else "explore/weight" in stored
+    assert touch.fitted_on(config) == touch.fitted_on(BioTac(name="other", slots=3, seed=5).handle.config)
+    assert touch.fitted_on(config)["skin"] != touch.fitted_on(BioTac(skin="default").handle.config)["skin"]
+
+
+@pytest.mark.parametrize(
+    "settings, text",
+    [
+        ({"tier": "full"}, r"'press' was fitted on a BioTac with tier 'condensed' \(here 'full'\).*--estimators press --skin SKIN"),
+        ({"material": "rubber"}, r"with material 'default' \(here 'rubber'\)"),
+        ({"skin": "default"}, r"with skin '\w{16}' \(here '\w{16}'\)"),
+        ({"liquid": False}, r"liquid True \(here False\).*calibration=FILE"),
+    ],
+)
+def test_a_controller_warns_of_another_biotac(settings, text):
+    class Environment:  # as much of one as is looked at
+        class task:
+            biotacs = [BioTac(**settings)]
+
+    with pytest.warns(touch.CalibrationWarning, match=text):
+        scripted.make_controller("press", Environment)
+
+
+def test_a_calibration_of_ones_own(tmp_path):
+    """An estimator from a file, which does not say what it was fitted on."""
+    own = dict(touch.load_calibration())
+    own["press/weight"] = 0 * own["press/weight"]
+    del own["press/fitted_on"]
+    path = tmp_path / "own.npz"
+    np.savez(path, **own)
+
+    class Environment:
+        class task:
+            biotacs = [BioTac()]
+
+    with pytest.warns(touch.CalibrationWarning, match="tier 'unknown'"):
+        controller = scripted.make_controller("press", Environment, calibration=path)
+    controller.reset()
+    observation = {"a/electrodes": REST_COUNTS["1"], "a/pdc": np.array([2100.0]), "target": np.ones(1)}
+    for _ in range(6):
+        controller.act(observation)
+    assert not controller.estimator(np.ones((1, 20))).any()
+
+
 def test_touch_is_tared():
     reader, rng = touch.Touch(), np.random.RandomState(0)
     rest = {"a/electrodes": REST_COUNTS["2"], "a/pdc": np.array([2100.0])}

@@ -1,11 +1,14 @@
 """Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--estimators press,grip] [--episodes 8]
 
 Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch is recorded around where it
-will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are kept in out/calibration, so that an interrupted run goes on.
+will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are kept in out/calibration, a folder for each kind of BioTac,
+so that an interrupted run goes on.
 """
 
 import argparse
 import functools
+import hashlib
+import json
 import os
 import pathlib
 
@@ -14,8 +17,9 @@ from tqdm import tqdm
 
 from ..data.objects import OBJECTS
 from . import suite
+from .biotac import BioTac
 from .scripted import SCRIPTED, make_controller
-from .touch import Estimator
+from .touch import Estimator, fitted_on
 
 __all__ = ["main", "record", "record_explore"]
 
@@ -34,9 +38,9 @@ _SECONDS = {"follow_edge": 0.9}
 _TIMES = {"follow_edge": 5}
 
 
-def record(domain, task, seed):
+def record(domain, task, seed, biotac=None):
     """One episode: touch (n, 20) while something touches, and the hidden values (n, k) with it, one row per BioTac and frame."""
-    env = _environment(domain, task)
+    env = _environment(domain, task, json.dumps(biotac))
     env.random_state.seed(seed)
     controller, rng = make_controller(task), np.random.RandomState(seed)
     controller.reset()
@@ -54,13 +58,13 @@ def record(domain, task, seed):
 
 
 @functools.lru_cache(maxsize=1)
-def _environment(domain, task):
-    return suite.load(domain, task, task_kwargs={"time_limit": _SECONDS.get(task)})
+def _environment(domain, task, biotac):
+    return suite.load(domain, task, task_kwargs={"time_limit": _SECONDS.get(task), "biotac": json.loads(biotac)})
 
 
-def record_explore(seed, name):
+def record_explore(seed, name, biotac=None):
     """The presses (100,) of one exploration of an object."""
-    env = suite.load("finger", "explore", task_kwargs={"random": seed, "objects": [name]})
+    env = suite.load("finger", "explore", task_kwargs={"random": seed, "objects": [name], "biotac": biotac})
     controller = make_controller("explore")
     controller.decide = lambda: None
     controller.reset()
@@ -95,10 +99,10 @@ def _discriminant(presses, label, shrink=0.05):
     return weight, -0.5 * np.einsum("kf,fk->k", mean, weight)
 
 
-def _explore(folder, episodes):
+def _explore(folder, episodes, biotac):
     rows = [(k, i) for i in range(episodes) for k in range(len(OBJECTS))]
     presses = np.stack([
-        _kept(folder / f"explore_{OBJECTS[k]}_{i}.npz", lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k]))[0]
+        _kept(folder / f"explore_{OBJECTS[k]}_{i}.npz", lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k], biotac))[0]
         for k, i in tqdm(rows, desc="explore")
     ])  # fmt: skip
     label, fold = np.array([k for k, _ in rows]), np.array([i for _, i in rows]) % 4
@@ -130,7 +134,13 @@ def main(arguments=None):
     parser.add_argument("--episodes", type=int, default=8, help="of each task, and of each object of explore")
     parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).with_name("calibration.npz"), help="file to write")
+    parser.add_argument("--skin", default="coarse", help="of the BioTac: coarse, default, fine or a stored skin")
+    parser.add_argument("--tier", default="condensed", help="condensed or full")
+    parser.add_argument("--material", help="name of a preset")
     options = parser.parse_args(arguments)
+    biotac = {"skin": options.skin, "tier": options.tier, "material": options.material}
+    kind = json.dumps(fitted_on(BioTac(**biotac).handle.config), sort_keys=True)
+    folder = options.folder / hashlib.sha256(kind.encode()).hexdigest()[:8]
     domain = {task: domain for domain, task in suite.tasks()}
     groups = {}  # estimator -> the tasks that share it
     for task, controller in SCRIPTED.items():
@@ -139,17 +149,17 @@ def main(arguments=None):
         if name not in groups:
             raise ValueError(f"no estimator {name!r} to calibrate: choose from {', '.join(groups)}")
         if name == "explore":
-            found = _explore(options.folder, options.episodes)
+            found = _explore(folder, options.episodes, biotac)
         else:
             made = [
-                _kept(options.folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i))
+                _kept(folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i, biotac))
                 for i, task in tqdm([(i, t) for i in range(options.episodes * _TIMES.get(name, 1)) for t in groups[name]], desc=name)
             ]
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
             fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
             print(f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
             found = {f"{name}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
-        _add(options.out, found)
+        _add(options.out, found | {f"{name}/fitted_on": np.array(kind)})
 
 
 if __name__ == "__main__":

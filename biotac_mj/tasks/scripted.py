@@ -7,7 +7,7 @@ regression calibrated on other episodes (`calibrate`), or, in the calibration it
 import numpy as np
 
 from ..data.objects import OBJECTS
-from .touch import Touch, load_calibration, load_estimator
+from .touch import Touch, check_fitted_on, load_calibration, load_estimator
 
 __all__ = ["SCRIPTED", "Random", "make_controller"]
 
@@ -19,7 +19,12 @@ class Scripted:
 
     task: str
     calibration = None  # name of its estimator, where it is not that of the task
-    estimator = None
+    estimator = stored = None  # the estimator, once it is needed; arrays of the calibration, None: the package's
+
+    @property
+    def fit(self):
+        """Name of its estimator."""
+        return self.calibration or self.task
 
     def reset(self):
         """Before an episode."""
@@ -31,7 +36,7 @@ class Scripted:
         self.frame += 1
         if truth is None:
             if self.estimator is None:
-                self.estimator = load_estimator(self.calibration or self.task)
+                self.estimator = load_estimator(self.fit, self.stored)
             truth = self.estimator(self.felt)
         touching = float(np.abs(self.felt).max()) > 0.6
         return np.clip(self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1)
@@ -137,7 +142,7 @@ class Explore(Scripted):
 
     def decide(self):
         """Linear discriminant analysis of the presses."""
-        stored = load_calibration()
+        stored = load_calibration() if self.stored is None else self.stored
         score = np.ravel(self.felt_at) @ stored["explore/weight"] + stored["explore/bias"]
         self.belief[:] = -1
         self.belief[np.argmax(score)] = 1
@@ -147,7 +152,7 @@ class Hold(Scripted):
     """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the friction limit: that is slip."""
 
     task, calibration = "hold", "grip"
-    least = 0.35  # [N] before there is a load
+    least, share, spare, gain = 1.0, 1.5, 0.35, 1.5  # grip before there is a load [N]; what it needs times a share, and more [N]; haste
 
     def wait(self, observation):
         return np.zeros(1)
@@ -161,13 +166,15 @@ class Hold(Scripted):
         grip, load = estimate[:, 0].mean(), max(0.0, estimate[:, 1].sum())
         needed = load / (2 * _FRICTION)
         self.slipping = needed > 0.85 * max(grip, 0.1)
-        return np.clip(0.7 * (max(self.least, 1.3 * needed + 0.15) - grip), -0.15, 1.0) + 0.3 * self.slipping
+        error = max(self.least, self.share * needed + self.spare) - grip
+        return np.clip((self.gain if error > 0 else 0.7) * error, -0.15, 1.0) + 0.3 * self.slipping
 
 
 class Lift(Hold):
     """As `Hold`; raises when it has gripped, slowly while the load grows."""
 
     task = "lift"
+    least, share, spare, gain = 0.35, 1.3, 0.15, 0.7  # the load comes slowly here
     goal = 0.0315  # [m] of the gripper
 
     def wait(self, observation):
@@ -201,12 +208,21 @@ class Random:
 SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}
 
 
-def make_controller(task) -> Scripted:
+def make_controller(task, env=None, calibration=None) -> Scripted:
     """The scripted controller of a task.
+
+    Args:
+      task: its name.
+      env: where it will act; it is warned (`CalibrationWarning`) of BioTacs unlike those its estimator was fitted on.
+      calibration: file of `python -m biotac_mj.tasks.calibrate --out`; None takes the package's.
 
     Raises:
       ValueError: there is none.
     """
     if task not in SCRIPTED:
         raise ValueError(f"no scripted controller for task {task!r}: there are {', '.join(SCRIPTED)}")
-    return SCRIPTED[task]()
+    controller = SCRIPTED[task]()
+    controller.stored = load_calibration(None if calibration is None else str(calibration))
+    for config in {str(b.handle.config): b.handle.config for b in env.task.biotacs}.values() if env else ():
+        check_fitted_on(controller.fit, controller.stored, config)
+    return controller

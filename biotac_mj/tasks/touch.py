@@ -2,13 +2,16 @@
 
 import dataclasses
 import functools
+import hashlib
 import importlib.resources
+import json
+import warnings
 
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
 
-__all__ = ["Estimator", "Touch", "load_calibration"]
+__all__ = ["CalibrationWarning", "Estimator", "Touch", "check_fitted_on", "fitted_on", "load_calibration", "load_estimator"]
 
 _TARE = 5  # frames averaged before anything is touched
 _PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # make features of order one
@@ -100,20 +103,62 @@ class Estimator:
         return cls(scale, solve(np.ones(len(held), bool), ridges[best]), errors[best])
 
 
+class CalibrationWarning(UserWarning):
+    """An estimator is used with a BioTac unlike that which it was fitted on."""
+
+
+def fitted_on(config) -> dict:
+    """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material, liquid, friction, readings."""
+    from ..coupling import skins
+
+    skin, digest = skins.load(config.skin), hashlib.sha256()
+    for array in (skin.vert, skin.elem, skin.outer_face, skin.fixed, skin.electrode_pos):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return {
+        "skin": digest.hexdigest()[:16],
+        "tier": config.tier,
+        "stepper": config.stepper,
+        "material": config.material or "default",
+        "liquid": config.liquid,
+        "friction": round(config.friction, 6),
+        "readings": config.readings,
+        "skin options": config.options.get("skin", {}),
+    }
+
+
+def check_fitted_on(name, stored, config):
+    """Warns (CalibrationWarning) where the estimator `name` of a calibration was fitted on another BioTac than that of a `Config`."""
+    now, text = fitted_on(config), stored.get(f"{name}/fitted_on")
+    then = {} if text is None else json.loads(str(text))
+    differ = [key for key in now if then.get(key) != now[key]]
+    if differ:
+        was = ", ".join(f"{key} {then.get(key, 'unknown')!r} (here {now[key]!r})" for key in differ)
+        warnings.warn(
+            f"the estimator {name!r} was fitted on a BioTac with {was}: how far its estimates are off is unknown. Fit it for this one with "
+            f"`python -m biotac_mj.tasks.calibrate --estimators {name} --skin SKIN --tier TIER --material MATERIAL --out FILE`, "
+            "then make_controller(task, env, calibration=FILE)",
+            CalibrationWarning,
+            stacklevel=3,
+        )
+
+
 @functools.cache
-def load_calibration() -> dict:
-    """Arrays of `biotac_mj/tasks/calibration.npz`, made by `python -m biotac_mj.tasks.calibrate`."""
-    with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as path, np.load(path) as file:
+def load_calibration(path=None) -> dict:
+    """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's, `biotac_mj/tasks/calibration.npz`."""
+    if path is None:
+        with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as own:
+            return load_calibration(str(own))
+    with np.load(path) as file:
         return {name: file[name] for name in file.files}
 
 
-def load_estimator(task) -> Estimator:
-    """The calibrated estimator of a task (of "grip" for hold and lift).
+def load_estimator(task, stored=None) -> Estimator:
+    """The calibrated estimator of a task (of "grip" for hold and lift), of a calibration or the package's.
 
     Raises:
       ValueError: the task has none.
     """
-    stored = load_calibration()
+    stored = load_calibration() if stored is None else stored
     if f"{task}/weight" not in stored:
         raise ValueError(f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --estimators {task}`")
     return Estimator(*(stored[f"{task}/{part}"] for part in ("scale", "weight", "error")))
