@@ -6,20 +6,24 @@ Both classes hold the same operator over the free nodes: `solve` applies it and 
 import numpy as np
 import warp as wp
 
+from .supernodal import Elimination, SupernodalFactor
+
 __all__ = ["DenseFactor", "SparseFactor"]
 
 _CLUSTER = 4  # nodes whose rows are computed together
 
 
 class SparseFactor:
-    """CHOLMOD's sparse factor (through cholespy) on the CPU."""
+    """A sparse factor on the CPU, see `supernodal`.
 
-    def __init__(self, stiffness, free, vert, device):
-        from cholespy import CholeskySolverD, MatrixType
+    Args:
+      elimination: of a matrix with the same pattern; None: made here, and kept as the attribute.
+    """
 
-        coo = stiffness.tocoo()
-        self.size = coo.shape[0]
-        self._solver = CholeskySolverD(self.size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO)
+    def __init__(self, stiffness, free, vert, device, elimination=None):
+        self.elimination = elimination or Elimination(stiffness, vert[free])
+        self._solver = SupernodalFactor(stiffness, self.elimination, free)
+        self.size = stiffness.shape[0]
         self._free = free
         self._index = np.full(len(vert), -1)
         self._index[free] = np.arange(len(free))
@@ -34,15 +38,7 @@ class SparseFactor:
 
     def solve(self, rhs):
         """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""
-        out = np.zeros_like(rhs)
-        nworld = rhs.shape[1]
-        b = np.ascontiguousarray(np.moveaxis(rhs[self._free], 1, 2).reshape(self.size, nworld))
-        x = np.empty_like(b)
-        if nworld == 1:
-            b, x = b[:, 0].copy(), x[:, 0].copy()
-        self._solver.solve(b, x)
-        out[self._free] = np.moveaxis(x.reshape(len(self._free), 3, nworld), 2, 1)
-        return out
+        return self._solver.solve(rhs)
 
     def rows(self, nodes) -> np.ndarray:
         """Rows of the inverse that belong to free nodes: (3 len(nodes), size) float32.
@@ -53,12 +49,11 @@ class SparseFactor:
         out = np.empty((len(nodes), 3, self.size), np.float32)
         for cluster in np.unique(self._cluster[local]):
             if cluster not in self._rows:
-                dof = (3 * self._cluster_nodes[cluster][:, None] + np.arange(3)).ravel()
-                b = np.zeros((self.size, len(dof)))
-                b[dof, np.arange(len(dof))] = 1
-                x = np.empty_like(b)
-                self._solver.solve(b, x)
-                self._rows[cluster] = x.T.reshape(-1, 3, self.size).astype(np.float32)
+                members = self._free[self._cluster_nodes[cluster]]
+                unit = np.zeros((len(self._index), len(members), 3, 3))
+                unit[members, np.arange(len(members))] = np.eye(3)
+                rows = self._solver.solve(unit.reshape(len(unit), -1, 3))[self._free]
+                self._rows[cluster] = np.moveaxis(rows, 1, 0).astype(np.float32).reshape(-1, 3, self.size)
             here = self._cluster[local] == cluster
             out[here] = self._rows[cluster][self._member[local[here]]]
         return out.reshape(-1, self.size)

@@ -153,6 +153,7 @@ class SkinModel:
         self.options = options or SkinOptions()
         self.device = wp.get_device(device)
         self._cores = {}
+        self._elimination = None
         self.law = LAWS[self.material.law]
         vert = geometry.vert
         if not np.isfinite(vert).all():
@@ -263,7 +264,11 @@ class SkinModel:
         return self._invert(self._of_free(formulation.rest_stiffness(self.material.mu, self.material.lame)))
 
     def _invert(self, stiffness):
-        return (DenseFactor if self.device.is_cuda else SparseFactor)(stiffness, self.free, self.geometry.vert, self.device)
+        if self.device.is_cuda:
+            return DenseFactor(stiffness, self.free, self.geometry.vert, self.device)
+        made = SparseFactor(stiffness, self.free, self.geometry.vert, self.device, self._elimination)
+        self._elimination = made.elimination
+        return made
 
     def _of_free(self, stiffness):
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()

@@ -82,8 +82,12 @@ class SurfaceCompliance:
         return (c,) if c >= 3 * len(self._outer) else (c - c % 3, c - c % 3 + 1, c - c % 3 + 2)
 
     def vector(self, field) -> np.ndarray:
-        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E."""
-        return self._factor.solve(field[:, None])[self._model.free, 0].ravel() / self._scale
+        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E; refined once, as the factor is rounded."""
+        free = self._model.free
+        first = self._factor.solve(field[:, None])
+        left = field.copy()
+        left[free] -= (self._stiffness @ first[free, 0].ravel()).reshape(-1, 3)
+        return (first + self._factor.solve(left[:, None]))[free, 0].ravel() / self._scale
 
     def _compute(self, coordinates):
         n = len(self._outer)
