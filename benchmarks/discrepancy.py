@@ -23,10 +23,9 @@ from discrepancy_table import confusion, table
 
 SEEDS = {"development": 0, "practice": 10_000, "blind": 700_000}
 KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
-PLANS = 4  # sets of trajectories of one seed, taken in turn
 
 
-def cases(counts, seeds):
+def cases(counts, seeds, plans=4):
     """Dicts: kind, case, effects (list of name, size), seed, settings of the generator, plan; kinds mixed, so that a part is a sample."""
     out = []
     for kind, count in counts.items():
@@ -48,7 +47,7 @@ def cases(counts, seeds):
             effects = [(str(n), float(np.exp(rng.uniform(*np.log(sizes[n]))))) for n in hidden]
             out.append(
                 {"kind": kind, "case": f"{kind}: {name} #{i}", "effects": effects, "seed": seed, "settings": settings,
-                 "plan": (order + i) % PLANS, "at": (order + 0.5) / len(drawn)}
+                 "plan": (order + i) % plans, "at": (order + 0.5) / len(drawn)}
             )  # fmt: skip
     return sorted(out, key=lambda c: c["at"])
 
@@ -103,7 +102,7 @@ class Worker:
         from biotac_mj.discrepancy import Simulator
 
         self.args, self.generators, self.fields = args, {}, {}
-        self.plans = [plan(SEEDS[args.seeds] + 5 + k, args.trajectories) for k in range(PLANS)]
+        self.plans = [plan(SEEDS[args.seeds] + 5 + k, args.trajectories) for k in range(args.plans)]
         self.sim = Simulator(cache=args.cache, tier=args.tier, device=args.device)
 
     def trajectories(self, k, measured):
@@ -192,6 +191,7 @@ def main(argv=None):
     args.add_argument("--seeds", choices=SEEDS, default="development")
     args.add_argument("--jobs", type=int, default=1, help="processes")
     args.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th on")
+    args.add_argument("--plans", type=int, default=4, help="sets of trajectories, taken in turn")
     args.add_argument("--trajectories", type=int, default=16)
     args.add_argument("--tier", choices=("condensed", "full"), default="condensed")
     args.add_argument("--device", default="cpu", help="of the full tier")
@@ -199,14 +199,22 @@ def main(argv=None):
     args.add_argument("--json", default="out/discrepancy.json")
     args.add_argument("--figure", default="", help="PNG of the confusion matrix")
     args.add_argument("--no-baselines", action="store_true")
+    args.add_argument("--table", nargs="+", metavar="JSON", help="only count what these files hold")
     args = args.parse_args(argv)
+    if args.table:
+        rows = [r for f in args.table for r in json.loads(pathlib.Path(f).read_text())]
+        print(f"thresholds {', '.join(sorted({r['thresholds'] for r in rows}))}; tier {', '.join(sorted({r['tier'] for r in rows}))}")
+        print(table(rows))
+        if args.figure:
+            confusion(rows, args.figure)
+        return
     from biotac_mj.discrepancy.workflow import threshold_hash
 
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text()) if path.exists() else []
     done = {(r["case"], r["seeds"], r["tier"], r["thresholds"]) for r in rows}
     i, n = (int(v) for v in args.share.split("/"))
-    todo = [c for c in cases(args.counts, args.seeds)[i::n] if (c["case"], args.seeds, args.tier, threshold_hash()) not in done]
+    todo = [c for c in cases(args.counts, args.seeds, args.plans)[i::n] if (c["case"], args.seeds, args.tier, threshold_hash()) not in done]
     print(f"thresholds {threshold_hash()}, {len(todo)} cases to do", flush=True)
     if todo:
         began = time.time()
@@ -216,7 +224,7 @@ def main(argv=None):
             _worker.generator(skin)
         if args.jobs > 1:
             with multiprocessing.get_context("spawn").Pool(args.jobs, _begin, (args,)) as pool:
-                pool.map(_solve, range(PLANS), chunksize=1)
+                pool.map(_solve, range(args.plans), chunksize=1)
                 print(f"fields there after {time.time() - began:.0f} s", flush=True)
                 _collect(pool.imap_unordered(_one, todo, chunksize=1), rows, path)
         else:

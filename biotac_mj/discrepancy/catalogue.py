@@ -276,6 +276,10 @@ class Gain(Effect):
     params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
     confusable = {"asper": "one electrode or all", "crosstalk": "drive one electrode alone", "saturate": "depth ladder"}
 
+    def doubt(self, theta):
+        g = np.array(list(theta.values()))
+        return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None  # scatter of manufacturing has no mean
+
     def apply(self, run, theta):
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
         run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))

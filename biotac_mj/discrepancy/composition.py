@@ -142,6 +142,8 @@ def _refused(comparison, one, chosen) -> list:
     out = [k for k, v in numbers.items() if v <= THRESHOLDS[k]] + (["p"] if one.p >= THRESHOLDS["p"] else [])
     if all(min(abs(v - p.low), abs(v - p.high)) < 1e-3 * p.scale for v, p in params):
         out.append("bound")
+    if one.effect.doubt(theta):
+        out.append(one.effect.doubt(theta))
     if one.effect.id in _SETUP and all(abs(v) < comparison.repeatability / np.sqrt(len(chosen)) * 2 for v, _ in params):
         out.append("repeatability")
     return out

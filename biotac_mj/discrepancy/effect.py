@@ -108,6 +108,10 @@ class Effect:
         """Why the data cannot show the effect, or None."""
         return None
 
+    def doubt(self, theta: dict) -> str | None:
+        """Why fitted parameters are not what the effect could be, or None."""
+        return None
+
     @property
     def free(self) -> list[str]:
         """Names of the parameters that are fitted; shape parameters come from `grid`, then are polished."""
