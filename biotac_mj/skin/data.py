@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from .launch import Launches
 from .liquid import Liquid
 from .model import SkinModel
 from .stress_memory import StressMemory
@@ -148,6 +149,10 @@ class SkinData:
     @functools.cached_property
     def elastic(self):
         return self.model.elasticity.allocate(self.nworld)
+
+    @functools.cached_property
+    def launch(self):
+        return Launches(self.model.device)
 
     @functools.cached_property
     def direction(self):

@@ -7,6 +7,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from . import material as mat
+from .launch import Launches
 from .types import mat33, real, vec3
 
 __all__ = ["LinearTetrahedra", "elastic_energy", "elastic_force", "gather", "hessian_product", "rest_shape", "rest_stiffness", "tet_stress"]
@@ -211,7 +212,7 @@ class LinearTetrahedra:
 
     def __init__(self, vert, elem, law, device):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
-        self._elem = elem
+        self._elem, self._launch = elem, Launches(device)
         self._inverse_edges, self._volume = rest_shape(vert, elem)
         self.node_volume = np.bincount(elem.ravel(), np.repeat(self._volume / 4, 4), self.nvert)
         start, slot = incidence(self.nvert, elem)
@@ -261,9 +262,6 @@ class LinearTetrahedra:
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
         self._launch(tet_stress, mises.shape, [self.law, mu, lam, self.elem, self.inverse_edges, x], [cauchy, mises])
         return cauchy, mises
-
-    def _launch(self, kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 class _Scratch(NamedTuple):

@@ -16,6 +16,7 @@ import dataclasses
 import numpy as np
 import warp as wp
 
+from .launch import Launches
 from .types import mat33, real, vec3
 
 __all__ = ["Liquid", "Rest", "cavity_volume", "volume_gradient"]
@@ -273,12 +274,14 @@ class Liquid:
         self.reset()
 
     def _allocate(self, nface):
+        self._launch = Launches(self.m.device)
         with wp.ScopedDevice(self.m.device):
             self._share = wp.zeros((nface, self.nworld), dtype=real)
             self._wet = wp.zeros((nface, self.nworld), dtype=vec3)
             self._corner = wp.zeros((3 * nface, self.nworld), dtype=vec3)
             self._none = wp.zeros((0, self.nworld), dtype=int), wp.zeros((0, self.nworld), dtype=vec3)
             self._no_area = wp.zeros(0, dtype=real)
+            self._reference, self._pressure = (wp.zeros(self.nworld, dtype=real) for _ in range(2))
 
     def reset(self):
         rest = self.m.rest
@@ -310,8 +313,7 @@ class Liquid:
     def begin(self):
         """Starts a step."""
         self.offset = np.where(self._holds(), self.last_pressure, 0.0)
-        reference = np.maximum(np.abs(self.last_pressure), _REFERENCE)
-        self._reference = wp.array(reference, dtype=real, device=self.m.device)
+        _view(self._reference)[...] = np.maximum(np.abs(self.last_pressure), _REFERENCE)
 
     def evaluate(self, x, core):
         """Volume, wet faces and pressure of the skin at x [nvert, nworld]; `core` is the contact with the core there, or None."""
@@ -321,25 +323,24 @@ class Liquid:
         else:
             area, touching, geom, force = core.surface.area, core.touching, core.trial_geom, core.sample_force
         contact = [m.sample, area, m.contact_stiffness, self._reference]
-        wp.launch(wetting, self._share.shape,
-                  [m.inner.face, m.core_slot, *contact, touching, geom, force, x],
-                  [self._share, self._wet], device=m.device)  # fmt: skip
+        inputs = [m.inner.face, m.core_slot, *contact, touching, geom, force, x]
+        self._launch(wetting, self._share.shape, inputs, [self._share, self._wet])
         self.volume = m.liquid_volume + _host(_view(self._share).sum(0)) - m.rest_volume
         if not m.has_liquid:
             return
         self.gauge_pressure = self.offset - self.stiffness * (self.volume - self.natural_volume)
         if core is not None:
-            pressure = wp.array(self.gauge_pressure, dtype=real, device=m.device)
-            wp.launch(soften_contact, touching.shape, [*contact, pressure, touching, geom, force], [core.block], device=m.device)
+            _view(self._pressure)[...] = self.gauge_pressure
+            self._launch(soften_contact, touching.shape, [*contact, self._pressure, touching, geom, force], [core.block])
 
     def gradient(self, x):
         """dV/dx by corners of the inner faces, for `elasticity.gather`."""
-        wp.launch(wet_gradient, self._share.shape, [self.m.inner.face, self._wet, x], [self._corner], device=self.m.device)
+        self._launch(wet_gradient, self._share.shape, [self.m.inner.face, self._wet, x], [self._corner])
         return self._corner
 
     def gradient_derivative(self, x, p):
         """The same of the derivative of dV/dx along p."""
-        wp.launch(gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner], device=self.m.device)
+        self._launch(gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner])
         return self._corner
 
     def commit(self, good):

@@ -21,6 +21,7 @@ import warp as wp
 
 from ..geometry.edge_nodes import shape_gradients
 from .elasticity import gather, incidence, rest_shape
+from .launch import Launches
 from .material import (
     LAWS,
     dilatation,
@@ -230,7 +231,7 @@ class QuadraticTetrahedra:
 
     def __init__(self, vert, elem, law, device, contraction=CONTRACTION):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
-        self._elem = elem
+        self._elem, self._launch = elem, Launches(device)
         rest_shape(vert, elem[:, :4])
         shape = shape_gradients(0.25 + contraction * (_POINTS - 0.25))
         edges = np.einsum("eai,qak->eqik", vert[elem], shape)
@@ -324,9 +325,6 @@ class QuadraticTetrahedra:
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
         self._launch(quadratic_stress, mises.shape, [*self._mesh(mu, lam), x], [cauchy, mises])
         return cauchy, mises
-
-    def _launch(self, kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 class _Scratch(NamedTuple):

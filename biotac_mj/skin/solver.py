@@ -1,7 +1,6 @@
 """One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate gradients."""
 
 import contextlib
-import functools
 
 import numpy as np
 import warp as wp
@@ -73,7 +72,7 @@ def _refuse_core(model, geoms):
     if not (model.has_core and geoms.count):
         return
     depth = wp.zeros((geoms.count, geoms.nworld), dtype=wp.float64, device=model.device)
-    _launcher(model.device)(contact.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth])
+    wp.launch(contact.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device)
     depth = depth.numpy()
     if depth.max() > model.options.max_core_depth:
         geom, world = np.unravel_index(depth.argmax(), depth.shape)
@@ -198,7 +197,7 @@ class _Step:
             good &= m.elasticity.smallest_jacobian(d.elastic) > 0
         if m.has_core:
             depth = wp.zeros((len(d.core.surface.face), d.nworld), dtype=wp.float64, device=m.device)
-            _launcher(m.device)(contact.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth])
+            wp.launch(contact.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth], device=m.device)
             good &= depth.numpy().max(0) < m.crushed_depth
         return good
 
@@ -249,7 +248,7 @@ class _Step:
         """Forces at x: elastic, external, contact, core, liquid, inertia."""
         m, d = self.m, self.d
         n, w = m.nvert, d.nworld
-        launch = _launcher(m.device)
+        launch = d.launch
         m.elasticity.force(d.elastic, d.mu, d.lam, d.x, d.force)
         if d.memory:
             d.memory.add_force(d.x, d.force)
@@ -270,7 +269,7 @@ class _Step:
 
     def _contact(self, state, geoms):
         m, d = self.m, self.d
-        surface, launch = state.surface, _launcher(m.device)
+        surface, launch = state.surface, d.launch
         still = state is d.core
         launch(
             contact.core_contact_force if still else contact.contact_force,
@@ -301,7 +300,7 @@ class _Step:
         if self.inertia is not None:
             q *= 1 + m.options.stiffness_damping / self.dt
             q += (1 + m.options.mass_damping * self.dt) * self.inertia * p
-        launch = _launcher(m.device)
+        launch = d.launch
         for s in self._contacts():
             launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
             launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
@@ -373,10 +372,8 @@ class _Step:
         wrench = wp.zeros((groups, d.nworld, 6), dtype=wp.float64, device=self.m.device)
         if groups:
             o = d.outer
-            _launcher(self.m.device)(
-                contact.contact_wrench, (groups, d.nworld),
-                [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force], [wrench],
-            )  # fmt: skip
+            inputs = [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force]
+            wp.launch(contact.contact_wrench, (groups, d.nworld), inputs, [wrench], device=self.m.device)
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
         d.outer.commit()
         if d.liquid:
@@ -394,7 +391,3 @@ class _Step:
             world = np.einsum("wij,nwj->nwi", mat, d.x.numpy()) + pos
             wp.copy(d.velocity, wp.array((world - self.world) / self.dt, dtype=vec3, ndim=2, device=self.m.device))
             d.core_pos, d.core_mat = pos.copy(), mat.copy()
-
-
-def _launcher(device):
-    return functools.partial(wp.launch, device=device)
