@@ -131,23 +131,27 @@ def quadratic_product(
 ):
     e, w = wp.tid()
     X = nodes(p, elem, e, w)
-    C = mat310()
-    V = mat310()  # d mean(theta) / dx, times the volume
-    change = real(0.0)
     local = wp.min(lam[w], real(POINTWISE) * mu[w])
+    rest = (lam[w] - local) / volume[e]
+    change = real(0.0)  # of the mean dilatation, times the volume
+    if rest > real(0.0):
+        for q in range(4):
+            R = mat33()
+            if law == 0:
+                R = rotation[4 * e + q, w]
+            change += weight[e, q] * wp.ddot(dilatation_gradient(law, deformation[4 * e + q, w], R), X * shape[q] * inverse[e, q])
+    C = mat310()
     for q in range(4):
         F = deformation[4 * e + q, w]
         dF = X * shape[q] * inverse[e, q]
         R = mat33()
         if law == 0:
             R = rotation[4 * e + q, w]
-        G = dilatation_gradient(law, F, R)
-        change += weight[e, q] * wp.ddot(G, dF)
-        dP = stress_derivative(law, mu[w], local, F, R, dF) + pressure[e, w] * dilatation_hessian(law, F, R, dF)
-        back = weight[e, q] * wp.transpose(inverse[e, q])
-        C += (dP * back) * wp.transpose(shape[q])
-        V += (G * back) * wp.transpose(shape[q])
-    scatter(C + ((lam[w] - local) * change / volume[e]) * V, e, w, corner_out)
+        dP = stress_derivative(law, mu[w], local, F, R, dF)
+        if rest > real(0.0):
+            dP += pressure[e, w] * dilatation_hessian(law, F, R, dF) + (rest * change) * dilatation_gradient(law, F, R)
+        C += (weight[e, q] * dP * wp.transpose(inverse[e, q])) * wp.transpose(shape[q])
+    scatter(C, e, w, corner_out)
 
 
 @wp.kernel
