@@ -9,7 +9,7 @@ import warp as wp
 
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
-from . import contact, elasticity, liquid
+from . import clearance, contact, elasticity, liquid
 from .factor import DenseFactor, SparseFactor
 from .fill import rest_state
 from .geoms import GeomSet
@@ -209,7 +209,7 @@ class SkinModel:
         """Inner faces that can meet the core: those that start nearer to it than the clearance lie on it (bonded, or faceted into it)."""
         face = self.geometry.inner_face
         gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
-        wp.launch(contact.rest_gap, dim=(len(face), len(self.sample)),
+        wp.launch(clearance.rest_gap, dim=(len(face), len(self.sample)),
                   inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert], outputs=[gap], device=self.device)  # fmt: skip
         return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 

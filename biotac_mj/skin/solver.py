@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from threadpoolctl import ThreadpoolController
 
-from . import contact, elasticity
+from . import clearance, contact, elasticity
 from .data import SkinData, view
 from .geoms import GeomSet
 from .model import SkinModel
@@ -72,7 +72,7 @@ def _refuse_core(model, geoms):
     if not (model.has_core and geoms.count):
         return
     depth = wp.zeros((geoms.count, geoms.nworld), dtype=wp.float64, device=model.device)
-    wp.launch(contact.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device)
+    wp.launch(clearance.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device)
     depth = depth.numpy()
     if depth.max() > model.options.max_core_depth:
         geom, world = np.unravel_index(depth.argmax(), depth.shape)
@@ -197,7 +197,7 @@ class _Step:
             good &= m.elasticity.smallest_jacobian(d.elastic) > 0
         if m.has_core:
             depth = wp.zeros((len(d.core.surface.face), d.nworld), dtype=wp.float64, device=m.device)
-            wp.launch(contact.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth], device=m.device)
+            wp.launch(clearance.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth], device=m.device)
             good &= depth.numpy().max(0) < m.crushed_depth
         return good
 

@@ -1,0 +1,69 @@
+"""How far skin, geoms and core are from each other: what is looked at besides the contact forces."""
+
+import warp as wp
+
+from .contact import Geoms
+from .shapes import distance, distance_bound
+from .types import real, vec3
+
+__all__ = ["deepest_corner", "depth_in_core", "rest_gap"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def rest_gap(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    gap_out: wp.array(dtype=real),
+):
+    """Distance of every sample to the first geom."""
+    f, s = wp.tid()
+    t = face[f]
+    b = sample[s]
+    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0]
+    dn = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], p)
+    gap_out[f * sample.shape[0] + s] = dn[3]
+
+
+@wp.kernel
+def deepest_corner(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    depth_out: wp.array2d(dtype=real),
+):
+    """How deep the corners of each face are in the first geom [face, world]; negative outside."""
+    f, w = wp.tid()
+    depth = real(-1.0)
+    R = wp.transpose(geoms.mat[0, w])
+    for c in range(3):
+        y = R * (x[face[f][c], w] - geoms.pos[0, w])
+        dn = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], y)
+        depth = wp.max(depth, -dn[3])
+    depth_out[f, w] = depth
+
+
+@wp.kernel
+def depth_in_core(
+    # In:
+    core_vert: wp.array(dtype=vec3),
+    geoms: Geoms,
+    # Out:
+    depth_out: wp.array2d(dtype=real),
+):
+    """How deep each geom reaches into the rigid core, by the core's vertices inside the geom [geom, world]."""
+    g, w = wp.tid()
+    R = geoms.mat[g, w]
+    deepest = real(0.0)
+    for i in range(core_vert.shape[0]):
+        y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        deepest = wp.min(deepest, bound)
+    depth_out[g, w] = -deepest
