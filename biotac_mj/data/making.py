@@ -40,7 +40,7 @@ def make_shards(out, options, settings, todo, workers, progress) -> dict:
       ValueError: an option is not possible.
       RuntimeError: a device's process failed; the text is its error.
     """
-    total = options.steps * sum(batch.simulated + batch.measured for batch in todo)
+    total = options.steps * sum(len(batch.members) * (batch.simulated + batch.measured) for batch in todo)
     with tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False) as bar:
 
         def tell(text):

@@ -49,7 +49,7 @@ def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
       model: the skin, on any device.
       names: of the object of each motion, or of the one that all share.
       motions: plan.Motions of equal length.
-      progress: called with the number of time steps that a step of the solver has finished, per motion.
+      progress: called with the number of time steps of all motions that a step of the solver has finished.
 
     Raises:
       ValueError: an object deep inside the rigid core (plans keep clear of it).
@@ -76,7 +76,7 @@ def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
         fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
         fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
         if progress:
-            progress(len(there) / nworld)
+            progress(len(there))
     return fields
 
 
@@ -106,7 +106,7 @@ def simulate_condensed(model: SkinModel, names, motions, progress=None) -> Field
                 fields.converged[k, row], fields.wrench[k, row], fields.pressure[k, row] = out.converged, out.wrench[0], memory.pressure
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
         if progress:
-            progress(nstep / len(motions))
+            progress(nstep)
     return fields
 
 
