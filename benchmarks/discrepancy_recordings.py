@@ -355,10 +355,8 @@ def main(argv=None):
             rows.append({"case": name, "seeds": args.seeds, **diagnose(make, pathlib.Path(folder))})
             r = rows[-1]
             if args.verbose or not r["hit"] or r["extra"]:
-                print(
-                    f"{'ok  ' if r['hit'] else 'MISS'} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: {r['verdict'][:230]}",
-                    flush=True,
-                )  # noqa: E501
+                mark = "ok  " if r["hit"] else "MISS"
+                print(f"{mark} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: {r['verdict'][:230]}", flush=True)
             if path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 part = path.with_suffix(".part")
@@ -393,15 +391,26 @@ def diagnose(make, folder):
 def code_hash():
     """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
     folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    names = "drifts electrode_drifts faults hum loads noises plain recorded_effect recorded_gap recorded_rest recorded_views recording shapes timeline"  # noqa: E501
+    names = (
+        "drifts electrode_drifts faults hum loads noises plain recorded_effect recorded_gap recorded_rest recorded_views recording shapes"
+    )
+    names += " timeline"
     return hashlib.sha256(b"".join((folder / f"{n}.py").read_bytes() for n in names.split())).hexdigest()[:12]
 
 
 def table(rows):
     """Rows by base: without effect, inside and outside the catalogue."""
-    lines = [
-        f"{'base':<30}{'no effect':>11}{'false':>7}{'hidden':>8}{'right':>7}{'with extras':>13}{'outside':>9}{'unknown':>9}{'worse view':>12}"
-    ]  # noqa: E501
+    heads = (
+        ("no effect", 11),
+        ("false", 7),
+        ("hidden", 8),
+        ("right", 7),
+        ("with extras", 13),
+        ("outside", 9),
+        ("unknown", 9),
+        ("worse view", 12),
+    )
+    lines = [f"{'base':<30}" + "".join(f"{head:>{width}}" for head, width in heads)]
     groups = collections.defaultdict(list)
     for r in rows:
         groups[r["base"] + (" with force" if r["force"] else "")].append(r)
@@ -410,13 +419,18 @@ def table(rows):
         outside = [r for r in members if r["effect"] in OUTSIDE]
         inside = [r for r in members if r["effect"] != "none" and r["effect"] not in OUTSIDE]
         worse = sum(any(after > 1.02 * before for before, after in r["views"].values()) for r in members)
-        lines.append(f"{base:<30}{len(none):>11}{sum(bool(r['extra']) for r in none):>7}{len(inside):>8}{sum(r['hit'] for r in inside):>7}"
-                     f"{sum(bool(r['extra']) for r in inside):>13}{len(outside):>9}{sum(r['hit'] for r in outside):>9}{worse:>12}")  # fmt: skip
+        counts = (len(none), sum(bool(r["extra"]) for r in none), len(inside), sum(r["hit"] for r in inside),
+                  sum(bool(r["extra"]) for r in inside), len(outside), sum(r["hit"] for r in outside), worse)  # fmt: skip
+        lines.append(f"{base:<30}" + "".join(f"{value:>{width}}" for value, (_, width) in zip(counts, heads)))
     lines.append("")
     for effect in dict.fromkeys(r["effect"] for r in rows):
         mine = [r for r in rows if r["effect"] == effect]
         wrong = collections.Counter(i for r in mine for i in r["extra"])
         lines.append(f"{effect:<14}{sum(r['hit'] for r in mine):>4} of {len(mine):<4}{', '.join(f'{k} {v}' for k, v in wrong.items())}")
+    lines += ["", f"{'confidence':<14}names, right"]
+    for value in sorted({round(f["confidence"], 3) for r in rows for f in r["named"]}):
+        told = [f["right"] or f["natural"] for r in rows for f in r["named"] if round(f["confidence"], 3) == value]
+        lines.append(f"{value:<14}{len(told):>4}{sum(told):>7}")
     return "\n".join(lines)
 
 

@@ -7,6 +7,8 @@ from .recorded_effect import Finding, Parameter, RecordedEffect
 
 __all__ = ["Hum"]
 
+_LEAST = 25.0  # nats: a weak line of a single electrode comes and goes in real recordings
+
 
 class Hum(RecordedEffect):
     id, name, stage, unit = "hum", "mains hum or another periodic disturbance", "A", "counts"
@@ -44,6 +46,8 @@ class Hum(RecordedEffect):
             "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
         }
         nats = min(k_segments * np.log(strength) * len(channels), 1e4)
+        if nats < _LEAST:
+            return []
         end = float(session.recording.time[-1]) if stop == len(x) else theta["end"]
         alias = "" if abs(f - 50) < 0.6 or abs(f - 60) < 0.6 else _alias(f, rate)
         return [Finding(self, tuple(channels), theta, parameters, nats, theta["start"], end, float(np.exp(-min(nats, 700))),
