@@ -71,15 +71,11 @@ def main(argv=None):
     args.add_argument("--json")
     args = args.parse_args(argv)
     rows = [compare(effect, theta, press(rows=args.rows), args.skin) for effect, theta in CASES]
-    print(
-        f"{'effect':<30}{'force N':>9}{'changes':>9}{'missed':>9}{'pressure Pa':>13}{'changes':>9}{'missed':>9}{'counts':>8}{'changes':>9}{'missed':>9}{'s':>7}"
-    )  # noqa: E501
+    names = ("force", 9, "N"), ("pressure", 13, "Pa"), ("counts", 9, "")
+    print(f"{'effect':<30}" + "".join(f"{f'{n} {unit}':>{w}}{'changes':>9}{'missed':>9}" for n, w, unit in names) + f"{'s':>7}")
     for r in rows:
         label = f"{r['effect']} " + ", ".join(f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening") if k in r)
-        cells = "".join(
-            f"{r[f'{n}_largest']:>{w}.4g}{r[f'{n}_signature']:>9.3g}{r[f'{n}_missed']:>9.2g}"
-            for n, w in (("force", 9), ("pressure", 13), ("counts", 8))
-        )  # noqa: E501
+        cells = "".join(f"{r[f'{n}_largest']:>{w}.4g}{r[f'{n}_signature']:>9.3g}{r[f'{n}_missed']:>9.2g}" for n, w, _ in names)
         print(f"{label:<30}{cells}{r['in_skin_s']:>7.0f}")
     if args.json:
         path = pathlib.Path(args.json)

@@ -247,7 +247,7 @@ def _settle(result, late):
 
 
 def _confidence(finding, loaded):
-    """How often such a name, or one of its ties, was right on the benchmark's practice recordings (Laplace's rule); see docs/discrepancy.md.
+    """How often such a name, or one of its ties, was right on the benchmark's practice recordings (Laplace's rule).
 
     Under load what one electrode does against the others is told less surely; what no row kept aside could confirm least.
     """
