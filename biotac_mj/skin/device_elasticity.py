@@ -12,7 +12,7 @@ from .elasticity import LinearTetrahedra, edge_matrix, incidence
 from .material import axial, stress, stress_derivative
 from .types import mat33, real, vec3
 
-__all__ = ["DeviceElements", "device_elements"]
+__all__ = ["Linear", "narrow", "polar_mixed", "polar_single", "widen"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -226,20 +226,6 @@ def linear_product(
 
 
 @wp.kernel
-def double_vector(p: wp.array2d(dtype=wp.vec3), on: wp.array(dtype=int), p_out: wp.array2d(dtype=vec3)):
-    i, w = wp.tid()
-    if on[w] == 1:
-        p_out[i, w] = vec3(real(p[i, w][0]), real(p[i, w][1]), real(p[i, w][2]))
-
-
-@wp.kernel
-def flag_inverted(law: int, jacobian: wp.array2d(dtype=real), on: wp.array(dtype=int), inverted_out: wp.array(dtype=int)):
-    e, w = wp.tid()
-    if on[w] == 1 and law == 2 and not (jacobian[e, w] > real(_INVERTED)):
-        inverted_out[w] = 1
-
-
-@wp.kernel
 def flag_turned_inside_out(
     # In:
     elem: wp.array(dtype=wp.vec4i),
@@ -255,15 +241,7 @@ def flag_turned_inside_out(
         failed_out[w] = 1
 
 
-@wp.kernel
-def flag_points_inside_out(jacobian: wp.array2d(dtype=real), asked: wp.array(dtype=int), failed_out: wp.array(dtype=int)):
-    """The same for integration points."""
-    e, w = wp.tid()
-    if asked[w] == 1 and not (jacobian[e, w] > real(0.0)):
-        failed_out[w] = 1
-
-
-class _Linear:
+class Linear:
     """Linear tetrahedra in an order in which neighbours in the list are neighbours in space, so that caches serve nodes to all of them."""
 
     def __init__(self, elements: LinearTetrahedra, nworld):
@@ -278,7 +256,7 @@ class _Linear:
                 wp.array(volume[order], dtype=real),
             ]
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
-            self.corner = wp.zeros((4 * len(elem), nworld), dtype=wp.vec3)
+            self.corner = self.corner_force = wp.zeros((4 * len(elem), nworld), dtype=wp.vec3)
         self._dim = (len(elem), nworld)
 
     def force(self, mu, lam, x, on, inverted):
@@ -291,42 +269,3 @@ class _Linear:
     def product(self, mu, lam, x, p, on):
         kernel = corotational_product if self.law == 0 else linear_product
         wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device)
-
-
-class DeviceElements:
-    """Any other element formulation, in double precision and for all worlds, through its own `force` and `product`.
-
-    Attributes:
-      start, slot: CSR lists of the corners of each node. corner: what `force` or `product` wrote last [slot, world] [N].
-    """
-
-    def __init__(self, elements, nworld):
-        self._elements = elements
-        self.law, self.device = elements.law, elements.device
-        self.start, self.slot = elements.start, elements.slot
-        self._scratch = elements.allocate(nworld)
-        self.corner = self._scratch.corner
-        with wp.ScopedDevice(self.device):
-            self._p = wp.zeros((elements.nvert, nworld), dtype=vec3)
-            self._unused = wp.zeros((elements.nvert, nworld), dtype=vec3)
-
-    def force(self, mu, lam, x, on, inverted):
-        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot bear the deformation."""
-        self._elements.force(self._scratch, mu, lam, x, self._unused)
-        jacobian = self._scratch.jacobian
-        wp.launch(flag_inverted, jacobian.shape, [self.law, jacobian, on], [inverted], device=self.device)
-
-    def refuse_inverted(self, x, asked, failed):
-        """Marks worlds with an inverted element at x, where `force` was evaluated last."""
-        jacobian = self._scratch.jacobian
-        wp.launch(flag_points_inside_out, jacobian.shape, [jacobian, asked], [failed], device=self.device)
-
-    def product(self, mu, lam, x, p, on):
-        """Tangent at x, where `force` was evaluated last, times p, by corners."""
-        wp.launch(double_vector, p.shape, [p, on], [self._p], device=self.device)
-        self._elements.product(self._scratch, mu, lam, x, self._p, self._unused)
-
-
-def device_elements(elements, nworld):
-    """The formulation as the device step needs it."""
-    return (_Linear if type(elements) is LinearTetrahedra else DeviceElements)(elements, nworld)

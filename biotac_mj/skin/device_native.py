@@ -15,10 +15,9 @@ _ROWS, _COLUMNS = 16, 32  # a block's threads as a grid: thread (r, c) holds the
 _EXCHANGE = """
     const int NR = %(nr)d, NC = %(nc)d;
     const int t = threadIdx.x, r = t / %(columns)d, c = t %% %(columns)d;
-    __shared__ float column[NR * %(rows)d];
+    __shared__ float columns[2][NR * %(rows)d];
     __shared__ float row[NC * %(columns)d];
     __shared__ int pivot[NR * %(rows)d];
-    __shared__ int chosen;
     const int w = world;
     const int n = n_in;
     float a[NR][NC];
@@ -32,33 +31,33 @@ _EXCHANGE = """
             const int ri = r + %(rows)d * i, cj = c + %(columns)d * j;
             a[i][j] = (ri < n && cj < n) ? source[ri * stride + cj] : 0.0f;
         }
-    for (int k = t; k < NR * %(rows)d; k += %(threads)d) pivot[k] = -1;
+    if (c == 0)
+        #pragma unroll
+        for (int i = 0; i < NR; ++i) columns[0][r + %(rows)d * i] = a[i][0];
+    unsigned taken = 0;  // of the rows c, c + 32, ...; every warp finds the pivots for itself, which saves a barrier
     for (int k = 0; k < n; ++k) {
-        const int kc = k %% %(columns)d, kj = k / %(columns)d;
+        const float* column = columns[k & 1];
         __syncthreads();
-        if (c == kc) {
-            #pragma unroll
-            for (int j = 0; j < NC; ++j)
-                if (j == kj)
-                    #pragma unroll
-                    for (int i = 0; i < NR; ++i) column[r + %(rows)d * i] = a[i][j];
+        unsigned best = 0, at = 0xffffffffu;  // bits of a number that is not negative are ordered as the number is
+        for (int m = 0; c + 32 * m < n; ++m) {
+            if (taken >> m & 1) continue;
+            const unsigned bits = __float_as_uint(fabsf(column[c + 32 * m]));
+            if (at == 0xffffffffu || bits > best) { best = bits; at = c + 32 * m; }
         }
-        __syncthreads();
-        if (t < 32) {
-            float best = -1.0f; int at = 0;
-            for (int i = t; i < n; i += 32) {
-                const float v = fabsf(column[i]);
-                if (pivot[i] < 0 && v > best) { best = v; at = i; }
-            }
-            for (int s = 16; s > 0; s >>= 1) {
-                const float other = __shfl_xor_sync(0xffffffffu, best, s);
-                const int where = __shfl_xor_sync(0xffffffffu, at, s);
-                if (other > best || (other == best && where < at)) { best = other; at = where; }
-            }
-            if (t == 0) { chosen = at; pivot[at] = k; }
+#if __CUDA_ARCH__ >= 800
+        const unsigned largest = __reduce_max_sync(0xffffffffu, best);
+        const unsigned p = __reduce_min_sync(0xffffffffu, best == largest ? at : 0xffffffffu);
+#else
+        unsigned largest = best, p = at;
+        for (int s = 16; s > 0; s >>= 1) {
+            const unsigned other = __shfl_xor_sync(0xffffffffu, largest, s);
+            const unsigned where = __shfl_xor_sync(0xffffffffu, p, s);
+            if (other > largest || (other == largest && where < p)) { largest = other; p = where; }
         }
-        __syncthreads();
-        const int p = chosen, pr = p %% %(rows)d, pi = p / %(rows)d;
+#endif
+        if (p %% 32 == c) taken |= 1u << (p / 32);
+        if (t == 0) pivot[p] = k;
+        const int pr = p %% %(rows)d, pi = p / %(rows)d;
         const float d = 1.0f / column[p];
         if (r == pr) {
             #pragma unroll
@@ -83,10 +82,16 @@ _EXCHANGE = """
                 }
             }
         }
+        if (c == (k + 1) %% %(columns)d)
+            #pragma unroll
+            for (int j = 0; j < NC; ++j)
+                if (j == (k + 1) / %(columns)d)
+                    #pragma unroll
+                    for (int i = 0; i < NR; ++i) columns[(k + 1) & 1][r + %(rows)d * i] = a[i][j];
     }
     __syncthreads();
     // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k
-    int* owner = (int*)column;
+    int* owner = (int*)columns[0];
     for (int k = t; k < n; k += %(threads)d) owner[pivot[k]] = k;
     __syncthreads();
     #pragma unroll

@@ -8,16 +8,18 @@ the residual, and one product gives the result. G = (I + D W)^-1 D is made expli
 import numpy as np
 import warp as wp
 
+from . import device_product as one
 from . import device_sides as sides
 from . import device_small as small
 from . import device_touch as touch
 from .device_worlds import BLOCK
 from .types import mat33, real
 
-__all__ = ["FEW", "DevicePreconditioner"]
+__all__ = ["FEW", "THREADS_FEW", "DevicePreconditioner"]
 
 _LISTED = 512
 FEW = 16  # worlds that do not fill the device: work is split finer there
+THREADS_FEW = 64  # of a block there, so that more multiprocessors take part
 
 
 class DevicePreconditioner:
@@ -67,6 +69,12 @@ class DevicePreconditioner:
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
             self._pivot = wp.zeros((nworld, size), dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
+            self._alone = None
+            if nworld == 1:
+                self._alone = one.SymmetricProduct(self._inverse.half, self._inverse.rest)
+                self._pair, self._pair_answer = (wp.zeros((2, rows), dtype=float) for _ in range(2))
+                self._corrections = wp.zeros((one.PARTS, n), dtype=wp.vec3)
+                rows = 0
             self._side = wp.zeros((rows, 2 * nworld), dtype=wp.float16)
             third = rows if len(self._inverse.rest) else 0
             self._answer = wp.zeros((rows, 2 * nworld), dtype=float), wp.zeros((third, nworld), dtype=float)
@@ -79,12 +87,12 @@ class DevicePreconditioner:
                 self._surfaces.append((s.face, s.start, s.slot, state.touching, state.block))
 
     def _launch(self, kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=THREADS_FEW if self.nworld <= FEW else 256)
 
     def _by_block(self, kernel, dim, inputs, outputs):
         wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=BLOCK, device=self.device)
 
-    def update(self, st, part, r, gradient, z_out, part_out):
+    def update(self, st, part, r, gradient, z_out, part_out, beside):
         """Takes the tangents of contact and liquid; z is the approximate inverse of the new tangent times r.
 
         Args:
@@ -92,6 +100,7 @@ class DevicePreconditioner:
           part: (4, nchunk, nworld) squares of r and of the gradient as its first and third.
           r: [nvert, nworld] residual, zero at fixed nodes. gradient: of the liquid's volume [nvert, nworld], or of length zero.
           z_out: [nvert, nworld]. part_out: (2, nchunk, nworld) r . z and gradient . z.
+          beside: launches functions that do not need each other's results.
         """
         on, m, w, inverse = st.active, self.capacity, self.nworld, self._inverse
         entries = [inverse.half, inverse.rest, inverse.scale]
@@ -102,27 +111,62 @@ class DevicePreconditioner:
             self._by_block(touch.list_wanted, [1], [self._wanted], [self._place, self._listed, self._count_listed, self._fits])
             for source, rows in zip((inverse.half, inverse.rest), self._rows):
                 self._launch(touch.copy_rows, rows.shape, [source, self._free, self._listed, self._count_listed], [rows])
-        if self.liquid:
-            self._launch(sides.load_gradient, self._nodes, [self._free, gradient, self._norm, on], [self._side])
-            inverse.multiply(self._side, *self._answer)
-            self._launch(sides.read_along, self._chunks,
-                         [self.chunk, self._free, gradient, *self._answer, self._norm, inverse.scale, st, on],
-                         [self._along, self._part])  # fmt: skip
-        self._meet(1, st, on, r)
         blocks = [self._count, self._link, self._spring]
-        self._launch(small.small_compliance, (w, m, m),
-                     [*entries, self._free, self.node, self.size, self.liquid, self._along, st], [self._W])  # fmt: skip
-        self._launch(small.small_stiffness, (m, w), [*outer, *core, self.slot, self.node, self.size, on], blocks)
-        self._launch(small.small_system, (w, m, m), [self.liquid, self.size, *blocks, self._W, on], [self._A])
-        self._invert(on)
-        self._launch(small.small_answer, (w, m, m), [self.liquid, self.size, *blocks, self._W, on], [self._G])
+
+        def meet():
+            if self._alone:
+                self._meet_alone(1, st, on, r, gradient)
+                return
+            if self.liquid:
+                self._direct_liquid(st, on, gradient)
+            self._meet(1, st, on, r)
+
+        def make():
+            self._launch(small.small_compliance, (w, m, m),
+                         [*entries, self._free, self.node, self.size, self.liquid, self._along, st], [self._W])  # fmt: skip
+            self._launch(small.small_system, (w, m, m), [self.liquid, self.size, *blocks, self._W, on], [self._A])
+            self._invert(on)
+            self._launch(small.small_answer, (w, m, m), [self.liquid, self.size, *blocks, self._W, on], [self._G])
+
+        def prepare():
+            self._launch(small.small_stiffness, (m, w), [*outer, *core, self.slot, self.node, self.size, on], blocks)
+            if not self.liquid:  # which has to be met first
+                make()
+
+        beside(meet, prepare)
+        if self.liquid:
+            make()
         self._balance(st, on, r, gradient, z_out, part_out)
 
     def apply(self, st, part, r, gradient, z_out, part_out):
         """z = approximate inverse of the tangent times r in the running worlds; `part` holds the square of r by chunks."""
+        if self._alone:
+            self._meet_alone(0, st, st.running, r, gradient)
+            self._balance(st, st.running, r, gradient, z_out, part_out)
+            return
         self._by_block(sides.measure_norm, [self.nworld], [part, st.running], [self._norm])
         self._meet(0, st, st.running, r)
         self._balance(st, st.running, r, gradient, z_out, part_out)
+
+    def _direct_liquid(self, st, on, gradient):
+        """What the liquid's direction does everywhere."""
+        inverse = self._inverse
+        self._launch(sides.load_gradient, self._nodes, [self._free, gradient, self._norm, on], [self._side])
+        inverse.multiply(self._side, *self._answer)
+        self._launch(sides.read_along, self._chunks,
+                     [self.chunk, self._free, gradient, *self._answer, self._norm, inverse.scale, st, on],
+                     [self._along, self._part])  # fmt: skip
+
+    def _meet_alone(self, first, st, on, r, gradient):
+        """`_direct_liquid` and `_meet` for one world: a single pass over the inverse."""
+        self._launch(one.load_pair, self._nodes[0], [self._free, r, gradient, on], [self._pair])
+        self._alone.multiply(self._pair, self._pair_answer)
+        self._launch(one.read_pair, max(self._chunks[0], 3 * self.capacity),
+                     [first, self.chunk, self.liquid, self._free, self.node, self.size, r, gradient, self._pair_answer,
+                      self._inverse.scale, st, on, self._along],
+                     [self._u, self._largest, self._part])  # fmt: skip
+        if self.liquid:
+            self._by_block(small.sum_liquid, [1], [self._part, on, first], [self._W, self._u])
 
     def _meet(self, first, st, on, r):
         """What the residual does to the liquid and at the touching nodes."""
@@ -167,6 +211,15 @@ class DevicePreconditioner:
         self._launch(
             small.small_forces, self._u.shape, [self.liquid, self.size, self._G, self._u, self._norm, st, on], [self._q, self._largest]
         )
+        if self._alone:
+            self._launch(one.correct, (one.PARTS, self._nodes[0]),
+                         [self.liquid, inverse.half, inverse.rest, self._free, self.node, self.size, self._q, on],
+                         [self._corrections])  # fmt: skip
+            self._launch(one.read_corrected, self._chunks[0],
+                         [self.chunk, self.liquid, self._free, self._pair_answer, self._corrections, self._along, self._q, inverse.scale,
+                          r, gradient, st, on],
+                         [z_out, part_out])  # fmt: skip
+            return
         self._launch(sides.load_balance, self._nodes,
                      [self.liquid, self._free, self.slot, r, gradient, self._q, self._norm, self._largest, st, on],
                      [self._side])  # fmt: skip

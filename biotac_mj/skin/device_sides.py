@@ -16,6 +16,7 @@ __all__ = [
     "load_balance",
     "load_gradient",
     "load_residual",
+    "lowered",
     "measure_along",
     "measure_norm",
     "pull_of_liquid",

@@ -22,8 +22,8 @@ from . import device_krylov as krylov
 from . import device_liquid as liquid
 from . import device_nodes as nodes
 from . import device_worlds as worlds
-from .device_elasticity import device_elements
-from .device_preconditioner import FEW, DevicePreconditioner
+from .device_preconditioner import FEW, THREADS_FEW, DevicePreconditioner
+from .device_quadratic import device_elements
 from .types import mat33, real, vec3
 
 __all__ = ["DeviceStep", "prepare_device", "step_device"]
@@ -118,6 +118,9 @@ class DeviceStep:
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (flags[i : i + 1] for i in range(5))
         self._graph = None
+        few = model.device.is_cuda and data.nworld <= FEW
+        self._streams = [wp.Stream(model.device) for _ in range(2 if few else 0)]  # many worlds fill the device without
+        self._events = [wp.Event(model.device) for _ in range(3 if few else 0)]
         self._warm_up()
 
     def run(self):
@@ -133,11 +136,29 @@ class DeviceStep:
         wp.capture_launch(self._graph)
 
     def _launch(self, kernel, dim, inputs, outputs=()):
-        wp.launch(kernel, dim, inputs, list(outputs), device=self.m.device)
+        threads = THREADS_FEW if self.d.nworld <= FEW else 256
+        wp.launch(kernel, dim, inputs, list(outputs), device=self.m.device, block_dim=threads)
 
     def _decide(self, kernel, inputs, outputs=()):
         """A block of threads for each world."""
         wp.launch_tiled(kernel, dim=[self.d.nworld], inputs=inputs, outputs=list(outputs), block_dim=worlds.BLOCK, device=self.m.device)
+
+    def _beside(self, *branches):
+        """Launches up to three functions, which do not need each other's results, as branches of the graph."""
+        if not self._streams:
+            for branch in branches:
+                branch()
+            return
+        main = self.m.device.stream
+        main.record_event(self._events[0])
+        for stream, done, branch in zip(self._streams, self._events[1:], branches[1:]):
+            stream.wait_event(self._events[0])
+            with wp.ScopedStream(stream, sync_enter=False):
+                branch()
+                stream.record_event(done)
+        branches[0]()
+        for done, _ in zip(self._events[1:], branches[1:]):
+            main.wait_event(done)
 
     def _warm_up(self):
         """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made, before anything is captured."""
@@ -216,7 +237,7 @@ class DeviceStep:
              self._gradient(), d.x, d.rest_vert, k.inertial, st.active],
             [k.r, k.worth, k.preconditioner.any_touch, self._newton_on],
         )  # fmt: skip
-        k.preconditioner.update(st, k.worth, k.r, self._gradient(), k.p, k.part)
+        k.preconditioner.update(st, k.worth, k.r, self._gradient(), k.p, k.part, self._beside)
         touch = k.preconditioner.any_touch
         limits = [m.options.tolerance, m.options.max_newton, int(m.has_liquid)]
         self._decide(worlds.judge_balance, [*limits, k.part, k.worth, touch, st], [self._newton_on])
@@ -293,18 +314,17 @@ class DeviceStep:
     def _evaluate(self, on):
         """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia."""
         m, d, k, st = self.m, self.d, self.k, self.st
-        k.elements.force(d.mu, d.lam, d.x, on, st.inverted)
-        self._contact(d.outer, self.geoms, k.near[0], 0, on)
-        if d.core:
-            self._contact(d.core, m.core(d.nworld), k.near[1], 1, on)
-        if m.has_liquid:
-            self._fill(on)
+        self._beside(
+            lambda: k.elements.force(d.mu, d.lam, d.x, on, st.inverted),
+            lambda: self._inside(on),
+            lambda: self._contact(d.outer, self.geoms, k.near[0], 0, on),
+        )
         none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
         core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner] if d.core else none
         wet = [m.inner.start, m.inner.slot, k.wet_corner] if m.has_liquid else [k.no_list, k.no_list, k.no_vector]
         self._launch(
             nodes.assemble_force, d.x.shape,
-            [k.elements.start, k.elements.slot, k.elements.corner, m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner,
+            [k.elements.start, k.elements.slot, k.elements.corner_force, m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner,
              *core, *wet, self._external(), st.pressure, on],
             [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
         )  # fmt: skip
@@ -319,6 +339,14 @@ class DeviceStep:
                 k.damped.product(d.mu, d.lam, d.x, k.q, on)
                 e = k.damped
                 self._launch(nodes.add_damping, d.x.shape, [e.start, e.slot, e.corner, real(o.stiffness_damping), d.dt, on, d.force])
+
+    def _inside(self, on):
+        """The skin's inner side: core and liquid."""
+        m, d = self.m, self.d
+        if d.core:
+            self._contact(d.core, m.core(d.nworld), self.k.near[1], 1, on)
+        if m.has_liquid:
+            self._fill(on)
 
     def _contact(self, state, geoms, near, still, on):
         m, d, s = self.m, self.d, state.surface

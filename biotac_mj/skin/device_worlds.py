@@ -21,6 +21,7 @@ __all__ = [
     "release_geoms",
     "retry_worlds",
     "total_of",
+    "totals_of",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -88,6 +89,17 @@ def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
     for c in range(t, part.shape[1], wp.block_dim()):
         s += part[k, c, w]
     return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
+
+
+@wp.func
+def totals_of(part: wp.array3d(dtype=real), k: int, other: wp.array3d(dtype=real), l: int, w: int, t: int):
+    """Two such sums, whose loads overlap."""
+    a = real(0.0)
+    b = real(0.0)
+    for c in range(t, part.shape[1], wp.block_dim()):
+        a += part[k, c, w]
+        b += other[l, c, w]
+    return wp.tile_extract(wp.tile_sum(wp.tile(a)), 0), wp.tile_extract(wp.tile_sum(wp.tile(b)), 0)
 
 
 @wp.func
@@ -188,10 +200,8 @@ def judge_balance(
     w, t = wp.tid()
     if st.active[w] == 0:
         return
-    rr = total_of(worth, 0, w, t)
-    # single precision leaves more residual than nothing, so a vibration without contact is measured by the work of its inertia
-    work = wp.abs(total_of(worth, 1, w, t)) + wp.abs(total_of(worth, 3, w, t))
-    rz = total_of(part, 0, w, t)
+    rr, rz = totals_of(worth, 0, part, 0, w, t)
+    load, fly = totals_of(worth, 1, worth, 3, w, t)
     gz = total_of(part, 1, w, t)
     if t > 0:
         return
@@ -203,7 +213,8 @@ def judge_balance(
         st.active[w] = 0
         st.error[w] = real(0.0)
         return
-    work += real(1.0e-12)
+    # single precision leaves more residual than nothing, so a vibration without contact is measured by the work of its inertia
+    work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     st.error[w] = wp.sqrt(wp.max(rz, real(0.0)) / work)
     settled = int(1)
     if has_liquid == 1:

@@ -1,0 +1,182 @@
+"""A peer on the GPU: Newton's VBD soft body (vertex block descent) on the same linear tetrahedra, pressed by a driven sphere in 2 ms steps.
+
+    python benchmarks/peer_newton.py [--device cuda:0] [--iterations 10,100,1000] [--worlds 1] [--json OUT]
+
+Its elasticity is stable Neo-Hooke with our Lame constants; contact is a penalty at the nodes, of `CONTACT` N/m each; it has neither liquid
+nor core contact here. Worlds are copies of the skin and its sphere in one model, far apart. The sphere is driven 1 mm, then held until the
+skin rests. `force` is the sum of the penalties, without friction. Newton is no requirement of this package: without it `VERSION` is None.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+
+import numpy as np
+import warp as wp
+
+try:
+    import newton
+except ImportError:
+    newton = None
+
+__all__ = ["VERSION", "press"]
+
+VERSION = newton and getattr(newton, "__version__", "?")
+TIMESTEP = 2e-3  # [s]
+SETTLE = 20  # steps at rest at the end
+CONTACT = 2e4  # [N/m] of a node
+APART = 0.1  # [m]
+
+
+@wp.kernel
+def drive(path: wp.array(dtype=wp.vec3), offset: wp.array(dtype=wp.vec3), count: wp.array(dtype=int), body_q: wp.array(dtype=wp.transform)):
+    b = wp.tid()
+    body_q[b] = wp.transform(path[wp.min(count[0], path.shape[0] - 1)] + offset[b], wp.quat_identity())
+
+
+@wp.kernel
+def advance(count: wp.array(dtype=int)):
+    count[0] = count[0] + 1
+
+
+def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0") -> dict:
+    """Drives the sphere along path (n + 1, 3) [m], the first at first touch, one step for each point, then holds it.
+
+    Returns:
+      ms_per_step: wall time of a step while the spheres move, of all worlds; steps: how many moved; setup_s: with compilation;
+      forces (n, worlds, 3) of the skin on the sphere in each step [N]; force: (3,) of the first world at the end [N].
+    """
+    begin = time.perf_counter()
+    size = 1e-9  # of a node [m]
+    with wp.ScopedDevice(device):
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        offset = np.array([[APART * w, 0, 0] for w in range(worlds)])
+        for w in range(worlds):
+            first = builder.particle_count
+            builder.add_soft_mesh(
+                pos=wp.vec3(*offset[w]), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(0.0, 0.0, 0.0),
+                vertices=[wp.vec3(*v) for v in geometry.vert], indices=geometry.tets.ravel().tolist(), density=material.density,
+                k_mu=material.mu, k_lambda=material.lame, k_damp=0.0, particle_radius=size,
+            )  # fmt: skip
+            for i in geometry.fixed:
+                builder.particle_mass[first + i] = 0.0
+            body = builder.add_body(xform=wp.transform(wp.vec3(*(path[0] + offset[w])), wp.quat_identity()), is_kinematic=True)
+            config = newton.ModelBuilder.ShapeConfig(ke=CONTACT, kd=0.0, mu=material.friction)
+            builder.add_shape_sphere(body, radius=radius, cfg=config)
+        builder.color()
+        model = builder.finalize()
+        model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = CONTACT, 0.0, material.friction
+        solver = newton.solvers.SolverVBD(model, iterations=iterations, integrate_with_external_rigid_solver=True)
+        pipeline = newton.CollisionPipeline(model)
+        contacts, control = pipeline.contacts(), model.control()
+        now, then = model.state(), model.state()
+        points, shift = wp.array(path.astype(np.float32), dtype=wp.vec3), wp.array(offset.astype(np.float32), dtype=wp.vec3)
+        count = wp.ones(1, dtype=int)
+
+        def once(a, b):
+            for state in (a, b):
+                wp.launch(drive, worlds, [points, shift, count], [state.body_q])
+            a.clear_forces()
+            pipeline.collide(a, contacts)
+            solver.step(a, b, control, contacts, TIMESTEP)
+            wp.copy(a.particle_q, b.particle_q)
+            wp.copy(a.particle_qd, b.particle_qd)
+            wp.launch(advance, 1, [count])
+
+        at_rest = wp.clone(now.particle_q)
+        once(now, then)  # compiles
+        graph = None
+        if wp.get_device().is_cuda:
+            with wp.ScopedCapture() as capture:
+                once(now, then)
+            graph = capture.graph
+        wp.copy(now.particle_q, at_rest)
+        now.particle_qd.zero_()
+        count.fill_(1)
+        wp.synchronize_device()
+        setup = time.perf_counter() - begin
+        seconds, forces, outer = 0.0, [], np.unique(geometry.outer_face)
+        for k in range(len(path) - 1 + SETTLE):
+            began = time.perf_counter()
+            wp.capture_launch(graph) if graph else once(now, then)
+            wp.synchronize_device()
+            if k < len(path) - 1:
+                seconds += time.perf_counter() - began
+            x = now.particle_q.numpy().astype(float).reshape(worlds, -1, 3)[:, outer]
+            away = x - offset[:, None] - path[min(k + 1, len(path) - 1)]
+            distance = np.linalg.norm(away, axis=2)
+            depth = np.maximum(radius + size - distance, 0)
+            forces.append(-CONTACT * (depth / distance)[:, :, None] * away)
+            forces[-1] = forces[-1].sum(1)
+    steps = len(path) - 1
+    return {
+        "ms_per_step": 1e3 * seconds / steps,
+        "steps": steps,
+        "setup_s": setup,
+        "forces": np.array(forces[:steps]),
+        "force": forces[-1][0],
+    }
+
+
+def main():
+    from accuracy import write_json
+    from speed import INCREMENT, PEER_TRAVEL, RADIUS, standard_path
+
+    from biotac_mj.geometry import load_skin
+    from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--skin", default="default")
+    parser.add_argument("--iterations", default="10,100,1000", help="comma-separated")
+    parser.add_argument("--worlds", default="1", help="comma-separated")
+    parser.add_argument("--increments", type=int, default=round(PEER_TRAVEL / INCREMENT))
+    parser.add_argument("--json", type=pathlib.Path)
+    options = parser.parse_args()
+    if newton is None:
+        print("Newton is not installed: left out")
+        return
+    wp.config.log_level = wp.LOG_WARNING
+    geometry = load_skin(options.skin)
+    path, _ = standard_path(geometry, options.increments)
+    model = SkinModel(geometry, PRESETS["paper"], SkinOptions(element="linear", liquid=False, tolerance=1e-6, max_newton=60))
+    data, geoms = SkinData(model), GeomSet(["sphere"], [(RADIUS,)], [model.material.friction])
+    geoms.set_pose(path[:1])
+    ours = []
+    for center in path[1:]:
+        geoms.set_pose(center[None])
+        step(model, data, geoms)
+        ours.append(data.wrench[0, 0, :3].copy())
+    ours, rows = np.array(ours), []
+    for worlds in map(int, options.worlds.split(",")):
+        for iterations in map(int, options.iterations.split(",")):
+            result = press(geometry, PRESETS["paper"], RADIUS, path, iterations, worlds, options.device)
+            size = np.linalg.norm(ours[-1])
+            moving = np.linalg.norm(result["forces"][:, 0] - ours, axis=1).mean() / size
+            held = np.linalg.norm(result["force"] - ours[-1]) / size
+            rows.append(
+                {
+                    "device": wp.get_device(options.device).name,
+                    "solver": f"newton {VERSION} VBD",
+                    "skin": options.skin,
+                    "worlds": worlds,
+                    "iterations": iterations,
+                    "ms_per_step": result["ms_per_step"],
+                    "setup_s": result["setup_s"],
+                    "steps": result["steps"],
+                    "force_error_rel": float(moving),
+                    "force_error_held": float(held),
+                    "force_N": float(np.linalg.norm(result["force"])),
+                    "force_ours_N": float(size),
+                }
+            )
+            print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    if options.json:
+        write_json(options.json, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
