@@ -11,6 +11,8 @@ import math
 
 __all__ = ["FITTED", "Correction", "correction"]
 
+_TOUCH = 0.01  # squeezed share from which on the skin counts as squeezed
+
 
 @dataclasses.dataclass(frozen=True)
 class Correction:
@@ -20,6 +22,7 @@ class Correction:
       depth: h [m]. most: s_max. width: b [m]. stretch: k. squeeze: q.
       poissons_ratio: least and largest Poisson's ratio that was compared with the full FEM.
       squeezed: up to which share of its thickness the skin may be squeezed until the error exceeds what the docs state.
+      narrow: how far the forces of squeezed skin may be spread: wider, rubber is stiffer than the correction knows [m].
     """
 
     depth: float
@@ -29,6 +32,7 @@ class Correction:
     squeeze: float
     poissons_ratio: tuple = (0.0, 0.0)
     squeezed: float = 0.0
+    narrow: float = math.inf
 
     def softening(self, depth, spread, squeezed):
         """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed share."""
@@ -40,15 +44,16 @@ class Correction:
         """c at a pressure above that at rest [Pa]."""
         return 1 / (1 + max(pressure, 0.0) / (self.stretch * youngs_modulus))
 
-    def measured(self, poissons_ratio, squeezed) -> bool:
-        """Whether the error has been measured there."""
+    def measured(self, poissons_ratio, squeezed, spread=0.0) -> bool:
+        """Whether the error has been measured there and is not worse than the docs state; arguments as in `softening`."""
         low, high = self.poissons_ratio
-        return low <= poissons_ratio <= high and squeezed <= self.squeezed
+        wide = squeezed > _TOUCH and spread > self.narrow**2
+        return low <= poissons_ratio <= high and squeezed <= self.squeezed and not wide
 
 
 FITTED = {
     "corotational": Correction(6.1e-3, 2.6, 2.8e-3, 0.033, 0.0, (0.25, 0.4), 0.5),
-    "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 5.3, (0.4, 0.4999), 0.45),
+    "neo_hookean": Correction(5.0e-3, 1.8, 2.1e-3, 0.041, 5.3, (0.4, 0.4999), 0.45, 1.5e-3),
     "linear": Correction(math.inf, 1.0, 1.0, math.inf, 0.0, (0.0, 0.4), 1.0),
 }
 

@@ -88,7 +88,7 @@ class Step:
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
         self.softening, self.swelling = (memory.after + self.repeat * memory.drift).tolist()
-        self.after, self.squeezed = np.ones(2), 0.0
+        self.after, self.squeezed, self.spread = np.ones(2), 0.0, 0.0
         self._choose()
 
     def _choose(self):
@@ -159,7 +159,7 @@ class Step:
         s = self.skin
         outer = self.coordinate < 3 * len(s._outer)
         depth, spread, squeezed = s.strain(self.coordinate[outer] // 3, self.force[outer])
-        self.squeezed = squeezed
+        self.squeezed, self.spread = squeezed, spread
         softening = s.correction.softening(depth, spread, squeezed)
         return np.array([softening, s.correction.swelling(self.pressure, s.model.material.youngs_modulus)])
 
@@ -283,7 +283,7 @@ class Step:
         )
         memory = Memory(True, *now)
         volume = float(s._share.sum()) - s._cavity + s.model.rest.volume if s.model.inner is not None else 0.0
-        measured = s.correction.measured(s.model.material.poissons_ratio, self.squeezed)
+        measured = s.correction.measured(s.model.material.poissons_ratio, self.squeezed, self.spread)
         return Outcome(memory, wrench, tangent, s.rest + self.u, volume, measured, self.converged, self.iterations, self.error)
 
     def _change(self):
