@@ -44,6 +44,7 @@ def logistic(x, y):
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("json", nargs="+")
+    args.add_argument("--write", action="store_true", help="put the weights of the confidence into thresholds.py")
     args = args.parse_args(argv)
     rows = [r for f in args.json for r in json.loads(pathlib.Path(f).read_text())]
     quiet = [r for r in rows if r["kind"] in ("none", "wrong-base")]
@@ -81,7 +82,12 @@ def main(argv=None):
               + ", ".join(f"{k} {np.mean(v):.2f}" for k, v in gone.items()))  # fmt: skip
     data = names(rows)
     w = logistic([e["x"] for e in data], [e["right"] for e in data])
-    print("CONFIDENCE =", tuple(round(float(v), 3) for v in w), "of", len(data), "names,", sum(e["right"] for e in data), "right")
+    weights = tuple(round(float(v), 3) for v in w)
+    print("CONFIDENCE =", weights, "of", len(data), "names,", sum(e["right"] for e in data), "right")
+    if args.write:
+        path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/thresholds.py"
+        lines = [f"CONFIDENCE = {weights}" if line.startswith("CONFIDENCE = ") else line for line in path.read_text().splitlines()]
+        path.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
-from biotac_mj.discrepancy.catalogue import _memory, by_id
-from biotac_mj.discrepancy.effect import STAGES, Run
+from biotac_mj.discrepancy.catalogue import by_id
+from biotac_mj.discrepancy.effect import STAGES, Run, memory
 from biotac_mj.discrepancy.where import phases
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -108,7 +108,7 @@ def test_memory_is_the_solution_of_its_equation():
     exact = solve_ivp(lambda t, q: np.interp(t, run.time[:-1] + np.diff(run.time) / 2, np.diff(x) / np.diff(run.time)) * 0
                       + (np.diff(x) / np.diff(run.time))[min(np.searchsorted(run.time, t, "right") - 1, len(x) - 2)] - q / 0.4,
                       (0, 4), [0.0], t_eval=run.time, max_step=0.002)  # fmt: skip
-    np.testing.assert_allclose(_memory(run, x, 0.4), exact.y[0], atol=2e-3)
+    np.testing.assert_allclose(memory(run, x, 0.4), exact.y[0], atol=2e-3)
 
 
 def test_relaxation_of_a_step_is_the_prony_series():
@@ -249,26 +249,56 @@ def test_generator_and_fitter_share_no_code():
 
 
 def test_trajectories_are_read_from_a_data_set(tmp_path):
-    from biotac_mj.data.schema import Interaction
-    from biotac_mj.data.store import write_shard
-    from biotac_mj.discrepancy import read_trajectories
+    from biotac_mj.discrepancy import read_trajectories, write_trajectories
 
-    rows = []
-    for t in measured([], n=2):
-        n = len(t.time)
-        counts = np.full((n, 23), np.nan, np.float32)
-        counts[:, :19], counts[:, 19] = t.electrodes, t.pdc
-        wrench = np.concatenate([t.force, np.zeros((n, 3))], axis=1).astype(np.float32)
-        rows.append(
-            Interaction(t.id, t.tool, "recorded", "train", 0, {"clock": t.clock}, t.time, indenter_pos=t.pos,
-                        indenter_quat=np.tile([1.0, 0, 0, 0], (n, 1)), measured_counts=counts, measured_wrench=wrench)
-        )  # fmt: skip
-    write_shard(tmp_path / "shard-00000.h5", rows)
-    again = read_trajectories(tmp_path)
-    for a, b in zip(again, measured([], n=2)):
-        assert a.id == b.id and abs(a.clock - b.clock) < 1e-9 and a.tdc is None
+    data = measured([], n=2)
+    data[1] = Trajectory(**{**data[1].__dict__, "tdc": np.linspace(1800, 1812, len(data[1].time)), "force": None})
+    write_trajectories(tmp_path / "measured.h5", data)
+    again = read_trajectories(tmp_path / "measured.h5")
+    for a, b in zip(again, data):
+        assert a.id == b.id and abs(a.clock - b.clock) < 1e-9
+        assert (a.tdc is None, a.force is None) == (b.tdc is None, b.force is None)
         np.testing.assert_allclose(a.electrodes, b.electrodes)
-        np.testing.assert_allclose(a.force, b.force, atol=1e-6)
         np.testing.assert_allclose(a.depth, b.depth, atol=1e-12)
+    np.testing.assert_allclose(again[0].force, data[0].force, atol=1e-6)
+    np.testing.assert_allclose(again[1].tdc, data[1].tdc, rtol=1e-6)
     with pytest.raises(FileNotFoundError, match="give an HDF5 file or folder"):
         read_trajectories(tmp_path / "none.h5")
+
+
+@pytest.mark.slow
+def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
+    """From measured.h5 (synthetic: this project's skin, a hidden low-pass, another modulus) to the amended sensor."""
+    import json
+    import sys
+
+    from biotac_mj.cli import main
+    from biotac_mj.discrepancy import write_trajectories
+
+    sys.path.insert(0, str(ROOT / "examples"))
+    from find_the_missing_effect import measure, presses
+
+    sim = Simulator(cache=str(tmp_path / "report/fields"))
+    sim.save(tmp_path / "sensor.yaml")
+    effect = by_id("lowpass")
+    write_trajectories(tmp_path / "measured.h5", measure(sim, presses(12, 0), (effect, {"tau": 0.08}), 1))
+    assert (
+        main(
+            [
+                "diagnose",
+                str(tmp_path / "measured.h5"),
+                "--sensor",
+                str(tmp_path / "sensor.yaml"),
+                "--out",
+                str(tmp_path / "report"),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
+    verdict = json.loads((tmp_path / "report/verdict.json").read_text())
+    assert [e["id"] for e in verdict["effects"]] == ["lowpass"] and verdict["share_closed"] > 0.8
+    low, high = verdict["effects"][0]["parameters"][0]["interval95"]
+    assert low < 0.08 < high
+    assert "low-pass" in capsys.readouterr().out and "<img" in (tmp_path / "report/report.html").read_text()
+    assert load_simulator(tmp_path / "report/sensor_amended.yaml").effects[0][0].id == "lowpass"

@@ -14,6 +14,7 @@ _HOME = {
     "load_simulator": "simulator",
     "read_recording": "recording",
     "read_trajectories": "trajectories",
+    "write_trajectories": "trajectories",
 }
 
 __all__ = list(_HOME)

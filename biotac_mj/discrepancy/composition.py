@@ -86,7 +86,7 @@ def compose(comparison, null, usable, chosen, seed, tick=lambda: None):
 
 
 def _ahead(lead):
-    return bool(lead.mean() > lead.std(ddof=1) / np.sqrt(len(lead)))
+    return bool(lead.mean() > THRESHOLDS["tie"] * lead.std(ddof=1) / np.sqrt(len(lead)))
 
 
 def _rank(best, step):
@@ -128,7 +128,7 @@ def _left_out(comparison, whole, chosen, seed, folds=3):
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
-        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, shapes=False)
+        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole)
         values = evidence(fit.residuals(comparison))
         out[chosen[fold == f]] = values[chosen[fold == f]]
     return out

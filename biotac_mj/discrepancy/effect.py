@@ -18,10 +18,12 @@ import dataclasses
 
 import numpy as np
 
-__all__ = ["STAGES", "Effect", "Param", "Run"]
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
 STAGES = {"S": "set-up", "B": "boundary", "K": "contact", "C": "constitutive", "T": "transduction", "A": "acquisition"}
+
+LAW = 0.08  # reduced laws: what practice data with other forms of the same effects showed (benchmarks/discrepancy_calibrate.py)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +101,7 @@ class Effect:
     id = name = stage = physics = ""
     params: dict = {}
     confusable: dict = {}
+    law = 0.0  # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its interval
     grid: tuple = ({},)
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -120,3 +123,13 @@ class Effect:
     def default(self) -> dict:
         """Parameters without effect, shape parameters from the first entry of the grid."""
         return {**{n: p.start for n, p in self.params.items()}, **self.grid[0]}
+
+
+def memory(run, x, tau):
+    """(n, ...) x less its exponential memory: what has changed within about tau."""
+    out = np.zeros_like(x)
+    for i in range(1, len(x)):
+        a = np.exp(-(run.time[i] - run.time[i - 1]) / tau)
+        h = (1 - a) * tau / max(run.time[i] - run.time[i - 1], 1e-12)  # exact for x linear in between
+        out[i] = a * out[i - 1] + h * (x[i] - x[i - 1])
+    return out

@@ -34,10 +34,11 @@ class Fit:
         return comparison.raw(self.effects, self.nuisance, exact)
 
     def interval(self, k):
-        """95 % interval of free parameter k, from the covariance by trajectory."""
+        """95 % interval of free parameter k, from the covariance by trajectory and what the effect says of its law."""
         effect, name = self.names[k]
         value = next(th for e, th in self.effects if e.id == effect)[name]
-        half = 1.96 * float(np.sqrt(max(self.covariance[k, k], 0)))
+        law = next(e.law for e, _ in self.effects if e.id == effect) * value
+        half = 1.96 * float(np.sqrt(max(self.covariance[k, k], 0) + law**2))
         return value - half, value + half
 
 
@@ -51,16 +52,16 @@ def evidence(residuals) -> np.ndarray:
     return np.array([-0.5 * len(r) * np.log(max(float((r**2).mean()), 0.05)) for r in residuals])
 
 
-def fit_effects(comparison, effects, keep=None, start=None, shapes=True) -> Fit:
+def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
     """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
 
     Args:
-      keep: trajectories to use (indices), None all. start: Fit whose parameters to start from. shapes: polish shape parameters too.
+      keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
     """
     keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
     names, scale, low, high, x0 = [], [], [], [], []
     for effect, theta in effects:
-        free = effect.free + ([n for n, p in effect.params.items() if p.shape] if shapes else [])
+        free = effect.free + [n for n, p in effect.params.items() if p.shape]
         for name in free:
             p = effect.params[name]
             names.append((effect.id, name))

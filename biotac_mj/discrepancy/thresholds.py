@@ -9,12 +9,13 @@ __all__ = ["THRESHOLDS", "confidence", "threshold_hash"]
 
 THRESHOLDS = {
     "p": 0.02,  # sign flips over trajectories
-    "gain": 1.0,  # [nats per trajectory] mean gain of evidence on trajectories left out
+    "gain": 0.7,  # [nats per trajectory] mean gain of evidence on trajectories left out
     "share": 0.15,  # of the closable log mean square that one effect has to close
-    "energy": 0.02,  # of the mean square that all effects take away, that each has to take away by itself
+    "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "named": 0.7,  # of the closable log mean square that all have to close, else the rest is unknown
-    "significant": 2.0,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
-    "peak": 4.0,  # the same of the worst channel
+    "significant": 1.1,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
+    "peak": 2.5,  # the same of the worst channel
+    "tie": 1.64,  # standard errors over trajectories by which a name has to lead, else the other is named with it
     "most": 3,  # effects
     "refit": 6,  # effects that are refitted after the screen
 }

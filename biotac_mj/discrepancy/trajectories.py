@@ -7,7 +7,7 @@ import numpy as np
 
 from .timeline import noise_level
 
-__all__ = ["Trajectory", "measurement_noise", "read_trajectories"]
+__all__ = ["Trajectory", "measurement_noise", "read_trajectories", "write_trajectories"]
 
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 
@@ -116,6 +116,31 @@ def read_trajectories(path) -> list[Trajectory]:
     if not out:
         raise ValueError(f"{path} has no measured counts: only labelled interactions can be compared with the simulation")
     return out
+
+
+def write_trajectories(path, trajectories) -> None:
+    """Writes one HDF5 file that `biotac diagnose` and `read_trajectories` read; what was not measured is stored as nan."""
+    from scipy.spatial.transform import Rotation
+
+    from ..data.schema import Interaction
+    from ..data.store import write_shard
+
+    rows = []
+    for t in trajectories:
+        n = len(t.time)
+        counts, wrench = np.full((n, 23), np.nan, np.float32), np.full((n, 6), np.nan, np.float32)
+        counts[:, :19] = t.electrodes
+        for column, values in ((19, t.pdc), (21, t.tdc)):
+            if values is not None:
+                counts[:, column] = values
+        if t.force is not None:
+            wrench[:, :3] = t.force
+        quat = np.roll(Rotation.from_matrix(t.mat).as_quat(), 1, axis=1)
+        rows.append(
+            Interaction(t.id, t.tool, "recorded", "train", 0, {"clock": float(t.clock)}, t.time, indenter_pos=t.pos,
+                        indenter_quat=quat, measured_counts=counts, measured_wrench=wrench)
+        )  # fmt: skip
+    write_shard(pathlib.Path(path), rows)
 
 
 def measurement_noise(trajectories) -> dict:
