@@ -240,3 +240,45 @@ def test_command_line_errors(capsys):
     assert cli.main(["compare", "--data", "press.csv"]) == 2
     assert "INDENTER=FILE" in capsys.readouterr().err
     assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
+
+
+def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
+    """What was finished is not made again; other settings start anew; the table is that of a run in one go."""
+    from biotac_mj.calibration import verbs
+
+    calls = []
+
+    def calibrated(body, *args, **kwargs):
+        calls.append(body.name)
+        if body.name == "shell_with_core" and calls.count(body.name) == 1:
+            raise KeyboardInterrupt
+        return Fitted()
+
+    monkeypatch.setattr(verbs, "calibrate", calibrated)
+    monkeypatch.setattr(verbs, "calibration_table", lambda fitted: "fitted")
+    monkeypatch.setattr(verbs, "stand_in", lambda plan, **settings: dataclasses.replace(plan, force=np.ones_like(plan.force)))
+    monkeypatch.setattr(verbs, "references", lambda plans, progress, **settings: calls.append("reference") or plans)
+    given = ["compare", "--configurations", "deformable_shell", "shell_with_core", "--indenters", "sphere_7mm", "--out", str(tmp_path)]
+    monkeypatch.setattr(verbs, "evaluate", lambda body, material, *rest: _compared(body.name, material))
+    assert cli.main(given) != 0  # stopped
+    assert calls == ["reference", "deformable_shell", "shell_with_core"] and not (tmp_path / "compare.json").exists()
+    assert cli.main(given) == 0
+    assert calls[3:] == ["shell_with_core"] and "goes on after reference" in capsys.readouterr().out
+    assert cli.main([*given, "--seed", "1"]) == 0
+    assert calls[4:] == ["reference", "deformable_shell", "shell_with_core"]
+    (tmp_path / "compare.kept").write_bytes(b"cut short")
+    assert cli.main(given) == 0 and calls[7:] == ["reference", "deformable_shell", "shell_with_core"]
+
+
+@dataclasses.dataclass
+class Fitted:
+    """In place of a Calibration, which takes minutes."""
+
+    material: Material = TRUTH
+    mean: float = 0.1
+
+
+def _compared(name, material):
+    from biotac_mj.calibration.comparison import Comparison
+
+    return Comparison(name, Fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, 1e-5, 0, 1, [])

@@ -9,11 +9,14 @@ from .comparison import PAPER, comparison_table, evaluate, plan_indentations, re
 from .configurations import CONFIGURATIONS, configuration
 from .fit import calibrate
 from .indentation import plan_shear, read_indentation, write_indentation
+from .kept import Kept
 from .reference import STAND_IN, stand_in
 from .refinement import refined
 from .report import calibration_table, read_material, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
+
+_NO_SETTINGS = ("configurations", "out", "quiet", "device", "verb")  # what finished parts of a comparison do not depend on
 
 
 def _material(text):
@@ -44,35 +47,55 @@ def calibrate_verb(args) -> None:
 
 
 def compare_verb(args) -> None:
-    """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be.
+
+    Called again with the same settings and folder it goes on where it was stopped.
+    """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
     chosen = [configuration(name, args.skin if CONFIGURATIONS[name][0] is None else "coarse",
                             liquid=args.liquid and CONFIGURATIONS[name][0] is None) for name in args.configurations]  # fmt: skip
     given = args.material and _material(args.material)
+    out = pathlib.Path(args.out)
+    settings = {k: v for k, v in vars(args).items() if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS}
+    if args.data:
+        files = [pathlib.Path(text.partition("=")[2]) for text in args.data]
+        settings["read"] = [file.stat().st_mtime_ns for file in files if file.is_file()]
+    kept = Kept(out / "compare.kept", settings | {"given": given})
+    if kept.names and not args.quiet:
+        print(f"goes on after {', '.join(kept.names)} (kept in {out / 'compare.kept'}; remove it to start anew)")
     if args.data:
         cases = [_measured(text) for text in args.data]
         calibration, cases = (None, cases) if given else (cases[0], cases[1:])
         reference = "measured data"
     else:
-        settings = dict(material=args.reference_material, skin=args.reference_skin, element=args.reference_element, device=args.device)
+        truth = dict(material=args.reference_material, skin=args.reference_skin, element=args.reference_element, device=args.device)
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
-            cases = references(plans, bar.update, **settings)
-        calibration = None if given else stand_in(plan_shear(), **settings)
+            cases = kept.get("reference", lambda: references(plans, bar.update, **truth))
+        calibration = None if given else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
         reference = f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin {args.reference_skin})"
     results = []
     for body in chosen:
-        fitted = None if given else calibrate(body, material("paper"), calibration, device=args.device, progress=not args.quiet)
-        with _bar(body.name, len(cases), args.quiet) as bar:
-            results.append(evaluate(body, given or fitted.material, cases, fitted, args.device, bar.update))
-    out = pathlib.Path(args.out) / "compare.json"
-    write_json({"reference": reference, "paper": PAPER, "configurations": results}, out)
+        results.append(kept.get(body.name, lambda body=body: _compared(body, given, calibration, cases, kept, args)))
+    write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
     for result in results:
         m = result.material
         print(f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, mu {m.friction:.4f}")
     print(comparison_table(results, reference))
-    print(f"wrote {out}")
+    print(f"wrote {out / 'compare.json'}")
+
+
+def _compared(body, given, calibration, cases, kept, args):
+    """Calibrates a configuration, unless its material is given, and evaluates it."""
+    fitted = None
+    if not given:
+        settings = dict(device=args.device, progress=not args.quiet)
+        fitted = kept.get(f"calibration of {body.name}", lambda: calibrate(body, material("paper"), calibration, **settings))
+        if not args.quiet:
+            print(f"{body.name}\n{calibration_table(fitted)}", flush=True)
+    with _bar(body.name, len(cases), args.quiet) as bar:
+        return evaluate(body, given or fitted.material, cases, fitted, args.device, bar.update)
 
 
 def _measured(text):
