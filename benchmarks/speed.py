@@ -33,6 +33,7 @@ import warp as wp
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 import peer_flex
+import peer_newton
 from accuracy import write_json
 
 from biotac_mj.approach import nearest_point, surface_point
@@ -48,6 +49,7 @@ INCREMENT = 4e-5  # [m]
 INCREMENTS = 60
 TIGHT = 1e-6  # tolerance of the press that force errors are measured against
 PEER_TRAVEL = 1e-3  # [m]; deeper the skin meets the core, which the flex does not have
+NEWTON_ITERATIONS = (10, 100)
 COLUMNS = (
     "device",
     "solver",
@@ -304,6 +306,30 @@ def time_peer(ours: dict) -> dict:
     }
 
 
+def time_newton(ours: dict, iterations: int) -> dict:
+    """Newton's VBD on the mesh and path of one of our rows of linear elements, to where the core would be met; its row."""
+    increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
+    path, _ = standard_path(load_skin(ours["skin"]), increments)
+    result = peer_newton.press(load_skin(ours["skin"]), PRESETS["paper"], RADIUS, path, iterations, ours["worlds"], ours["device"])
+    wanted = np.array(ours["force"][:increments])
+    wrong = np.linalg.norm(result["forces"][:, 0] - wanted, axis=1).mean()
+    return {
+        "device": ours["device"],
+        "solver": f"newton VBD x{iterations}",
+        "skin": ours["skin"],
+        "element": "linear",
+        "tier": "full",
+        "liquid": False,
+        "worlds": ours["worlds"],
+        "ms_per_press": result["ms_per_step"] * ours["increments"],
+        "ms_per_step": result["ms_per_step"],
+        "setup_s": result["setup_s"],
+        "force_error_rel": float(wrong / np.linalg.norm(wanted, axis=1).max()),
+        "increments": ours["increments"],
+        "travel_m": increments * INCREMENT,
+    }
+
+
 def _cpu_name() -> str:
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -336,7 +362,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--tolerances", default=str(SkinOptions.tolerance), help="comma-separated tolerances of the solver")
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
     parser.add_argument("--references", type=pathlib.Path, help="folder that keeps the tight presses that errors are measured against")
-    parser.add_argument("--no-peer", action="store_true", help="leave MuJoCo's flex out")
+    parser.add_argument("--no-peer", action="store_true", help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out")
     options = parser.parse_args(arguments)
     skins = options.skins.split(",")
     if unknown := [skin for skin in skins if skin not in SKINS]:
@@ -380,6 +406,14 @@ def main(arguments=None) -> int:
                 f"  flex / ours over this travel: {peer['ratio_ms_per_step']:.1f} in wall time, {peer['ratio_cpu']:.1f} in processor time"
             )
             rows.append(peer)
+    if not options.no_peer and options.device != "cpu":
+        mine = [row for row in rows if (row["element"], row["liquid"], row["worlds"]) == ("linear", False, 1) and "force" in row]
+        if peer_newton.VERSION is None:
+            print("Newton is not installed: its peer is left out")
+            mine = []
+        for ours, iterations in itertools.product(mine, NEWTON_ITERATIONS):
+            rows.append({**time_newton(ours, iterations), "machine": machine})
+            _print_row(rows[-1])
     write_json(options.json, {"rows": rows})
     return 0
 
