@@ -16,7 +16,7 @@ from .simulator import Simulator, _impedance, _sphere_radius
 __all__ = ["InSkinSimulator", "memory_of", "solve_with_memory"]
 
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
-_ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and beta of Ogden and Roxburgh: with W_max of kJ/m^3 softening is 0.98 / r at no load
+_ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
 
 
 def memory_of(effects):
@@ -28,7 +28,7 @@ def memory_of(effects):
         elif effect.id == "creep":
             prony += [(max(theta["n"], 0.0) * np.log(10**0.5), tau) for tau in _TAUS]
         elif effect.id == "mullins" and theta["softening"] > 0:
-            mullins = (1 / theta["softening"], _ENERGY, _SHARE)
+            mullins = (1 / theta["softening"], _ENERGY, theta.get("width", _SHARE))
         else:
             rest.append((effect, theta))
     return {"prony": tuple(p for p in prony if p[0] > 0), "mullins": mullins}, rest

@@ -1,0 +1,52 @@
+"""Constitutive effects inside the finite elements: what goes into the material, and agreement with the reduced form where that is exact."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from biotac_mj.discrepancy.catalogue import by_id
+from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
+from biotac_mj.discrepancy.trajectories import Trajectory
+
+
+def test_effects_become_what_the_material_remembers():
+    effects = [(by_id("relax"), {"g": 0.2, "tau": 3.0}), (by_id("gain"), {}), (by_id("mullins"), {"softening": 0.25, "width": 0.7})]
+    memory, rest = memory_of(effects)
+    assert memory == {"prony": ((0.2, 3.0),), "mullins": (4.0, 1.0, 0.7)} and [e.id for e, _ in rest] == ["gain"]
+    # a power law of slope -n between the shortest and the longest of its times
+    memory, _ = memory_of([(by_id("creep"), {"n": 0.05})])
+    g, tau = np.array(memory["prony"]).T
+    t = np.geomspace(0.1, 10, 30)
+    slope = np.polyfit(np.log(t), np.log(1 + np.exp(-t[:, None] / tau) @ g), 1)[0]
+    assert slope == pytest.approx(-0.05, rel=0.25)
+    assert memory_of([(by_id("relax"), {"g": 0.0, "tau": 1.0})])[0]["prony"] == ()
+
+
+def test_the_condensed_tier_is_refused():
+    with pytest.raises(ValueError, match="needs tier='full'"):
+        InSkinSimulator(tier="condensed")
+
+
+@pytest.mark.slow
+def test_held_skin_relaxes_as_the_reduced_form_and_keeps_a_dent_after_release():
+    t = np.concatenate([np.linspace(0, 0.8, 5), np.linspace(1.2, 2.8, 5), [2.9, 3.0, 3.1]])
+    depth = np.interp(t, [0, 0.8, 2.8, 3.0], [-0.1e-3, 0.8e-3, 0.8e-3, -0.3e-3])
+    from biotac_mj.geometry import load_skin
+
+    vert = load_skin("coarse").vert
+    surface = vert[(abs(vert[:, 0] + 12e-3) < 2e-3) & (abs(vert[:, 2]) < 2e-3), 1].min()
+    pos = np.column_stack([np.full(len(t), -12e-3), surface + depth, np.zeros(len(t))])
+    press = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+    sim = InSkinSimulator()
+    effects = [(by_id("relax"), {"g": 0.4, "tau": 0.8})]
+    plain, inside = sim.run([press], effects=[])[0], sim.run([press], effects=effects)[0]
+    reduced = dataclasses.replace(plain)
+    reduced.force, reduced.pressure = plain.force.copy(), plain.pressure.copy()
+    effects[0][0].apply(reduced, effects[0][1])
+    held = slice(4, 10)
+    np.testing.assert_allclose(inside.normal_force[held], reduced.normal_force[held], rtol=0.02)
+    assert inside.normal_force[4] > 1.1 * plain.normal_force[4]
+    np.testing.assert_allclose(inside.counts[held], plain.counts[held], atol=2)
+    assert plain.normal_force[-2] == 0 and abs(inside.counts[-2] - plain.counts[-2]).max() > 5  # the dent heals after the object has gone
+    assert abs(inside.counts[-1] - plain.counts[-1]).max() < abs(inside.counts[-2] - plain.counts[-2]).max()
