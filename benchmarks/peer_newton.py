@@ -22,7 +22,7 @@ try:
 except ImportError:
     newton = None
 
-__all__ = ["VERSION", "press"]
+__all__ = ["VERSION", "press", "time_newton"]
 
 VERSION = newton and getattr(newton, "__version__", "?")
 TIMESTEP = 2e-3  # [s]
@@ -118,6 +118,35 @@ def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0
         "setup_s": setup,
         "forces": np.array(forces[:steps]),
         "force": forces[-1][0],
+    }
+
+
+def time_newton(ours: dict, iterations: int) -> dict:
+    """Newton's VBD on the mesh and path of one of our rows of linear elements, to where the core would be met; its row."""
+    from speed import INCREMENT, PEER_TRAVEL, RADIUS, standard_path
+
+    from biotac_mj.geometry import load_skin
+    from biotac_mj.skin import PRESETS
+
+    increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
+    path, _ = standard_path(load_skin(ours["skin"]), increments)
+    result = press(load_skin(ours["skin"]), PRESETS["paper"], RADIUS, path, iterations, ours["worlds"], ours["device"])
+    wanted = np.array(ours["force"][:increments])
+    wrong = np.linalg.norm(result["forces"][:, 0] - wanted, axis=1).mean()
+    return {
+        "device": ours["device"],
+        "solver": f"newton VBD x{iterations}",
+        "skin": ours["skin"],
+        "element": "linear",
+        "tier": "full",
+        "liquid": False,
+        "worlds": ours["worlds"],
+        "ms_per_press": result["ms_per_step"] * ours["increments"],
+        "ms_per_step": result["ms_per_step"],
+        "setup_s": result["setup_s"],
+        "force_error_rel": float(wrong / np.linalg.norm(wanted, axis=1).max()),
+        "increments": ours["increments"],
+        "travel_m": increments * INCREMENT,
     }
 
 

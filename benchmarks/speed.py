@@ -306,30 +306,6 @@ def time_peer(ours: dict) -> dict:
     }
 
 
-def time_newton(ours: dict, iterations: int) -> dict:
-    """Newton's VBD on the mesh and path of one of our rows of linear elements, to where the core would be met; its row."""
-    increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
-    path, _ = standard_path(load_skin(ours["skin"]), increments)
-    result = peer_newton.press(load_skin(ours["skin"]), PRESETS["paper"], RADIUS, path, iterations, ours["worlds"], ours["device"])
-    wanted = np.array(ours["force"][:increments])
-    wrong = np.linalg.norm(result["forces"][:, 0] - wanted, axis=1).mean()
-    return {
-        "device": ours["device"],
-        "solver": f"newton VBD x{iterations}",
-        "skin": ours["skin"],
-        "element": "linear",
-        "tier": "full",
-        "liquid": False,
-        "worlds": ours["worlds"],
-        "ms_per_press": result["ms_per_step"] * ours["increments"],
-        "ms_per_step": result["ms_per_step"],
-        "setup_s": result["setup_s"],
-        "force_error_rel": float(wrong / np.linalg.norm(wanted, axis=1).max()),
-        "increments": ours["increments"],
-        "travel_m": increments * INCREMENT,
-    }
-
-
 def _cpu_name() -> str:
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -412,7 +388,7 @@ def main(arguments=None) -> int:
             print("Newton is not installed: its peer is left out")
             mine = []
         for ours, iterations in itertools.product(mine, NEWTON_ITERATIONS):
-            rows.append({**time_newton(ours, iterations), "machine": machine})
+            rows.append({**peer_newton.time_newton(ours, iterations), "machine": machine})
             _print_row(rows[-1])
     write_json(options.json, {"rows": rows})
     return 0
