@@ -1,6 +1,6 @@
 """Time per step of a Shadow Hand with 1 to 5 BioTacs, of which none, some or all touch something, for both tiers.
 
-    MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands.json [--tiers condensed,full] [--steps 40] [--markdown]
+    MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands.json [--tiers condensed,full] [--steps 40]
 
 A ball of 10 mm radius that does not move is pushed 0.6 mm into the pad of each finger that touches; the hand is held by its servos, with
 no gravity. Milliseconds of processor time of the thread per mj_step of 4 ms, median and mean over the steps: the film of the electrodes is

@@ -25,10 +25,11 @@ OBJECTS = {  # MuJoCo's geom type and sizes [m], mass [kg]
 PAD = np.array([-0.010, -0.0082, 0.0])  # middle of the pad in the BioTac frame [m]
 STAND = 0.04  # height of the post under the object, so that the thumb fits below its middle [m]
 TIMESTEP = 4e-3
-CLOSE, SQUEEZE, LIFT, HOLD = 0.6, 0.4, 0.8, 0.3  # [s]
+CLOSE, SQUEEZE, LIFT, HOLD = 0.6, 0.6, 0.8, 0.3  # [s]
 CLEAR = 0.016  # of the middle links' axes from the object [m]: they are 9 to 10 mm thick
-GRIP = 80  # counts of PDC above rest that a finger presses with; the thumb balances them
+HELD = 0.05  # [N] a tip with more holds the object
 FELT = 12  # counts of PDC above rest that say: this finger touches
+THUMB, FINGER = 200, 18  # counts above rest with which the thumb presses, and that no finger may fall below
 
 
 def menagerie():
@@ -141,6 +142,7 @@ class Grasp:
         thumb = np.array([f == "th" for f in self.handles])
         preferred = np.clip(self._preferred(), low + 1e-3, high - 1e-3)
         place = np.array([-0.36, 0.0, self.center[2] + 0.08])
+        rise = -0.003 if self.kind == "sphere" else 0.004  # of the pads over the object's middle [m]
         side = np.where(thumb, -1.0, 1.0)  # the thumb comes from -x, the fingers from +x
 
         def residual(x):
@@ -151,21 +153,27 @@ class Grasp:
             return np.concatenate([
                 200 * (distance - gap), 1.5 * (out + normal).ravel(), 100 * np.minimum(side * point[:, 0] - 0.5 * self.size[0], 0),
                 200 * np.minimum(self.surface(knuckle, thumb)[0] - CLEAR, 0),
-                40 * (point[:, 2] - self.center[2] + 0.003), 200 * np.minimum(fingers[:-1] - fingers[1:] - 0.0155, 0),
-                60 * (point[thumb, 1] - fingers.mean()), 60 * fingers.mean()[None], 0.1 * (x[:-3] - preferred),
+                40 * (point[:, 2] - self.center[2] - rise), 200 * np.minimum(fingers[:-1] - fingers[1:] - 0.0155, 0),
+                60 * (point[thumb, 1] - fingers.mean()), 60 * fingers.mean()[None], 60 * point[thumb, 1], 0.1 * (x[:-3] - preferred),
                 0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]]),
             ])  # fmt: skip
 
         return self._least_squares(residual, np.append(preferred, place), np.append(low, place - 0.1), np.append(high, place + 0.1))
 
     def move(self, near, by):
-        """The same with every pad moved `by` [m] along the surface's normal, from a solution, whose place is kept."""
+        """The same with every pad moved `by` [m] along the surface's normal, from a solution, whose place is kept.
+
+        Inwards the thumb bends its last joint: what it presses against then pushes its other links away from the object.
+        """
         point, out = self._place(near)
-        goal = point + by * self.surface(point, np.array([f == "th" for f in self.handles]))[1]
+        thumb = np.array([f == "th" for f in self.handles])
+        goal = point + by * self.surface(point, thumb)[1]
+        held = np.array(["THJ" in n and not n.endswith("THJ1") for n in self.names]) & (by < 0)
+        stay, face = np.append(np.where(held, 10.0, 0.3), [0.3] * 3), np.where(thumb & (by < 0), 0.0, 1.0)[:, None]
 
         def residual(x):
             there, facing = self._place(x)
-            return np.concatenate([200 * (there - goal).ravel(), (facing - out).ravel(), 0.3 * (x - near),
+            return np.concatenate([200 * (there - goal).ravel(), (face * (facing - out)).ravel(), stay * (x - near),
                                    0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]])])  # fmt: skip
 
         low, high = self.model.jnt_range[self.joint].T
@@ -225,9 +233,10 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         pdc = np.array([h.read(data, "pdc")[0] for h in handles.values()])
         if data.time < CLOSE:  # who feels the object waits for the others
             closing += np.where(pdc - rest < FELT, 0.7 * TIMESTEP / CLOSE, 0.0)
-        else:  # then each presses until it feels its share, and goes on adjusting while the hand lifts
-            wanted = np.where(thumb, 1.6, 1.0) * GRIP
-            closing = np.clip(closing + TIMESTEP * np.clip(2.5 * (wanted - pdc + rest) / wanted, -0.5, 1.5), 0.0, np.where(thumb, 1.3, 2.0))
+        else:  # then the thumb presses the object against the fingers; these stay where they are, and follow where they would lose it
+            wanted = np.where(thumb, THUMB, FINGER)
+            closing += TIMESTEP * np.clip(2.5 * (wanted - pdc + rest) / wanted, np.where(thumb, -0.5, 0.0), 1.5)
+            closing = np.minimum(closing, 2.0)
         c = closing[owner]
         data.ctrl[hand] = (way[1] + np.where(c < 0.5, (1 - 2 * c) * (way[0] - way[1]), (2 * c - 1) * (way[2] - way[1])))[hand]
         data.ctrl[z] = touch[nj + 2] + height * np.clip((data.time - CLOSE - SQUEEZE) / LIFT, 0, 1)
@@ -304,9 +313,10 @@ def main(arguments=None):
         screen.__exit__()
     if options.traces:
         draw_traces(result, options.traces, options.object)
-    touching = [f for f, force in zip(FINGERS, result["force"][-1]) if force > 0.05]
+    touching = [f for f, force in zip(FINGERS, result["force"][-1]) if force > HELD]
+    all_hold = (result["force"] > HELD).all(axis=1)[result["time"] > CLOSE + SQUEEZE]
     print(f"{options.object}: lifted by {1e3 * result['height'][-1]:.0f} mm, held by {', '.join(touching) or 'nothing'}; "
-          f"forces {np.round(result['force'][-1], 2)} N")  # fmt: skip
+          f"all five tips hold it in {100 * all_hold.mean():.0f} % of the lift; forces {np.round(result['force'][-1], 2)} N")  # fmt: skip
     return result
 
 

@@ -190,11 +190,13 @@ def test_bad_hands(settings, text):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "cube", "can"])
 def test_shadow_hand_lifts(name, monkeypatch, repo):
-    """The example's hand lifts each object by most of its own lift, with at least three fingertips on it, thumb or palm helping."""
+    """The example's hand lifts each object by most of its own lift, held by all five fingertips nearly all the way."""
     from test_examples import load
 
     monkeypatch.setenv("MENAGERIE_ROOT", str(shadow_folder().parent))
-    result = load(repo, "shadow_hand_grasp").run(name, progress=False)
-    assert result["height"][-1] > 0.05
-    assert (result["force"][-1] > 0.05).sum() >= 3
+    example = load(repo, "shadow_hand_grasp")
+    result = example.run(name, progress=False)
+    assert result["height"][-1] > 0.07
+    lifting = result["time"] > example.CLOSE + example.SQUEEZE
+    assert (result["force"] > example.HELD).all(axis=1)[lifting].mean() > 0.9 and (result["force"][-1] > 0.1).all()
     assert (np.abs(result["counts"] - result["counts"][0]).max(axis=(0, 2)) > 20).sum() >= 4
