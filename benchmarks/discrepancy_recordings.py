@@ -21,7 +21,7 @@ import numpy as np
 __all__ = ["EFFECTS", "SEEDS", "bases", "hide", "make_case", "score"]
 
 REAL = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
-SEEDS = {"development": 0, "practice": 100_000, "blind": 900_000}
+SEEDS = {"development": 0, "practice": 100_000, "blind": 900_000, "second blind": 1_700_000}
 NATURAL = {"loaded, real": {"warmup", "lowpass", "latency", "relax", "hyster"}, "unloaded, real": {"warmup"}}
 PLACES = np.array([[-14.5, 71], [-9.6, 44], [-6.1, 44], [-4.3, 71], [-1.8, 44], [1.1, 71], [-17, 0], [-15.3, 30], [-15.3, -30], [-13.6, 0],
                    [-14.5, -71], [-9.6, -44], [-6.1, -44], [-4.3, -71], [-1.8, -44], [1.1, -71], [-9.5, 0], [-2.5, 0], [1.3, 0]])  # fmt: skip  # noqa: E501

@@ -12,7 +12,7 @@ __all__ = ["Drift", "GainChange"]
 # Nats under load. The place of a contact wanders too and bends the electrodes' relations, on recordings without effect up to 82 nats' worth
 # (practice seeds); a fault stands out of what the other electrodes seem to do.
 _SLOW, _ALONE = 90.0, 2.0
-_STAYS, _GOES = 35.0, 80.0  # a gain that changes and stays so; one that comes and goes
+_STAYS, _GOES = 50.0, 80.0  # a gain that changes and stays so; one that comes and goes
 
 
 class Drift(TimeShaped):

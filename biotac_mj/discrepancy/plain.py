@@ -29,7 +29,7 @@ _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
 _MOVING = [EFFECTS[5], *EFFECTS[11:17]]
 _FORCE = EFFECTS[17:]
 _MOST = 8
-_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 6 / 12, 2 / 5  # confidence: 42 of 42, 5 of 10 and 1 of 3 names right
+_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 6 / 12, 2 / 5  # confidence: of 42, 10 and 3 names 42, 5 and 1 right
 
 
 @dataclasses.dataclass
@@ -215,7 +215,7 @@ def _late(session, effects):
         if any(f.id in _COMMON for f in session.findings):
             candidates = [f for f in candidates if f.id not in _COMMON or f.nats > 40]
         if whole.timeline().loaded:  # nothing is left to confirm them, so they must be plain
-            candidates = [f for f in candidates if f.id not in ("gain", "drift") or f.nats > 80]
+            candidates = [f for f in candidates if f.id not in ("gain", "drift", *_COMMON) or f.nats > 80]
         candidates = [f for f in candidates if f.start >= begin - 0.02 * session.recording.time[-1]]
         chosen = _choose(whole, [f for f in candidates if f.id != "hum"]) or next((f for f in candidates if f.id == "hum"), None)
         if chosen is None:
