@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 
-__all__ = ["THRESHOLDS", "confidence", "threshold_hash"]
+__all__ = ["CONFIDENCE", "THRESHOLDS", "confidence", "terms", "threshold_hash"]
 
 THRESHOLDS = {
     "p": 0.02,  # sign flips over trajectories
@@ -19,8 +19,8 @@ THRESHOLDS = {
     "most": 3,  # effects
     "refit": 6,  # effects that are refitted after the screen
 }
-# Logistic of a name's confidence: constant, log1p(nats), share of the excess closed, log of what is left, lead over the runner-up [z].
-CONFIDENCE = (-1.0, 0.8, 1.5, 0.0, 0.0)
+# Logistic of a confidence; terms: 1, log1p(nats), share of the excess closed, log of what is left, lead over the runner-up [z], tied.
+CONFIDENCE = (-1.0, 0.8, 1.5, -0.5, 0.2, -1.0)
 
 
 def threshold_hash() -> str:
@@ -29,11 +29,15 @@ def threshold_hash() -> str:
 
 
 def confidence(nats, closed, left, lead, ties) -> float:
-    """Probability that a name is right.
+    """Probability that a name is the right one.
 
     Args:
       nats: per trajectory, left out. closed: share of the excess that all effects close. left: mean log mean square that remains.
       lead: over the runner-up, in standard errors over trajectories. ties: how many others do as well.
     """
-    x = np.dot(CONFIDENCE, [1.0, np.log1p(max(nats, 0.0)), closed, max(left, 0.0), min(max(lead, 0.0), 10.0)])
-    return float(1 / (1 + np.exp(-x)) / (1 + ties))
+    return float(1 / (1 + np.exp(-np.dot(CONFIDENCE, terms(nats, closed, left, lead, ties)))))
+
+
+def terms(nats, closed, left, lead, ties) -> list:
+    """What CONFIDENCE weighs."""
+    return [1.0, np.log1p(max(nats, 0.0)), closed, max(left, 0.0), min(max(lead, 0.0), 10.0), float(ties > 0)]
