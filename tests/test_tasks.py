@@ -1,5 +1,6 @@
 """Every task, by one test; the Entity's observables; touch and its estimators; bad input."""
 
+import json
 import os
 import subprocess
 import sys
@@ -323,6 +324,29 @@ def test_bad_input(call, text):
     with pytest.raises(ValueError) as caught:
         call()
     assert text in str(caught.value)
+
+
+def test_scores_of_several_files_make_one_table(repo, tmp_path, monkeypatch, capsys):
+    """A task that was run again counts from the last file; what is printed are means over its seeds."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import importlib
+
+    benchmark = importlib.import_module("tasks")
+
+    def row(task, seed, score):
+        return {"domain": "gripper", "task": task, "policy": "scripted", "seed": seed, "score": score, "last_second": score,
+                "failed_steps": seed, "seconds": 2.0 + seed}  # fmt: skip
+
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    first.write_text(json.dumps({"rows": [row("hold", 0, 0.1), row("lift", 0, 0.5)]}))
+    second.write_text(json.dumps({"rows": [row("hold", 0, 0.9), row("hold", 1, 0.7)]}))
+    assert benchmark.main(["--markdown", str(first), str(second)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "| gripper/hold | 0.80 +- 0.10 | 50 % |  |  | 2, 0 | 2.5 | 1 |" in lines
+    assert "| gripper/lift | 0.50 +- 0.00 | 0 % |  |  | 1, 0 | 2.0 | 0 |" in lines
+    with pytest.raises(SystemExit):
+        benchmark.main(["--tasks", "hold"])
+    assert "--json FILE is missing" in capsys.readouterr().err
 
 
 def test_unknown_observable():
