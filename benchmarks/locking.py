@@ -5,7 +5,8 @@
 Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y) that moves the patch by
 0.1 mm on the load's average, small strain, for each resolution and element: "quadratic" is the package's, "gauss" the same integrated at
 Gauss's points (C3D10), "nodal" linear tetrahedra with averaged nodal pressure. "reference" is "gauss" on the same body, refined once.
-Factor and solve seconds are CHOLMOD's on this machine: the price of a step is a few tens of solves. --press adds real presses of a sphere.
+Factor and solve seconds are those of the package's own factor (`skin.supernodal`): the price of a step is a few tens of solves.
+--press adds real presses of a sphere.
 Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of scikit-fem. Sphere: Lame's closed form.
 """
 
@@ -33,6 +34,7 @@ from biotac_mj.skin.contact import face_samples
 from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
 from biotac_mj.skin.material import LAWS
 from biotac_mj.skin.quadratic import QuadraticTetrahedra
+from biotac_mj.skin.supernodal import Elimination, SupernodalFactor
 
 __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 
@@ -78,21 +80,45 @@ def nodal_pressure(geometry, material):
 
 
 def solve(stiffness, load, free, prescribed=None):
-    """Displacements (3 nvert,) under nodal loads with the coordinates outside `free` held at `prescribed`; seconds of factor and solve."""
+    """Displacements (3 nvert,) under nodal loads with the coordinates outside `free` held at `prescribed`, by CHOLMOD."""
     from cholespy import CholeskySolverD, MatrixType
 
     u = np.zeros(len(load)) if prescribed is None else prescribed.copy()
     u[free] = 0
     b = (load - stiffness @ u)[free]
     a = stiffness[free][:, free].tocoo()
-    times = [time.perf_counter()]
     factor = CholeskySolverD(a.shape[0], a.row.astype(np.int32), a.col.astype(np.int32), a.data, MatrixType.COO)
-    times.append(time.perf_counter())
     x = np.empty_like(b)
     factor.solve(b, x)
-    times.append(time.perf_counter())
     u[free] = x
-    return u, np.diff(times)
+    return u
+
+
+def solve_nodes(stiffness, load, vert, free):
+    """Displacements (nvert, 3) under nodal loads (nvert, 3), all but the nodes `free` held; seconds of the factor and of one solve.
+
+    The factor is rounded: conjugate gradients, which it preconditions, go on until the residual is 1e-9 of the load.
+    """
+    dof = (3 * free[:, None] + np.arange(3)).ravel()
+    a, b = stiffness[dof][:, dof], np.zeros_like(load)
+    b[free] = load[free]
+    times = [time.perf_counter()]
+    factor = SupernodalFactor(a, Elimination(a, vert[free]), free)
+    times.append(time.perf_counter())
+    x, r, p, rz = np.zeros_like(b), b.copy(), None, 1.0
+    for k in range(50):
+        z = factor.solve(r[:, None])[:, 0]
+        if k == 0:
+            times.append(time.perf_counter())
+        last, rz = rz, (r * z).sum()
+        p = z if p is None else z + rz / last * p
+        q = (a @ p[free].ravel()).reshape(-1, 3)
+        alpha = rz / (p[free] * q).sum()
+        x += alpha * p
+        r[free] -= alpha * q
+        if np.linalg.norm(r) < 1e-9 * np.linalg.norm(b):
+            return x, np.diff(times)
+    raise RuntimeError(f"the residual is still {np.linalg.norm(r) / np.linalg.norm(b):.1e} of the load after 50 iterations")
 
 
 def patch_force(geometry, element, material):
@@ -107,9 +133,9 @@ def patch_force(geometry, element, material):
     load = np.zeros((geometry.nvert, 3))
     np.add.at(load[:, 1], geometry.outer_face, traction @ sample)
     load /= load.sum()
-    free = (3 * np.setdiff1d(np.arange(geometry.nvert), geometry.fixed)[:, None] + np.arange(3)).ravel()
-    u, seconds = solve(stiffness, load.ravel(), free)
-    return PATCH_MOTION / (load.ravel() @ u), len(free), *seconds
+    free = np.setdiff1d(np.arange(geometry.nvert), geometry.fixed)
+    u, seconds = solve_nodes(stiffness, load, geometry.vert, free)
+    return PATCH_MOTION / (load * u).sum(), 3 * len(free), *seconds
 
 
 def cook_tip(cells, element, nu):
@@ -123,7 +149,7 @@ def cook_tip(cells, element, nu):
     load[:, 1] = nodal_areas(geometry.vert, faces_on(geometry.vert, geometry.outer_face, 0, 48)) / 16
     moves = np.repeat(geometry.vert[:, :1] > 1e-9, 3, axis=1)
     moves[:, 2] = False
-    u, _ = solve(stiffness, load.ravel(), np.flatnonzero(moves.ravel()))
+    u = solve(stiffness, load.ravel(), np.flatnonzero(moves.ravel()))
     corner = np.linalg.norm(geometry.vert[:, :2] - [48, 60], axis=1) < 1e-9
     return u.reshape(-1, 3)[corner, 1].mean()
 
@@ -170,7 +196,7 @@ def sphere_growth(nu, element, subdivisions, layers, inner=6e-3, outer=10e-3, pr
     held = [np.linalg.norm(vert - outer * axis, axis=1).argmin() for axis in np.eye(3)]  # they go where they belong: no other force
     prescribed = (vert / radius[:, None] * exact(radius)[:, None]).ravel()
     free = (3 * np.setdiff1d(np.arange(len(vert)), held)[:, None] + np.arange(3)).ravel()
-    u, _ = solve(stiffness, load.ravel(), free, prescribed)
+    u = solve(stiffness, load.ravel(), free, prescribed)
     grown = (u.reshape(-1, 3) * vert).sum(1) / radius
     return np.array([grown[abs(radius - r) < 1e-9].mean() / exact(r) - 1 for r in (inner, outer)])
 
