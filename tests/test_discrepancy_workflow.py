@@ -182,7 +182,7 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     parameter = report.effects[0]["parameters"][0]
     assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
     assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
-    assert report.ranking[0][0] == name and any(c["phase"] in ("approach", "hold", "unload") for c in report.where)
+    assert report.ranking[0][0] == name and any(c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where)
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
     from biotac_mj.discrepancy.workflow_verb import summary, write_report
@@ -227,6 +227,25 @@ def test_phases_are_told_apart():
     rows = phases(t)
     assert sum(r.sum() for r in rows.values()) == len(t.time)
     assert rows["approach"].any() and rows["hold"].any() and rows["unload"].any() and rows["free"][0]
+
+
+def test_where_knows_a_trend_over_the_session_from_a_place_and_a_load():
+    from biotac_mj.discrepancy.fitting import fit_effects
+    from biotac_mj.discrepancy.trajectories import measurement_noise
+    from biotac_mj.discrepancy.where import where
+    from biotac_mj.discrepancy.whitening import Comparison
+
+    def cells(effects):
+        data = measured(effects)
+        comparison = Comparison(Springs(), data, Springs().fields(data, progress=False), measurement_noise(data))
+        chosen = np.arange(len(data))
+        return where(comparison, fit_effects(comparison, [], chosen), chosen)
+
+    assert len(cells([])) <= 1
+    warm = cells([(by_id("warmup"), {"a": -0.3, "tau": 60.0})])
+    assert sum(c["condition"] == "clock" and c["channel"].startswith("e") for c in warm) >= 10
+    soft = cells([(by_id("relax"), {"g": 0.4, "tau": 0.3})])
+    assert soft[0]["channel"] in ("force", "pdc") and not any(c["channel"] == "e1" and c["condition"] == "clock" for c in soft)
 
 
 # --- independence of the benchmark ---------------------------------------------------------------------------------------------------

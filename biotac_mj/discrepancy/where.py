@@ -4,7 +4,7 @@ import numpy as np
 
 from .evidence import max_t
 
-__all__ = ["depends_on", "phases", "where"]
+__all__ = ["channel_groups", "conditions", "depends_on", "phases", "where"]
 
 
 def phases(t) -> dict:
@@ -20,25 +20,61 @@ def phases(t) -> dict:
     }  # fmt: skip
 
 
+def conditions(trajectories) -> dict:
+    """name -> per trajectory (boolean rows, weight): phases, load, tool, place, session's clock and temperature.
+
+    A weight of 1 asks for the mean residual of the rows, a centred one for its trend over trajectories.
+    """
+    out = {name: [] for name in ("free", "approach", "hold", "slide", "unload")}
+    for t in trajectories:
+        for name, rows in phases(t).items():
+            out[name].append((rows, 1.0))
+    deepest = np.median([t.depth.max() for t in trajectories])
+    out["deep"] = [(t.depth > 0.75 * deepest, 1.0) for t in trajectories]
+    out["light"] = [((t.depth > 20e-6) & (t.depth < 0.4 * deepest), 1.0) for t in trajectories]
+    touch = [t.depth > 20e-6 for t in trajectories]
+    tools = sorted({t.tool for t in trajectories})
+    for tool in tools if len(tools) > 1 else ():
+        out[tool] = [(rows & (t.tool == tool), 1.0) for t, rows in zip(trajectories, touch)]
+    place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
+    trends = {"along finger": place[:, 0], "across finger": place[:, 2], "clock": [t.clock for t in trajectories]}
+    if all(t.tdc is not None for t in trajectories):
+        trends["temperature"] = [float(t.tdc.mean()) for t in trajectories]
+    for name, values in trends.items():
+        spread = np.std(values)
+        if spread > 0:
+            rows = [np.ones(len(t.time), bool) for t in trajectories] if name in ("clock", "temperature") else touch
+            out[name] = list(zip(rows, (values - np.mean(values)) / spread))
+    return out
+
+
+def channel_groups(comparison) -> dict:
+    """name -> slice of the residual's columns: every electrode, PDC, force."""
+    return {**{f"e{k + 1}": slice(k, k + 1) for k in range(19)}, **{k: s for k, s in comparison.groups.items() if k != "electrodes"}}
+
+
 def where(comparison, null, chosen):
-    """Cells channel group x phase and x depth, tool, time; family-wise p by sign flips of whole trajectories."""
+    """Cells channel x condition that stand out; family-wise p by sign flips of whole trajectories.
+
+    All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times that, a trend 0.3 sigma.
+    """
     white = null.residuals(comparison)
-    cells, names = [], []
-    channels = {**{f"e{k + 1}": slice(k, k + 1) for k in range(19)}, **{k: s for k, s in comparison.groups.items() if k != "electrodes"}}
-    for name, part in channels.items():
-        for phase in ("free", "approach", "hold", "slide", "unload"):
-            column = []
-            for i in chosen:
-                rows = phases(comparison.trajectories[i])[phase]
+    cells, names, large = [], [], []
+    for condition, parts in conditions([comparison.trajectories[i] for i in chosen]).items():
+        for channel, part in channel_groups(comparison).items():
+            column, size = [], []
+            for i, (rows, weight) in zip(chosen, parts):
                 x = white[i][rows][:, part]
-                column.append(x.mean() * np.sqrt(len(x)) if x.size else np.nan)
-            if np.isfinite(column).sum() >= 5:
-                cells.append(column)
-                names.append((name, phase))
+                column.append(weight * x.mean() * np.sqrt(len(x)) if x.size else np.nan)
+                size += [weight * x.mean()] if x.size else []
+            if len(size) >= 5:
+                trend = any(weight != 1.0 for _, weight in parts)
+                cells.append(column), names.append((channel, condition))
+                large.append(abs(np.mean(size)) > (0.3 if trend else 3 / np.sqrt(len(chosen))))
     if not cells:
         return []
     t, p = max_t(np.array(cells).T)
-    out = [{"channel": n[0], "phase": n[1], "t": float(a), "p": float(b)} for n, a, b in zip(names, t, p) if b < 0.05]
+    out = [{"channel": n[0], "condition": n[1], "t": float(a), "p": float(b)} for n, a, b, c in zip(names, t, p, large) if b < 0.05 and c]
     return sorted(out, key=lambda c: -abs(c["t"]))
 
 

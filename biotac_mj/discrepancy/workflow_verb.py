@@ -10,7 +10,7 @@ from ..press_record import replacing
 from .effect import STAGES
 from .simulator import Simulator, load_simulator
 from .trajectories import read_trajectories
-from .where import phases
+from .where import conditions
 from .workflow import THRESHOLDS, Report, diagnose, threshold_hash
 
 __all__ = ["diagnose_data", "summary", "verdict_dict", "write_report"]
@@ -49,8 +49,8 @@ def summary(report: Report) -> str:
     """Text for the terminal, in the report's order."""
     lines = [f"verdict: {report.verdict}"]
     if report.where:
-        cells = ", ".join(f"{c['channel']} ({c['phase']})" for c in report.where[:6])
-        lines.append(f"  where: {len(report.where)} cells of channel x phase at family-wise 5 %: {cells}")
+        cells = ", ".join(f"{c['channel']} ({c['condition']})" for c in report.where[:6])
+        lines.append(f"  where: {len(report.where)} cells of channel x condition at family-wise 5 %: {cells}")
     for e in report.effects:
         lines.append(
             f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats per trajectory left out, p {e['p']:.2g}"  # noqa: E501
@@ -117,27 +117,26 @@ def _channels(report):
 
 
 def _where(report):
-    """Mean whitened residual of the model without effects, channel x phase; dots: family-wise significant."""
+    """Mean whitened residual of the model without effects (or its trend over trajectories), channel x condition; dots: significant."""
     from .fitting import fit_effects
 
     c = report.comparison
     white = fit_effects(c, [], report.selection).residuals(c)
-    names, kinds = _channel_names(report), ("free", "approach", "hold", "slide", "unload")
-    table = np.full((len(kinds), len(names)), np.nan)
-    for k, kind in enumerate(kinds):
-        rows = [white[i][phases(c.trajectories[i])[kind]] for i in report.selection]
-        rows = np.concatenate([r for r in rows if len(r)]) if any(len(r) for r in rows) else None
-        if rows is not None:
-            table[k] = rows.mean(0)
-    figure, ax = _figure(9, 2.6)
+    names, asked = _channel_names(report), conditions([c.trajectories[i] for i in report.selection])
+    table = np.full((len(asked), len(names)), np.nan)
+    for k, parts in enumerate(asked.values()):
+        means = [weight * white[i][rows].mean(0) for i, (rows, weight) in zip(report.selection, parts) if rows.any()]
+        if means:
+            table[k] = np.mean(means, axis=0)
+    figure, ax = _figure(9, 0.8 + 0.28 * len(asked))
     limit = max(np.nanmax(np.abs(table)), 1.0)
     image = ax.imshow(table, cmap="RdBu", vmin=-limit, vmax=limit, aspect="auto")
     for cell in report.where:
         name = {"force": "Fy"}.get(cell["channel"], cell["channel"])
-        ax.plot(names.index(name), kinds.index(cell["phase"]), "k.", ms=4)
+        ax.plot(names.index(name), list(asked).index(cell["condition"]), "k.", ms=4)
     ax.set_xticks(np.arange(len(names)), names, fontsize=7)
-    ax.set_yticks(np.arange(len(kinds)), kinds, fontsize=8)
-    figure.colorbar(image, label="mean residual [sigma]")
+    ax.set_yticks(np.arange(len(asked)), asked, fontsize=7)
+    figure.colorbar(image, label="mean residual, or trend [sigma]")
     return figure
 
 
@@ -185,7 +184,7 @@ def _page(report, pictures):
 <style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}table{{border-collapse:collapse;font-size:13px}}
 td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(report.verdict)}</h1>
-<h2>1. Where</h2><p>{len(report.where)} cells of channel x phase at family-wise 5 %.</p>
+<h2>1. Where</h2><p>{len(report.where)} cells of channel x condition at family-wise 5 %.</p>
 <h2>2. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th>
 <th>p</th><th>ties</th></tr>
 {"".join(rows) or "<tr><td colspan=7>none</td></tr>"}</table><p>{esc(report.remainder)}</p>
