@@ -6,7 +6,7 @@ from .hum import Hum
 from .loads import ForceEffect, ForceView
 from .noises import CrossTalk, LowPass, _lag_one, quiet, windows
 from .recorded_effect import Session
-from .recorded_views import VIEWS, Amended, Choice, choose, cross_residual, squares, whole_line
+from .recorded_views import VIEWS, Amended, Choice, choose, cross_residual, whole_line
 from .timeline import noise_level
 
 __all__ = ["gap", "statistics"]
@@ -142,7 +142,7 @@ def gap(session, findings, late=()) -> dict:
     views = {}
     for name in names:
         choices, trials = chosen[name]
-        before = _view(name, session, findings, [Choice("none", False)] * len(choices), locked)
+        before = _view(name, session, findings, [Choice("none", False)], locked)
         after = _view(name, session, findings, choices, locked)
         view = views[name] = {"unit": "N" if name.startswith("force") else "counts", "before": before.pop("rms"), "after": after.pop("rms")}
         view["variance_removed"] = 1 - (view["after"] / max(view["before"], 1e-12)) ** 2
@@ -158,6 +158,9 @@ def gap(session, findings, late=()) -> dict:
                 else float("nan")
             )  # noqa: E501
             view["drift_variance_removed"] = 1 - after["wander"] / max(before["wander"], 1e-12)
+        if "channels_after" in view:
+            used = range(19) if len(view["channels_after"]) == 19 else session.timeline().used
+            view["electrodes"] = [f"e{k + 1}" for k in used]
         view["amendments"] = [c.text(findings) for c in choices]
         view["trials"] = trials
         if late:
@@ -166,18 +169,20 @@ def gap(session, findings, late=()) -> dict:
 
 
 def _view(name, session, findings, choices, locked):
-    """RMS of a view on the part kept aside, each of its components amended by its own choice."""
-    found = {c: Amended(session, findings, c) for c in dict.fromkeys(choices)}
-    if name == "force from electrodes":
-        each = np.array([squares(name, found[c], locked)[k] for k, c in enumerate(choices)])
-        return {"rms": float(np.sqrt(each.mean())), "components": np.sqrt(each).tolist()}
-    said, measured, time = VIEWS[name](found[choices[0]])
+    """RMS of a view on the part kept aside, each of its components amended by its own choice (one choice: by that)."""
+    said = None
+    for choice in dict.fromkeys(choices):
+        one, measured, time = VIEWS[name](Amended(session, findings, choice))
+        mine = np.array([c == choice for c in choices]) if len(choices) > 1 else np.ones(one.shape[1], bool)
+        said = one.copy() if said is None else said
+        said[:, mine] = one[:, mine]
     inside = np.interp(time, session.recording.time, locked.astype(float)) > 0.5
     error = (said - measured)[inside]
-    good = ~session.masked[inside] if len(said) == len(locked) else np.ones(error.shape, bool)
-    channels = np.sqrt((error**2 * good).sum(0) / np.maximum(good.sum(0), 1))
-    out = {"rms": float(np.sqrt((channels**2).mean())), "channels": channels.tolist()}
-    if len(said) == len(locked):
+    counts = error.shape[1] == 19 and len(said) == len(locked)
+    good = ~session.masked[inside] if counts else np.ones(error.shape, bool)
+    each = np.sqrt((error**2 * good).sum(0) / np.maximum(good.sum(0), 1))
+    out = {"rms": float(np.sqrt((each**2).mean())), "components" if name.startswith("force") else "channels": each.tolist()}
+    if counts:
         # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset counts.
         width = max(1, len(error) // 60)
         m = len(error) // width

@@ -117,11 +117,12 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
 
 
 def _amendments(view):
-    """The view's choices in words; of three force components one by one where they differ."""
+    """The view's choices in words, with the components that made them where they differ."""
     choices = view["amendments"]
     if len(set(choices)) == 1:
         return choices[0]
-    return "; ".join(f"{name}: {c}" for name, c in zip(("Fx", "Fy", "Fz"), choices))
+    names = ("Fx", "Fy", "Fz") if len(choices) == 3 else view["electrodes"]
+    return "; ".join(f"{' '.join(n for n, c in zip(names, choices) if c == choice)}: {choice}" for choice in dict.fromkeys(choices))
 
 
 def write_report(diagnosis: RecordingDiagnosis, folder) -> list:

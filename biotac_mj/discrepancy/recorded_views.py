@@ -16,7 +16,7 @@ from .noises import LowPass
 from .recorded_effect import Session
 from .recording import counts_of, log_impedance
 
-__all__ = ["Amended", "Choice", "VIEWS", "as_found", "choose", "cross_residual", "options", "whole_line"]
+__all__ = ["Amended", "Choice", "VIEWS", "choose", "cross_residual", "options", "whole_line"]
 
 _EDGES = (0.4, 0.55, 0.7, 0.85, 1.0)  # of the part fitted: each trial uses all rows up to an edge and is judged up to the next
 _WEIGHTS = (1.0, 2.0, 3.0, 4.0)  # of the trials: the last ones are the most like what is to come
@@ -129,16 +129,13 @@ VIEWS = {
 
 
 def squares(view, amended, rows):
-    """(components,) mean square error of a view on rows (n,) bool: of the three forces apart, else of all electrodes together."""
+    """(components,) mean square error of a view on rows (n,) bool, of every force component or electrode; masked samples do not count."""
     said, measured, time = VIEWS[view](amended)
     inside = np.interp(time, amended.time, rows.astype(float)) > 0.5
     error = (said - measured)[inside] ** 2
-    if view == "force from electrodes":
-        return error.mean(0)
-    if len(said) == len(rows):
-        good = ~amended.session.masked[inside]
-        return np.array([(error * good).sum() / max(good.sum(), 1)])
-    return np.array([error.mean()])
+    good = ~amended.session.masked[inside] if error.shape[1] == 19 and len(said) == len(rows) else np.ones(error.shape, bool)
+    each = (error * good).sum(0) / np.maximum(good.sum(0), 1)
+    return np.array([each.mean()]) if view == "electrodes at rest" else each  # at rest all electrodes have the same choice
 
 
 # --- trials ----------------------------------------------------------------------------------------------------------------------------
@@ -151,17 +148,12 @@ def options(view, findings) -> list:
     return [Choice(t, f) for f in forces for t in times]
 
 
-def as_found(view, findings):
-    """Each component of a view as was found."""
-    return [options(view, findings)[0]] * (3 if view == "force from electrodes" else 1)
-
-
 def choose(session, findings, views) -> dict:
-    """view -> (Choice of each component, {option's text: mean log error against none (components,)}), by trials in the part fitted.
+    """view -> (Choice of each component or of all, {option's text: mean log error against none (components,)}), by trials.
 
     Where no trial can tell, because nothing was found in its first rows, the findings enter as found.
     """
-    out = {v: (as_found(v, findings), {}) for v in views}
+    out = {v: (options(v, findings)[:1], {}) for v in views}
     asked = {v: options(v, findings) for v in views}
     fitted = int(session.fit.sum())
     edges = np.rint(np.array(_EDGES) * fitted).astype(int)
