@@ -286,6 +286,25 @@ def test_trajectories_are_read_from_a_data_set(tmp_path):
 
 
 @pytest.mark.slow
+def test_trajectories_solved_together_are_those_solved_alone():
+    """Other tools, other lengths: a batch pads the shorter one; what is stored must not notice."""
+    import sys
+
+    sys.path.insert(0, str(ROOT / "examples"))
+    from find_the_missing_effect import presses
+
+    data = presses(2, 0)
+    cut = {k: getattr(data[1], k)[:12] for k in ("time", "pos", "mat", "electrodes", "pdc", "force")}
+    data[1] = Trajectory(**{**data[1].__dict__, **cut})
+    assert data[0].tool != data[1].tool and len(data[0].time) != len(data[1].time)
+    together, alone = Simulator().solve(data), [Simulator().solve([t])[0] for t in data]
+    for a, b in zip(together, alone):
+        for key in ("force", "pressure", "log_z"):
+            np.testing.assert_allclose(a[key], b[key], rtol=1e-9, atol=1e-9)
+    assert together[0]["force"].shape == (len(data[0].time), 3) and np.linalg.norm(together[0]["force"], axis=1).max() > 0.1
+
+
+@pytest.mark.slow
 def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
     """From measured.h5 (synthetic: this project's skin, a hidden low-pass, another modulus) to the amended sensor."""
     import json
