@@ -250,17 +250,29 @@ def test_touch_is_tared():
         reader.update({"position": np.zeros(3)})
 
 
-def test_dm_controls_wrappers_and_viewer():
-    """Action scale and the viewer's own runtime, as for a task of dm_control.suite."""
+@pytest.mark.parametrize("domain, task", TASKS)
+def test_dm_controls_action_scale(domain, task):
+    """As for a task of dm_control.suite: scaled bounds, and the same motion for the same share of them."""
     from dm_control.suite.wrappers import action_scale
 
-    env = action_scale.Wrapper(load("finger", "press", task_kwargs={"random": 0}), minimum=-10.0, maximum=10.0)
-    assert (env.action_spec().maximum == 10.0).all()
-    env.reset()
-    before = env.task.machine.position(env.physics)
-    for _ in range(5):
-        env.step(np.array([10.0, 0, 0]))
-    assert env.task.machine.position(env.physics)[0] - before[0] > 0.5e-3  # full speed is 30 mm/s
+    plain = load(domain, task, task_kwargs={"random": 0})
+    scaled = action_scale.Wrapper(load(domain, task, task_kwargs={"random": 0}), minimum=-10.0, maximum=10.0)
+    assert (scaled.action_spec().minimum == -10.0).all() and (scaled.action_spec().maximum == 10.0).all()
+    assert scaled.action_spec().shape == plain.action_spec().shape
+    action = np.linspace(-0.9, 0.9, plain.action_spec().shape[0])
+    moved = []
+    for env, factor in ((plain, 1.0), (scaled, 10.0)):
+        env.reset()
+        before = env.task.machine.position(env.physics)
+        for _ in range(3):
+            env.step(factor * action)
+        moved.append(env.task.machine.position(env.physics) - before)
+    np.testing.assert_allclose(moved[0], moved[1], rtol=1e-9, atol=1e-12)
+    assert np.abs(moved[0]).max() > 5e-5
+
+
+def test_dm_controls_viewer():
+    """The viewer's own runtime, without its window."""
     from dm_control.viewer import runtime
 
     with warnings.catch_warnings():
