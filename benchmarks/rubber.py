@@ -23,7 +23,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from accuracy import write_json
 from condensed import run
 
-from biotac_mj.skin import PRESETS, SkinData, SkinModel, contact
+from biotac_mj.skin import PRESETS, SkinData, SkinModel, clearance
 from biotac_mj.skin.data import view
 
 __all__ = ["main", "press", "shape"]
@@ -37,7 +37,7 @@ def shape(model, data, vert_xpos) -> tuple[float, float]:
     model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
     face = model.core_surface.face
     depth = wp.zeros((len(face), 1), dtype=wp.float64, device=model.device)
-    wp.launch(contact.deepest_corner, dim=depth.shape, inputs=[face, model.core(1).struct, data.x], outputs=[depth])
+    wp.launch(clearance.deepest_corner, dim=depth.shape, inputs=[face, model.core(1).struct, data.x], outputs=[depth])
     return float(model.elasticity.smallest_jacobian(data.elastic)[0]), float(depth.numpy().max())
 
 
