@@ -207,7 +207,8 @@ class SupernodalFactor:
         nrhs = rhs.shape[1]
         work = np.zeros((nrhs, self.size + self._scratch))
         work[:, : self.size] = np.swapaxes(rhs[self._rows], 0, 1).reshape(nrhs, self.size)
-        wp.launch(substitute, dim=1, inputs=[self.size, *self._panels, wp.array(work, dtype=wp.float64, ndim=2, copy=False)], device="cpu")
+        shared = wp.array(work, dtype=wp.float64, ndim=2, device="cpu", copy=False)
+        wp.launch(substitute, dim=1, inputs=[self.size, *self._panels, shared], device="cpu")
         out = np.zeros(rhs.shape)
         out[self._rows] = np.swapaxes(work[:, : self.size].reshape(nrhs, -1, 3), 0, 1)
         return out
