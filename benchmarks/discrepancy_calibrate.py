@@ -14,7 +14,7 @@ import numpy as np
 from discrepancy_table import right
 from scipy.optimize import minimize
 
-from biotac_mj.discrepancy.thresholds import terms
+from biotac_mj.discrepancy.thresholds import THRESHOLDS, terms
 
 _RIDGE = 0.5
 _LEFT_OUT = 0.25  # weight of a case whose effect is not in the catalogue: about one in ten of all
@@ -27,6 +27,8 @@ def names(rows):
         trace = r["trace"]
         for k, name in enumerate(r["named"]):
             c = next(c for step in reversed(trace["rounds"]) for c in step if c["id"] == name)
+            if k and c["nats"] <= THRESHOLDS["further"]:
+                continue  # present thresholds refuse it
             x = terms(c["nats"], trace["inside"], trace["left"], c["lead"], len(r["ties"][k]))
             out.append({"x": x, "inside": trace["inside"], "after": trace["after"], "right": right(r, k), "exact": name in r["truth"],
                         "row": r, "name": name, "candidate": c, "ties": len(r["ties"][k])})  # fmt: skip

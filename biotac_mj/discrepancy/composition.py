@@ -59,40 +59,56 @@ def compose(comparison, null, usable, chosen, seed, tick=lambda: None):
         return null, [], [first]
     _rank(accepted[0], first)
     ends = {}
-    for start in [accepted[0], *[c for c in accepted[1:] if c.effect.id in accepted[0].ties]][:_BEAMS]:
+    tied = [accepted[0], *[c for c in accepted[1:] if c.effect.id in accepted[0].ties]]
+    for start in tied[:_BEAMS]:
         fit, found, rounds = start.fit, [start], [first]
         while len(found) < THRESHOLDS["most"]:
             step = _round(comparison, fit, null, usable, chosen, seed)
             rounds.append(step)
             tick()
-            best = next((c for c in step if not c.refused), None)
-            if best is None:
+            able = [c for c in step if not c.refused]
+            if not able:
                 break
+            best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
             _rank(best, step)
             found, fit = [*found, best], best.fit
         held = found[-1].held
         fit, found = _needed(comparison, fit, found, chosen)
         ends[start.effect.id] = fit, found, rounds, held - THRESHOLDS["gain"] * len(found)
-    winner = max(ends, key=lambda k: ends[k][3].mean())
+    size = [sum(len(c.effect.params) for c in e[1]) for e in ends.values()]
+    winner = list(ends)[_simplest([(e[3], k) for e, k in zip(ends.values(), size)])]
     fit, found, rounds, score = ends[winner]
     if found and found[0].effect.id == winner:
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
-        found[0].ties = [t for t in found[0].ties if t not in ends or not _ahead(score - ends[t][3])]
+        zero = evidence(null.residuals(comparison))[chosen]
+        found[0].ties = [t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero)]
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
     return fit, found, rounds
 
 
-def _ahead(lead):
-    return bool(lead.mean() > THRESHOLDS["tie"] * lead.std(ddof=1) / np.sqrt(len(lead)))
+def _simplest(options) -> int:
+    """Index of the one with the fewest parameters among those (evidence (chosen,), parameters) that the best does not lead by much."""
+    best = max(options, key=lambda o: o[0].mean())[0]
+    near = [k for k, (e, _) in enumerate(options) if not _ahead(best - e, THRESHOLDS["simpler"])]
+    return min(near, key=lambda k: (options[k][1], -options[k][0].mean()))
+
+
+def _ahead(lead, by=None):
+    return bool(lead.mean() > (THRESHOLDS["tie"] if by is None else by) * lead.std(ddof=1) / np.sqrt(len(lead)))
+
+
+def _tied(gain, other) -> bool:
+    """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than laws are known."""
+    return not _ahead(gain - other) or other.mean() > THRESHOLDS["alike"] * gain.mean()
 
 
 def _rank(best, step):
     """Ties of the best one, and its lead over the runner-up."""
     leads = {c.effect.id: best.gain - c.gain for c in step if c is not best}
-    best.ties = [c.effect.id for c in step if c is not best and c.nats >= THRESHOLDS["gain"] and not _ahead(leads[c.effect.id])]
+    best.ties = [c.effect.id for c in step if c is not best and c.nats >= THRESHOLDS["gain"] and _tied(best.gain, c.gain)]
     best.lead = min((float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0)
 
 
@@ -116,7 +132,7 @@ def _round(comparison, current, null, effects, chosen, seed):
         one = Candidate(
             effect, fit, gain, held, float(gain.mean()), sign_flip(gain), float(gain.mean()) / (0.5 * rows * excess), energy, []
         )
-        one.refused = _refused(comparison, one, chosen)
+        one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects])
         out.append(one)
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
@@ -134,7 +150,7 @@ def _left_out(comparison, whole, chosen, seed, folds=3):
     return out
 
 
-def _refused(comparison, one, chosen) -> list:
+def _refused(comparison, one, chosen, present) -> list:
     """Why a candidate is not accepted."""
     theta = next(th for e, th in one.fit.effects if e.id == one.effect.id)
     params = [(theta[n], one.effect.params[n]) for n in one.effect.free]
@@ -142,6 +158,12 @@ def _refused(comparison, one, chosen) -> list:
     out = [k for k, v in numbers.items() if v <= THRESHOLDS[k]] + (["p"] if one.p >= THRESHOLDS["p"] else [])
     if all(min(abs(v - p.low), abs(v - p.high)) < 1e-3 * p.scale for v, p in params):
         out.append("bound")
+    if present and one.nats <= THRESHOLDS["further"]:
+        out.append("further")
+    # What is left of an effect whose true law is a little different looks like those that it is confused with.
+    alike = any(one.effect.id in e.confusable or e.id in one.effect.confusable for e in present)
+    if alike and one.energy <= THRESHOLDS["form"]:
+        out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
     if one.effect.id in _SETUP and all(abs(v) < comparison.repeatability / np.sqrt(len(chosen)) * 2 for v, _ in params):
