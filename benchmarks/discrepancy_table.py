@@ -114,7 +114,7 @@ def confusion(rows, path):
     matrix = np.zeros((len(truths), len(names)), int)
     for r in shown:
         matrix[truths.index(r["truth"][0] if r["truth"] else r["kind"]), names.index(answer(r))] += 1
-    figure = Figure(figsize=(9, 7.5), layout="constrained")
+    figure = Figure(figsize=(7.4, 7.6), layout="constrained")
     ax = figure.subplots()
     ax.imshow(matrix / np.maximum(matrix.sum(1, keepdims=True), 1), cmap="Blues", vmax=1.4)
     for i, j in zip(*np.nonzero(matrix)):
@@ -125,5 +125,7 @@ def confusion(rows, path):
     ax.axvline(len(HIDDEN) - 0.5, color="0.6", lw=0.7)
     ax.set_xlabel("first name given, or abstention")
     ax.set_ylabel("hidden (synthetic data)")
+    tiers, seeds = ({r[k] for r in shown} for k in ("tier", "seeds"))
+    ax.set_title(f"{len(shown)} cases without pairs; seeds {', '.join(seeds)}; tier {', '.join(tiers)}", fontsize=9)
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
