@@ -4,6 +4,7 @@ MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps
 may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
 """
 
+import atexit
 import ctypes
 import functools
 import importlib
@@ -214,6 +215,14 @@ def register():
         if slot < 0:
             raise RuntimeError(f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of biotac_mj loaded?")
         _alive.extend((callbacks, names, plugin))
+        atexit.register(_fall_silent, slot)
+
+
+def _fall_silent(slot):
+    """When Python ends: an mjData that outlives it is freed by MuJoCo alone; a call into a finalized interpreter would crash."""
+    get = structs.LIBRARY.mjp_getPluginAtSlot
+    get.restype, get.argtypes = ctypes.POINTER(_Plugin), (_INT,)
+    get(slot).contents.destroy = _CALLBACKS["destroy"]()  # none
 
 
 def check():

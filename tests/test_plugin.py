@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 import threading
 import time
 
@@ -338,3 +340,17 @@ def test_overhead_is_small_beside_the_skin(coupling, limit):
         mujoco.mj_step(model, data, 50)
         best = min(best, (time.process_time() - begin) / 50)
     assert best < limit
+
+
+_OUTLIVED = """
+import mujoco, biotac_mj, sys
+spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body><freejoint/><geom size=".01" mass=".01"/></body></worldbody></mujoco>')
+biotac_mj.attach(spec, pos=[0, 0, 1], skin="coarse", readings="none")
+model = spec.compile()
+sys.modules["kept"] = mujoco.MjData(model)  # freed when no Python is left to call
+"""
+
+
+def test_data_that_outlives_python_is_freed_without_a_crash():
+    done = subprocess.run([sys.executable, "-c", _OUTLIVED], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, (done.returncode, done.stderr)
