@@ -346,8 +346,12 @@ _OUTLIVED = """
 import mujoco, biotac_mj, sys
 spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body><freejoint/><geom size=".01" mass=".01"/></body></worldbody></mujoco>')
 biotac_mj.attach(spec, pos=[0, 0, 1], skin="coarse", readings="none")
-model = spec.compile()
-sys.modules["kept"] = mujoco.MjData(model)  # freed when no Python is left to call
+class Kept:
+    pass
+kept = Kept()
+# freed when no Python is left to call
+kept.itself, kept.data = kept, mujoco.MjData(spec.compile())
+sys.modules["kept"] = kept
 """
 
 
