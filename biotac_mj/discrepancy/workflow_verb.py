@@ -178,18 +178,26 @@ def _page(report, pictures):
         )
     gap = "".join(f"<tr><td>{g}</td><td>{report.before[g]:.4g}</td><td>{report.after[g]:.4g}</td></tr>" for g in report.comparison.groups)
     closed = f"{report.closed:.0%}" if np.isfinite(report.closed) else "nothing to close"
-    images = "".join(f'<img src="{p}" style="max-width:100%">' for p in pictures)
     notes = "".join(f"<li>{esc(n)}</li>" for n in report.notes)
+    image = {name.split(".")[0]: f'<img src="{name}" style="max-width:100%">' for name in pictures}
+    level, after = report.trace["before"], report.trace["after"]
+    cells = "".join(
+        f"<tr><td>{c['channel']}</td><td>{c['condition']}</td><td>{c['t']:.1f}</td><td>{c['p']:.2g}</td></tr>" for c in report.where[:20]
+    )
     return f"""<!doctype html><meta charset="utf-8"><title>diagnosis</title>
 <style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}table{{border-collapse:collapse;font-size:13px}}
 td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(report.verdict)}</h1>
-<h2>1. Where</h2><p>{len(report.where)} cells of channel x condition at family-wise 5 %.</p>
-<h2>2. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th>
+<h2>1. Is there a disagreement?</h2><p>Mean square of residuals over noise, resolution and repeatability: {level["level"]:.2f} of a
+trajectory, {level["peak"]:.2f} of the worst channel (beyond {THRESHOLDS["significant"]} or {THRESHOLDS["peak"]} something is wrong).
+With the effects found {after["level"]:.2f} and {after["peak"]:.2f}.</p>
+<h2>2. Where</h2><p>{len(report.where)} cells of channel x condition at family-wise 5 %.</p><table>
+<tr><th>channel</th><th>condition</th><th>t</th><th>p</th></tr>{cells}</table>{image["where"]}
+<h2>3. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th>
 <th>p</th><th>ties</th></tr>
-{"".join(rows) or "<tr><td colspan=7>none</td></tr>"}</table><p>{esc(report.remainder)}</p>
-<h2>3. Added</h2><p>sensor_amended.yaml</p>
-<h2>4. Proof on trajectories kept aside</h2><table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table>
-<p>share of the closable gap: {closed}</p>
-<h2>5. What the data cannot tell</h2><ul>{notes}</ul><h2>6. Next experiment</h2><p>{esc(report.next_experiment)}</p>
-{images}<p>thresholds {threshold_hash()}</p>"""
+{"".join(rows) or "<tr><td colspan=7>none</td></tr>"}</table><p>{esc(report.remainder)}</p>{image["evidence"]}
+<h2>4. Added</h2><p>sensor_amended.yaml</p>
+<h2>5. Proof on trajectories kept aside</h2><table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table>
+<p>share of the closable gap: {closed}</p>{image["channels"]}
+<h2>6. What the data cannot tell</h2><ul>{notes}</ul><p>Next experiment: {esc(report.next_experiment)}</p>{image["isolability"]}
+<p>thresholds {threshold_hash()}</p>"""
