@@ -307,6 +307,18 @@ def test_the_part_kept_aside_does_not_choose():
         assert view["after"] < view["before"] or name == "force from electrodes" and view["after"] == view["before"]
 
 
+def test_a_channel_that_is_stuck_in_a_trial_alone_is_left_out_of_it():
+    """Masked for most of the first rows, usable on the whole: trials have one electrode less than the report."""
+    e, force, rng = pressed(9)
+    z = (4095 / e - 1) * np.exp(-0.4 * np.arange(len(e)) / len(e))[:, None]
+    counts = noisy(4095 / (z + 1), rng)
+    counts[: len(e) * 35 // 100, 6] = counts[0, 6]
+    d = diagnose_recording(Recording(counts))
+    assert {"stuck", "warmup"} <= set(ids(d))
+    view = d.gap["each electrode from the others"]
+    assert view["after"] < view["before"] and len(view["channels_after"]) == 19
+
+
 def test_a_trend_that_turns_round_is_not_carried_on():
     """A gain that comes and goes: carried on it would be wrong, and earlier turns inside the part fitted say so."""
     from biotac_mj.discrepancy.recorded_views import Choice, _best

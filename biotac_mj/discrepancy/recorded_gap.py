@@ -158,9 +158,6 @@ def gap(session, findings, late=()) -> dict:
                 else float("nan")
             )  # noqa: E501
             view["drift_variance_removed"] = 1 - after["wander"] / max(before["wander"], 1e-12)
-        if "channels_after" in view:
-            used = range(19) if len(view["channels_after"]) == 19 else session.timeline().used
-            view["electrodes"] = [f"e{k + 1}" for k in used]
         view["amendments"] = [c.text(findings) for c in choices]
         view["trials"] = trials
         if late:
@@ -181,7 +178,10 @@ def _view(name, session, findings, choices, locked):
     counts = error.shape[1] == 19 and len(said) == len(locked)
     good = ~session.masked[inside] if counts else np.ones(error.shape, bool)
     each = np.sqrt((error**2 * good).sum(0) / np.maximum(good.sum(0), 1))
-    out = {"rms": float(np.sqrt((each**2).mean())), "components" if name.startswith("force") else "channels": each.tolist()}
+    out = {
+        "rms": float(np.sqrt((each**2).sum() / max((each > 0).sum(), 1))),
+        "components" if name.startswith("force") else "channels": each.tolist(),
+    }
     if counts:
         # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset counts.
         width = max(1, len(error) // 60)

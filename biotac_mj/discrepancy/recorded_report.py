@@ -121,7 +121,7 @@ def _amendments(view):
     choices = view["amendments"]
     if len(set(choices)) == 1:
         return choices[0]
-    names = ("Fx", "Fy", "Fz") if len(choices) == 3 else view["electrodes"]
+    names = ("Fx", "Fy", "Fz") if len(choices) == 3 else [f"e{k + 1}" for k in range(len(choices))]
     return "; ".join(f"{' '.join(n for n, c in zip(names, choices) if c == choice)}: {choice}" for choice in dict.fromkeys(choices))
 
 

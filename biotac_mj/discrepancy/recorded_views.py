@@ -118,7 +118,8 @@ def force_from_electrodes(a):
 def each_from_the_others(a):
     line, deviation, _ = whole_line(a.session)
     e = np.median(a.session.recording.electrodes, axis=0)[line.used]
-    residual = cross_residual(line, deviation) * e * (1 - e / 4095)
+    residual = np.zeros((len(line.time), 19))  # zero of electrodes that are masked for the most part
+    residual[:, line.used] = cross_residual(line, deviation) * e * (1 - e / 4095)
     return residual, np.zeros_like(residual), line.time
 
 
