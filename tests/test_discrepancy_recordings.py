@@ -329,3 +329,8 @@ def test_a_trend_that_turns_round_is_not_carried_on():
     assert asked[_best(asked, trials[:3], trials[:3].mean(0), wary=True)].time == "none"
     assert asked[_best(asked, trials[:1] - [0.5, 0.6, 0], np.array([-0.5, -0.6, 0]), wary=True)].time == "none"
     assert asked[_best(asked, 0 * trials, np.zeros(3), wary=False)].time == "carried on"
+
+
+def test_the_benchmarks_generator_shares_no_code_with_what_it_judges():
+    source = (pathlib.Path(__file__).parents[1] / "benchmarks/discrepancy_recordings_generator.py").read_text()
+    assert "biotac_mj" not in source and "import numpy" in source
