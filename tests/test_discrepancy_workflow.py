@@ -171,6 +171,21 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
+def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
+    from biotac_mj.discrepancy.nuisance import Nuisance
+
+    rng, data = np.random.default_rng(3), plans()
+    runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
+    data = [
+        Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, np.rint(r.counts + 3 * rng.standard_normal(r.counts.shape)),
+                   np.rint(r.pdc), None, r.force + 0.005 * rng.standard_normal(r.force.shape))
+        for t, r in zip(data, runs)
+    ]  # fmt: skip
+    report = diagnose(Springs(), data, progress=False)
+    assert not report.effects and abs(report.fit.nuisance.footprint - 0.06) < 0.015
+    assert any("footprint is +" in note for note in report.notes)
+
+
 @pytest.mark.parametrize(
     "name, size", [("latency", {"delay": 0.06}), ("relax", {"g": 0.25, "tau": 0.5}), ("mount", {"compliance": 1.2e-4})]
 )

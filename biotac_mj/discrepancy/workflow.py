@@ -8,6 +8,7 @@ import tqdm
 from .catalogue import CATALOGUE
 from .composition import compose
 from .fitting import Fit, fit_effects, mean_square
+from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
 from .simulator import Simulator
 from .thresholds import THRESHOLDS, confidence, threshold_hash
@@ -134,6 +135,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     gap_before, gap_after = _gap(comparison, null, aside), _gap(comparison, current, aside)
     outside = [np.log(np.maximum(g["mean_square"], 1.0)).mean() for g in (gap_before, gap_after)]
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if found or _wrong(before) else float("nan")
+    notes = notes + _base(comparison, current.nuisance)
     table = isolability(comparison, current, usable, effects, chosen)
     trace = {
         "before": before, "after": after, "inside": inside, "left": left, "rounds": [[c.record() for c in step] for step in rounds],
@@ -170,6 +172,16 @@ def _gap(comparison, fit, rows):
         out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
     out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
     return out
+
+
+def _base(comparison, nuisance) -> list:
+    """What the fitted nuisance says of the base model; it takes no effect's name."""
+    notes = []
+    if abs(nuisance.footprint) > 0.02:
+        notes.append(f"the base model's contact footprint is {nuisance.footprint:+.0%} off: calibrate before looking for small effects")
+    if nuisance.mesh > 0.5:
+        notes.append(f"the data lie nearer to the mesh {OTHER_MESH[comparison.sim.skin]!r} than to {comparison.sim.skin!r}: use that one")
+    return notes
 
 
 def _notes(data, comparison):
