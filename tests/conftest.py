@@ -14,6 +14,14 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 REPO = pathlib.Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def default_device():
+    """Arrays of the tests are on the CPU, as the package's own are by default, also where CUDA is; tests of CUDA name their device."""
+    import warp as wp
+
+    wp.set_device("cpu")
+
+
 @pytest.fixture(scope="session")
 def repo():
     """The root of the repository."""

@@ -242,27 +242,26 @@ def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
     from biotac_mj.skin.device_quadratic import Quadratic
     from biotac_mj.skin.material import Material
 
-    with wp.ScopedDevice("cpu"):  # also where CUDA is
-        rubber = Material(law, 1e6, 0.49)
-        model = SkinModel(load_skin("coarse"), rubber, SkinOptions(element="quadratic"))
-        element, rng = model.elasticity, np.random.default_rng(0)
-        turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
-        vert = np.repeat(load_skin("coarse").vert[:, None], 2, axis=1) @ turn.T * 1.03
-        x = wp.array(vert + 1e-5 * rng.standard_normal(vert.shape), dtype=wp.vec3d, ndim=2)
-        p = rng.standard_normal(vert.shape).astype(np.float32)
-        mu = wp.array([rubber.mu] * 2, dtype=wp.float64)
-        lam = wp.array([rubber.bulk if law == "neo_hookean" else rubber.lame] * 2, dtype=wp.float64)
-        on, inverted, unused = wp.ones(2, dtype=int), wp.zeros(2, dtype=int), wp.zeros(vert.shape[:2], dtype=wp.vec3d)
-        scratch, device = element.allocate(2), Quadratic(element, 2)
-        element.force(scratch, mu, lam, x, unused)
-        device.force(mu, lam, x, on, inverted)
-        force = scratch.corner.numpy()
-        np.testing.assert_allclose(device.corner_force.numpy(), force, rtol=0, atol=3e-7 * np.abs(force).max())
-        element.product(scratch, mu, lam, x, wp.array(p.astype(float), dtype=wp.vec3d, ndim=2), unused)
-        device.product(mu, lam, x, wp.array(p, dtype=wp.vec3, ndim=2), on)
-        product = scratch.corner.numpy()
-        np.testing.assert_allclose(device.corner.numpy(), product, rtol=0, atol=2e-6 * np.abs(product).max())
-        assert (inverted.numpy() == 0).all()
+    rubber = Material(law, 1e6, 0.49)
+    model = SkinModel(load_skin("coarse"), rubber, SkinOptions(element="quadratic"))
+    element, rng = model.elasticity, np.random.default_rng(0)
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    vert = np.repeat(load_skin("coarse").vert[:, None], 2, axis=1) @ turn.T * 1.03
+    x = wp.array(vert + 1e-5 * rng.standard_normal(vert.shape), dtype=wp.vec3d, ndim=2)
+    p = rng.standard_normal(vert.shape).astype(np.float32)
+    mu = wp.array([rubber.mu] * 2, dtype=wp.float64)
+    lam = wp.array([rubber.bulk if law == "neo_hookean" else rubber.lame] * 2, dtype=wp.float64)
+    on, inverted, unused = wp.ones(2, dtype=int), wp.zeros(2, dtype=int), wp.zeros(vert.shape[:2], dtype=wp.vec3d)
+    scratch, device = element.allocate(2), Quadratic(element, 2)
+    element.force(scratch, mu, lam, x, unused)
+    device.force(mu, lam, x, on, inverted)
+    force = scratch.corner.numpy()
+    np.testing.assert_allclose(device.corner_force.numpy(), force, rtol=0, atol=3e-7 * np.abs(force).max())
+    element.product(scratch, mu, lam, x, wp.array(p.astype(float), dtype=wp.vec3d, ndim=2), unused)
+    device.product(mu, lam, x, wp.array(p, dtype=wp.vec3, ndim=2), on)
+    product = scratch.corner.numpy()
+    np.testing.assert_allclose(device.corner.numpy(), product, rtol=0, atol=2e-6 * np.abs(product).max())
+    assert (inverted.numpy() == 0).all()
 
 
 def test_one_world_alone_equals_the_host(model):

@@ -88,7 +88,12 @@ class BatchFilm:
         Args:
           x: (nvert, nworld) wp.array of vec3d, nodes in the BioTac frame [m].
           due: (nworld,) wp.array of int, 0 where the last impedances stay.
+
+        Raises:
+          ValueError: an array is on another device.
         """
+        if {x.device, due.device} != {self.device}:
+            raise ValueError(f"the film is on {self.device}, x on {x.device} and due on {due.device}: make both where the film is")
         f, nworld = self.film, self.nworld
         surface = [self._middle, self._thickness]
 
