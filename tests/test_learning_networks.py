@@ -12,6 +12,7 @@ from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.electrode_vae import ElectrodeVAE  # noqa: E402
 from biotac_mj.learning.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
+from biotac_mj.learning.fitting import _one_cycle, cycle  # noqa: E402
 from biotac_mj.learning.graph import ChebConv, SparseMatrix  # noqa: E402
 from biotac_mj.learning.heads import LocalHead, PodHead, averages, next_average  # noqa: E402
 from biotac_mj.learning.hierarchy import build_hierarchy  # noqa: E402
@@ -195,3 +196,25 @@ def test_config_names_what_is_wrong():
         LearningConfig(steps=-1)
     with pytest.raises(ValueError, match="equally many"):
         LearningConfig(mesh_factors=(4, 4))
+
+
+def test_the_rate_of_one_cycle_is_torchs():
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], 1.0)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2.0, total_steps=1000, pct_start=0.15)
+    for step in range(1000):
+        assert abs(_one_cycle(step / 1000) - schedule.get_last_lr()[0]) < 0.03
+        optimizer.step(), schedule.step()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_replayed_steps_train_as_launched_ones_do():
+    x = torch.randn(300, 19, device="cuda", generator=torch.Generator("cuda").manual_seed(0))
+    y = x @ torch.randn(19, 5, device="cuda", generator=torch.Generator("cuda").manual_seed(1))
+    found = []
+    for graph in (False, True):
+        torch.manual_seed(0)
+        net = torch.nn.Sequential(torch.nn.Linear(19, 32), torch.nn.ELU(), torch.nn.Linear(32, 5)).cuda()
+        loss = lambda r, net=net: (net(x[r]) - y[r]).square().mean()  # noqa: E731
+        rows = torch.arange(300, device="cuda")
+        found.append(float(cycle(net, loss, rows, 64, 300, 3e-3, lambda: loss(rows), decay=0.95, graph=graph)))  # noqa: B023
+    assert abs(found[0] - found[1]) < 0.02 * found[0] and found[0] < 0.5

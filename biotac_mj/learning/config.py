@@ -30,6 +30,7 @@ class LearningConfig:
       pod: modes of the principal components of the mesh. width: of our networks. mirror: they also see every touch mirrored in z.
       window: time constants [s] of the causal averages of their features.
       members: networks that are averaged in the best model.
+      graphs: on a GPU training steps are replayed as CUDA graphs.
     """
 
     mesh_order: int = 6
@@ -65,6 +66,7 @@ class LearningConfig:
     mirror: bool = True
     window: tuple = (0.5, 4.0)
     members: int = 3
+    graphs: bool = True
 
     def __post_init__(self):
         for field in dataclasses.fields(self):

@@ -84,10 +84,10 @@ def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, p
         film = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device)
         film = film - film[arrays.first]
         cycle(head, lambda r: loss(r, film), every, 2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed,
-              progress=progress)  # fmt: skip
+              graph=config.graphs, progress=progress)  # fmt: skip
     rate = config.learning_rate * (0.5 if teach else 1)
     head.validation = cycle(head, loss, rows, config.batch, config.steps, rate, lambda: error(check), weight_decay=0.01, seed=seed,
-                            progress=progress)  # fmt: skip
+                            graph=config.graphs, progress=progress)  # fmt: skip
     return head
 
 

@@ -109,10 +109,11 @@ def train_head(features, train, validation, config, kind="local", window=True, t
             value = root_mean_square(output(rows) - target[rows])
             return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order]) if mirror else value
 
-        cycle(head, teacher_loss, a.rows(train), 2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed, progress=progress)
+        cycle(head, teacher_loss, a.rows(train), 2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed,
+              graph=config.graphs, progress=progress)  # fmt: skip
     rate = config.learning_rate * (0.5 if teach else 1)
     cycle(head, loss, labelled, config.batch, config.steps, rate, lambda: root_mean_square(predict(check) - a.change(check)),
-          weight_decay=0.01, seed=seed, progress=progress)  # fmt: skip
+          weight_decay=0.01, seed=seed, graph=config.graphs, progress=progress)  # fmt: skip
 
     @torch.no_grad()
     def evaluate(rows):

@@ -62,7 +62,7 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
         return sum(float((vae(field(r))[0] - field(r)).square().sum()) for r in mesh_check.split(64))
 
     cycle(vae, mesh_loss, mesh_rows, config.mesh_batch, config.mesh_steps, config.learning_rate, mesh_validate, checks=4,
-          decay=config.decay, seed=seed, progress=progress)  # fmt: skip
+          decay=config.decay, seed=seed, graph=False, progress=progress)  # fmt: skip
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     y = torch.zeros_like(arrays.counts)
@@ -74,7 +74,8 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
         return _vae_loss(y[r], *electrode(y[r]), config.electrode_kl, config.reconstruction)
 
     cycle(electrode, electrode_loss, rows, config.batch, config.paper_steps, config.learning_rate,
-          lambda: (electrode(y[check])[0] - y[check]).square().mean(), decay=config.decay, seed=seed, progress=progress)  # fmt: skip
+          lambda: (electrode(y[check])[0] - y[check]).square().mean(), decay=config.decay, seed=seed,
+          graph=config.graphs, progress=progress)  # fmt: skip
 
     model = LatentProjection(vae, electrode, config).to(device)
     for part in (vae, electrode):
@@ -105,7 +106,7 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
         return root_mean_square(model.to_mesh(b) - a)
 
     kind = dict(batch=config.batch, steps=config.paper_steps, learning_rate=config.learning_rate, decay=config.decay, seed=seed)
-    kind["progress"] = progress
+    kind |= dict(graph=config.graphs, progress=progress)
     cycle(model.to_electrode, forward_loss, rows, validate=lambda: forward_loss(check), **kind)
     cycle(model.to_mesh, inverse_loss, rows, validate=lambda: inverse_loss(check), **kind)
     return model.eval()
@@ -127,7 +128,7 @@ def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> 
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
 
     cycle(net, loss, rows, config.batch, config.paper_steps, config.learning_rate, validate, decay=config.decay, seed=seed,
-          progress=progress)  # fmt: skip
+          graph=False, progress=progress)  # fmt: skip
     return net
 
 
