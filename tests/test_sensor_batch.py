@@ -145,3 +145,11 @@ def test_a_film_with_other_excitation_is_refused():
     film = FilmConduction(load_skin("coarse"), excitation=[(0.0, 1.0), (-5e-3, 1.0)], sensor=None)
     with pytest.raises(ValueError, match="needs the sensor's four"):
         BatchFilm(film, 1)
+
+
+def test_a_film_refuses_arrays_of_another_device(film):
+    class Elsewhere:
+        device = "another device"
+
+    with pytest.raises(ValueError, match="the film is on cpu, x on another device .*: make both where the film is"):
+        BatchFilm(film, 1).solve(Elsewhere(), wp.ones(1, dtype=int))

@@ -92,7 +92,7 @@ class BatchFilm:
         Raises:
           ValueError: an array is on another device.
         """
-        if {x.device, due.device} != {self.device}:
+        if x.device != self.device or due.device != self.device:
             raise ValueError(f"the film is on {self.device}, x on {x.device} and due on {due.device}: make both where the film is")
         f, nworld = self.film, self.nworld
         surface = [self._middle, self._thickness]
