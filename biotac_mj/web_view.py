@@ -11,6 +11,7 @@ __all__ = ["Finger", "Page", "play_file", "play_model"]
 
 _WINDOW = 200  # samples that a trace shows
 _MAP = (150, 220)  # of the electrode map, (angle, x) [pixel]
+_FROM = np.array([-0.55, -0.75, 0.35])  # where the camera looks from: the tip's side, pad in sight
 _FULL = 300.0  # change at full colour [counts]
 
 
@@ -65,11 +66,7 @@ class Page:
         self._scene, self._gui, self._log = {}, {}, {}
         for name, finger in fingers.items():
             self._add(viser, name, finger)
-        first = next(iter(fingers.values()))
-        center = first.electrode_pos.mean(0)
-        self.server.initial_camera.look_at = center
-        self.server.initial_camera.position = center + [0.02, -0.05, 0.03]
-        self.server.initial_camera.up = (0.0, 1.0, 0.0)
+        self._aimed = False
 
     def _add(self, viser, name, finger):
         scene, gui = self.server.scene, self.server.gui
@@ -85,12 +82,31 @@ class Page:
         with gui.add_folder(name):
             picture = gui.add_image(np.zeros((*_MAP, 3), np.uint8), label="electrodes (tip left)")
             empty = np.zeros(2)
-            traces = gui.add_uplot(
-                (empty, *[empty] * 19), _series(viser, [f"e{i}" for i in range(1, 20)]), title="change [counts]", aspect=2.0
-            )
-            force = gui.add_uplot((empty, empty, empty), _series(viser, ["force [N]", "PDC/100"]), title="force and pressure", aspect=2.0)
+            look = {"scales": {"x": viser.uplot.Scale(time=False)}, "aspect": 2.0}
+            names = [f"e{i}" for i in range(1, 20)]
+            traces = gui.add_uplot((empty, *[empty] * 19), _series(viser, names), title="change [counts]", **look)
+            force = gui.add_uplot((empty, empty, empty), _series(viser, ["force [N]", "PDC/100"]), title="force and pressure", **look)
         self._gui[name] = picture, traces, force
         self._log[name] = []
+
+    def _aim(self, state):
+        """Points the camera at all fingers; once, as it is the user's afterwards."""
+        from scipy.spatial.transform import Rotation
+
+        place = np.concatenate(
+            [Rotation.from_quat(quat, scalar_first=True).apply(vert) + pos for vert, _, _, _, pos, quat in state.values()]
+        )
+        low, high = place.min(0), place.max(0)
+        center = (low + high) / 2
+        away = center + 1.15 * np.linalg.norm(high - low) * _FROM / np.linalg.norm(_FROM)
+        self.server.initial_camera.look_at, self.server.initial_camera.position, self.server.initial_camera.up = (
+            center,
+            away,
+            (0.0, 0.0, 1.0),
+        )
+        for client in self.server.get_clients().values():
+            client.camera.up_direction, client.camera.position, client.camera.look_at = (0.0, 0.0, 1.0), away, center
+        self._aimed = True
 
     def update(self, time, state):
         """Shows a moment.
@@ -99,6 +115,8 @@ class Page:
           time: [s].
           state: {name: (vert (nnode, 3) [m] of the outer nodes, counts (19,), pdc above rest, force [N], pos (3,), quat (4,))}.
         """
+        if not self._aimed:
+            self._aim(state)
         with self.server.atomic():
             self._title.content = f"**BioTac** t = {time:.3f} s"
             for name, (vert, counts, pdc, force, pos, quat) in state.items():

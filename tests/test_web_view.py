@@ -1,4 +1,4 @@
-"""The page in the browser: what an HTTP client and a websocket client get from it. (No browser can be had where this is tested.)"""
+"""The page in the browser: what an HTTP client and a websocket client get from it, and what a headless browser shows."""
 
 import asyncio
 import urllib.request
@@ -9,6 +9,7 @@ import pytest
 viser = pytest.importorskip("viser", reason="needs viser (extra web)")
 
 # ruff: noqa: E402
+import browser
 import zstandard
 
 from biotac_mj import cli, web_view
@@ -81,6 +82,30 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     rows = page._gui["left"][1].data
     np.testing.assert_allclose(rows[0], [0.1, 0.2])
     np.testing.assert_allclose(rows[5], [-300, -300])
+
+
+def green(picture):
+    """Where the skin is seen, right of which the panel begins."""
+    r, g, b = np.moveaxis(picture[:, :660].astype(int), 2, 0)
+    return np.argwhere((g - r > 20) & (g > b))
+
+
+@pytest.mark.skipif(browser.executable() is None, reason="needs Chromium (Debian: chromium)")
+def test_a_browser_shows_the_finger_wherever_it_is_and_what_it_feels(page, shell, tmp_path):
+    vert, counts = shell.vert[page.fingers["left"].node], np.full(19, 3000.0)
+    counts[4] -= 300
+    pose = np.array([0.3, -0.2, 1.0]), np.array([np.cos(0.4), 0, 0, np.sin(0.4)])
+    with browser.Browser(page.url, tmp_path) as window:
+        page.update(0.1, {"left": (vert, counts, 50.0, 0.4, *pose)})
+        before = window.until(lambda picture: len(green(picture)) > 3000)
+        assert np.abs(green(before).mean(0) - np.array(before.shape[:2]) / 2).max() < 70  # in the middle of the page
+        red = before[:, 660:].astype(int)
+        assert ((red[..., 0] > 180) & (red[..., 2] < 60)).sum() > 100  # the electrode whose counts fell, on the map
+        wide = vert * [1, 1, 1.6]
+        page.update(0.2, {"left": (wide, counts, 50.0, 0.4, *pose)})
+        window.until(lambda picture: len(green(picture)) > 1.15 * len(green(before)))
+        text = window.evaluate("document.body.innerText")
+    assert "t = 0.200 s" in text and "electrodes (tip left)" in text and "force and pressure" in text
 
 
 def test_electrode_map_shows_each_electrode_at_its_place():
