@@ -1,5 +1,7 @@
 """Effects that develop over the record in all electrodes: the shared impedance gain (warm-up), temperature, changes in counts."""
 
+import abc
+
 import numpy as np
 
 from .recorded_effect import Finding, Parameter, RecordedEffect
@@ -84,8 +86,9 @@ class TimeShaped(RecordedEffect):
 
 
 class Common(TimeShaped):
+    @abc.abstractmethod
     def pattern(self, counts):
-        raise NotImplementedError
+        """(19,) change of ln Z of each electrode for an amplitude of one, at these counts."""
 
     def find(self, session):
         line = session.timeline()
@@ -220,7 +223,7 @@ class CountGain(_InCounts):
         return v / v.mean()
 
 
-class Thermal(Common):
+class Thermal(TimeShaped):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
     physics = "all impedances follow the core's temperature, with a lag"
     params = {

@@ -14,6 +14,7 @@ Your own in ten lines:
     diagnose(sim, data, effects=[*CATALOGUE, HalfBoard()])
 """
 
+import abc
 import dataclasses
 
 import numpy as np
@@ -91,7 +92,7 @@ class Run:
         self.pressure = self.pressure * factor
 
 
-class Effect:
+class Effect(abc.ABC):
     """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values of shape parameters) and
     `apply`.
 
@@ -104,8 +105,9 @@ class Effect:
     law = 0.0  # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its interval
     grid: tuple = ({},)
 
+    @abc.abstractmethod
     def apply(self, run: Run, theta: dict) -> None:
-        raise NotImplementedError
+        """Changes `run` where the effect acts."""
 
     def applicable(self, trajectories) -> str | None:
         """Why the data cannot show the effect, or None."""

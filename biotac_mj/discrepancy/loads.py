@@ -5,6 +5,8 @@ blocks of
 time. An effect is a change of the force that the electrodes follow; it is judged by the logarithm of each block's error, block by block.
 """
 
+import abc
+
 import numpy as np
 from scipy.signal import lfilter
 
@@ -74,11 +76,13 @@ class ForceEffect(RecordedEffect):
 
     unit = "N"
 
+    @abc.abstractmethod
     def see(self, force, rate, theta):
-        raise NotImplementedError
+        """(n, 3) force that the electrodes follow [N]."""
 
+    @abc.abstractmethod
     def unsee(self, force, rate, theta):
-        raise NotImplementedError
+        """(n, 3) force that a sensor would have said from what the electrodes followed [N]: the inverse of `see`."""
 
 
 class Latency(ForceEffect):

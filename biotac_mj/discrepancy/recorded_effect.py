@@ -1,5 +1,6 @@
 """What an effect on plain recordings is: found in a `Session`, applied to clean counts, taken out of measured ones."""
 
+import abc
 import dataclasses
 
 import numpy as np
@@ -60,7 +61,7 @@ class Finding:
         return self.effect.apply(counts, time, self.channels, self.theta)
 
 
-class RecordedEffect:
+class RecordedEffect(abc.ABC):
     """One effect that recordings alone can show.
 
     Subclasses set id, name, stage (of STAGES), physics, params (name -> Parameter) and confusable (id -> what would tell them apart) and
@@ -76,8 +77,9 @@ class RecordedEffect:
     params: dict = {}
     confusable: dict = {}
 
+    @abc.abstractmethod
     def find(self, session) -> list:
-        raise NotImplementedError
+        """Findings in the part of the session that may be fitted."""
 
     def apply(self, counts, time, channels, theta):
         return counts
