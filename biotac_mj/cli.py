@@ -303,6 +303,10 @@ def _add_diagnose(verbs):
     kept = "of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
+    verb.add_argument(
+        "--in-skin", action="store_true", help="relaxation, creep and softening inside the finite elements (full tier) in the proof"
+    )
+    verb.add_argument("--device", default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0")
     verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 

@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from biotac_mj import cli
 from biotac_mj.discrepancy.catalogue import by_id
 from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
+from biotac_mj.discrepancy.simulator import Simulator, load_simulator
 from biotac_mj.discrepancy.trajectories import Trajectory
 
 
@@ -21,6 +23,33 @@ def test_effects_become_what_the_material_remembers():
     slope = np.polyfit(np.log(t), np.log(1 + np.exp(-t[:, None] / tau) @ g), 1)[0]
     assert slope == pytest.approx(-0.05, rel=0.25)
     assert memory_of([(by_id("relax"), {"g": 0.0, "tau": 1.0})])[0]["prony"] == ()
+
+
+def test_a_file_says_where_constitutive_effects_act(tmp_path):
+    InSkinSimulator(effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})]).save(tmp_path / "s.yaml")
+    again = load_simulator(tmp_path / "s.yaml")
+    assert type(again) is InSkinSimulator and again.effects[0][1] == {"g": 0.3, "tau": 2.0}
+    Simulator().save(tmp_path / "r.yaml")
+    assert type(load_simulator(tmp_path / "r.yaml")) is Simulator
+    (tmp_path / "x.yaml").write_text((tmp_path / "r.yaml").read_text().replace("constitutive: reduced", "constitutive: elsewhere"))
+    with pytest.raises(ValueError, match="constitutive 'elsewhere' is none of reduced, in_skin"):
+        load_simulator(tmp_path / "x.yaml")
+
+
+@pytest.mark.parametrize(
+    "arguments, text",
+    [
+        (["--sensor", "r.yaml", "--in-skin"], "write `constitutive: in_skin` into it"),
+        (["--device", "cuda:0"], "add --tier full"),
+        (["--device", "cuda:0", "--in-skin"], "for the full tier without --in-skin"),
+    ],
+)
+def test_the_command_line_says_what_does_not_go_together(arguments, text, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("biotac_mj.discrepancy.workflow_verb.read_trajectories", lambda path: [])
+    Simulator().save("r.yaml")
+    assert cli.main(["diagnose", "measured.h5", *arguments]) == 2
+    assert text in capsys.readouterr().err
 
 
 def test_the_condensed_tier_is_refused():

@@ -8,10 +8,11 @@ much the reduced forms differ.
 """
 
 import dataclasses
+import typing
 
 import numpy as np
 
-from .simulator import Simulator, _impedance, _sphere_radius
+from .simulator import Simulator, _impedance, placed
 
 __all__ = ["InSkinSimulator", "memory_of", "solve_with_memory"]
 
@@ -84,6 +85,7 @@ class InSkinSimulator(Simulator):
     """
 
     tier: str = "full"
+    constitutive: typing.ClassVar[str] = "in_skin"
 
     def __post_init__(self):
         if self.tier != "full":
@@ -109,16 +111,10 @@ class _Remembering(Simulator):
     """Solves the skin with `memory`; nothing is cached, since the past decides."""
 
     def solve(self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None) -> list:
-        poses = []
-        for i, t in enumerate(trajectories):
-            tool, pos = t.tool, t.pos + (0.0 if offset is None else offset[i])
-            grow = 0.0 if log_radius is None else float(log_radius[i])
-            if grow and "sphere" in tool:
-                radius = _sphere_radius(tool)
-                tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
-                radius *= np.exp(grow)
-                tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
-            poses.append((tool, pos))
+        poses = [
+            placed(t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i]))
+            for i, t in enumerate(trajectories)
+        ]
         model, film = self._model(log_friction, bubble)
         return solve_with_memory(model, film, trajectories, poses, progress)
 

@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import hashlib
 import pathlib
+import typing
 
 import numpy as np
 import tqdm
@@ -48,6 +49,7 @@ class Simulator:
     cache: str | None = None
     device: str = "cpu"
     intervals: dict = dataclasses.field(default_factory=dict)
+    constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
 
     def with_effects(self, effects, modulus=None) -> "Simulator":
         """A copy with these effects added."""
@@ -66,14 +68,7 @@ class Simulator:
         """
         out, todo = [None] * len(trajectories), []
         for i, t in enumerate(trajectories):
-            shift = 0.0 if offset is None else offset[i]
-            grow = 0.0 if log_radius is None else float(log_radius[i])
-            tool, pos = t.tool, t.pos + shift
-            if grow and "sphere" in tool:
-                radius = _sphere_radius(tool)
-                tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
-                radius *= np.exp(grow)
-                tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
+            tool, pos = placed(t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i]))
             key = hashlib.sha256(
                 repr((self.skin, self.tier, self.material, self.sensor, tool, round(log_friction, 9), round(bubble * 1e12, 6), "v2")).encode()  # noqa: E501
                 + np.round(pos, 9).tobytes() + np.round(t.mat, 9).tobytes()
@@ -253,7 +248,7 @@ class Simulator:
             stages[STAGES[effect.stage]].append({"effect": effect.id, "name": effect.name, "parameters": parameters})
         document = {
             "schema": SCHEMA, "skin": self.skin, "tier": self.tier, "material": self.material, "sensor": self.sensor,
-            "modulus_factor": float(self.modulus), "stages": {k: v for k, v in stages.items() if v},
+            "constitutive": self.constitutive, "modulus_factor": float(self.modulus), "stages": {k: v for k, v in stages.items() if v},
         }  # fmt: skip
         with replacing(path) as temporary:
             temporary.write_text(yaml.safe_dump(document, sort_keys=False))
@@ -276,6 +271,8 @@ def load_simulator(path, extra=()) -> Simulator:
       FileNotFoundError, ValueError: no file, no YAML, another schema, unknown effect or parameter.
     """
     import yaml
+
+    from .in_skin import InSkinSimulator
 
     path = pathlib.Path(path)
     if not path.is_file():
@@ -302,7 +299,22 @@ def load_simulator(path, extra=()) -> Simulator:
                 raise ValueError(f"{path}: effect {effect.id!r} acts at the stage {STAGES[effect.stage]!r}, not {stage!r}")
             effects.append((effect, theta))
     keys = {k: document[k] for k in ("skin", "tier", "material", "sensor") if k in document}
-    return Simulator(**keys, effects=effects, modulus=float(document.get("modulus_factor", 1.0)), intervals=intervals)
+    kinds = {"reduced": Simulator, "in_skin": InSkinSimulator}
+    kind = document.get("constitutive", "reduced")
+    if kind not in kinds:
+        raise ValueError(f"{path}: constitutive {kind!r} is none of {', '.join(kinds)}")
+    return kinds[kind](**keys, effects=effects, modulus=float(document.get("modulus_factor", 1.0)), intervals=intervals)
+
+
+def placed(t, shift=None, grow=0.0):
+    """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied by exp(grow), its tip kept."""
+    tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)
+    if grow and "sphere" in tool:
+        radius = _sphere_radius(tool)
+        tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
+        radius *= np.exp(grow)
+        tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
+    return tool, pos
 
 
 def _begin(order, t, base, session, first_tdc):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..press_record import replacing
 from .effect import STAGES
+from .in_skin import InSkinSimulator
 from .simulator import Simulator, load_simulator
 from .trajectories import read_trajectories
 from .where import conditions
@@ -20,7 +21,14 @@ def diagnose_data(args) -> None:
     """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`."""
     out = pathlib.Path(args.out)
     data = read_trajectories(args.data)
-    sim = load_simulator(args.sensor) if args.sensor else Simulator(tier=args.tier)
+    sim = load_simulator(args.sensor) if args.sensor else InSkinSimulator() if args.in_skin else Simulator(tier=args.tier)
+    if args.in_skin and not isinstance(sim, InSkinSimulator):
+        raise ValueError(
+            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: in_skin` into it, or leave --in-skin out"
+        )
+    sim.device = args.device
+    if args.device != "cpu" and (sim.tier != "full" or args.in_skin):
+        raise ValueError(f"--device {args.device} is for the full tier without --in-skin: add --tier full, or leave it out")
     sim.cache = str(out / "fields")  # solved fields stay: run again after an interruption
     report = diagnose(sim, data, locked=0.25 if args.locked is None else args.locked, progress=not args.quiet)
     files = write_report(report, sim, out)
