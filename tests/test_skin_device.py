@@ -12,8 +12,6 @@ from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.device_step import prepare_device, step_device
 from biotac_mj.skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
-pytest.importorskip("cholespy")  # the CPU's factor
-
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
 START = 13.5e-3  # z of the sphere's centre where it touches the ball [m]
 

@@ -94,15 +94,16 @@ class SyntheticSensor:
       variation: SensorVariation. model: SkinModel of its skin.
 
     Raises:
-      ValueError: scikit-fem is missing.
+      ValueError: scikit-fem or cholespy is missing.
     """
 
     def __init__(self, seed: int = 0, skin: str = "fine", device="cpu"):
         from ..skin import SkinModel, SkinOptions
         from ..skin.material import Material
 
-        if importlib.util.find_spec("skfem") is None:
-            raise ValueError("the synthetic measured sensor needs scikit-fem: pip install 'biotac-mj[data]', or take --labelled 0")
+        for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
+            if importlib.util.find_spec(module) is None:
+                raise ValueError(f"the synthetic measured sensor needs {name}: pip install 'biotac-mj[data]', or take --labelled 0")
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
         options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
