@@ -20,7 +20,7 @@ _threads = ThreadpoolController()
 
 _BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = 0.01
-_FACTOR = 60  # products of the tangent: about what a factor costs
+_FACTOR = 25  # products of the tangent: about what a factor costs
 _PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
 
