@@ -173,6 +173,7 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
     from . import plugin
     from .coupling import skins
     from .sensor.channels import REST_COUNTS
+    from .web_scene import Scene
 
     if page is None:
         fingers = {
@@ -181,6 +182,7 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
         }
         page = Page(fingers, **server)
     mujoco.mj_forward(model, data)
+    scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
     shown = -np.inf
     while data.time < seconds:
@@ -191,6 +193,7 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
         plugin.check()
         if data.time - shown > 0.04 - 1e-9:
             shown = data.time
+            scene.update(data)
             page.update(shown, {name: _state(model, data, h, page.fingers[name], rest[name]) for name, h in handles.items()})
         clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
     return page
