@@ -271,13 +271,14 @@ def test_dm_controls_action_scale(domain, task):
     assert np.abs(moved[0]).max() > 5e-5
 
 
-def test_dm_controls_viewer():
+@pytest.mark.parametrize("domain, task", TASKS)
+def test_dm_controls_viewer(domain, task):
     """The viewer's own runtime, without its window."""
     from dm_control.viewer import runtime
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        shown = runtime.Runtime(environment=load("finger", "press", task_kwargs={"random": 0}), policy=None)
+        shown = runtime.Runtime(environment=load(domain, task, task_kwargs={"random": 0}), policy=None)
     shown.tick(0.05, paused=False)
     shown.tick(0.05, paused=False)
     assert shown.get_time() > 0
@@ -285,7 +286,11 @@ def test_dm_controls_viewer():
 
 _PIXELS = """
 from dm_control.suite.wrappers import pixels
-from biotac_mj.tasks import load
+from biotac_mj.tasks import load, suite
+for domain, task in suite.tasks():
+    env = pixels.Wrapper(load(domain, task, task_kwargs={"random": 0}), render_kwargs={"height": 48, "width": 64})
+    picture = env.reset().observation["pixels"]
+    assert picture.shape == (48, 64, 3) == env.observation_spec()["pixels"].shape and picture.std() > 5, (task, picture)
 size = {"height": 48, "width": 64, "camera_id": "side"}
 env = pixels.Wrapper(load("finger", "press", task_kwargs={"random": 0}), render_kwargs=size)
 picture = env.reset().observation["pixels"]
