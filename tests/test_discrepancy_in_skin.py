@@ -14,15 +14,15 @@ from biotac_mj.discrepancy.trajectories import Trajectory
 
 def test_effects_become_what_the_material_remembers():
     effects = [(by_id("relax"), {"g": 0.2, "tau": 3.0}), (by_id("gain"), {}), (by_id("mullins"), {"softening": 0.25, "width": 0.7})]
-    memory, rest = memory_of(effects)
-    assert memory == {"prony": ((0.2, 3.0),), "mullins": (4.0, 1.0, 0.7)} and [e.id for e, _ in rest] == ["gain"]
+    inside = memory_of(effects)
+    assert inside.material == {"prony": ((0.2, 3.0),), "mullins": (4.0, 1.0, 0.7)} and [e.id for e, _ in inside.rest] == ["gain"]
+    assert inside.contact == inside.model == {}
     # a power law of slope -n between the shortest and the longest of its times
-    memory, _ = memory_of([(by_id("creep"), {"n": 0.05})])
-    g, tau = np.array(memory["prony"]).T
+    g, tau = np.array(memory_of([(by_id("creep"), {"n": 0.05})]).material["prony"]).T
     t = np.geomspace(0.1, 10, 30)
     slope = np.polyfit(np.log(t), np.log(1 + np.exp(-t[:, None] / tau) @ g), 1)[0]
     assert slope == pytest.approx(-0.05, rel=0.25)
-    assert memory_of([(by_id("relax"), {"g": 0.0, "tau": 1.0})])[0]["prony"] == ()
+    assert memory_of([(by_id("relax"), {"g": 0.0, "tau": 1.0})]).material == {"prony": ()}
 
 
 def test_a_file_says_where_constitutive_effects_act(tmp_path):

@@ -14,25 +14,50 @@ import numpy as np
 
 from .simulator import Simulator, _impedance, placed
 
-__all__ = ["InSkinSimulator", "memory_of", "solve_with_memory"]
+__all__ = ["Inside", "InSkinSimulator", "memory_of", "solve_with_memory"]
 
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
 _ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
 
 
-def memory_of(effects):
-    """What a material remembers under effects [(Effect, theta)]: dict of `prony` and `mullins`, and the effects that are left."""
-    prony, mullins, rest = [], None, []
+class Inside(typing.NamedTuple):
+    """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact), arguments of its `SkinModel`; and
+    the effects [(Effect, theta)] that are left to act as they do without the skin."""
+
+    material: dict
+    contact: dict
+    model: dict
+    rest: list
+
+
+def memory_of(effects) -> Inside:
+    """What effects [(Effect, theta)] change of a skin in which they act themselves."""
+    inside = Inside({"prony": ()}, {}, {}, [])
     for effect, theta in effects:
-        if effect.id == "relax":
-            prony.append((max(theta["g"], 0.0), theta["tau"]))
-        elif effect.id == "creep":
-            prony += [(max(theta["n"], 0.0) * np.log(10**0.5), tau) for tau in _TAUS]
-        elif effect.id == "mullins" and theta["softening"] > 0:
-            mullins = (1 / theta["softening"], _ENERGY, theta.get("width", _SHARE))
+        becomes = _BECOMES.get(effect.id)
+        if becomes is None:
+            inside.rest.append((effect, theta))
         else:
-            rest.append((effect, theta))
-    return {"prony": tuple(p for p in prony if p[0] > 0), "mullins": mullins}, rest
+            becomes(inside, theta)
+    return inside
+
+
+def _relax(inside, theta):
+    if theta["g"] > 0:
+        inside.material["prony"] += ((theta["g"], theta["tau"]),)
+
+
+def _creep(inside, theta):
+    for tau in _TAUS:
+        _relax(inside, {"g": theta["n"] * np.log(10**0.5), "tau": tau})
+
+
+def _mullins(inside, theta):
+    if theta["softening"] > 0:
+        inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
+
+
+_BECOMES = {"relax": _relax, "creep": _creep, "mullins": _mullins}  # effect id -> function that writes it into an Inside
 
 
 def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> list:
@@ -41,7 +66,7 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
     Overstress is forgotten between trajectories, the largest energy of every point is not.
 
     Args:
-      model: SkinModel on the CPU whose material has `prony` or `mullins`; film: FilmConduction.
+      model: SkinModel on the CPU; film: FilmConduction.
       poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
 
     Returns:
@@ -53,9 +78,10 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
     data, out = SkinData(model), []
     for i, t in enumerate(trajectories):
         tool, pos = (t.tool, t.pos) if poses is None else poses[i]
-        worst = data.memory.worst.copy()
+        worst = data.memory.worst.copy() if data.memory else None
         data.reset()
-        np.maximum(worst, data.memory.worst, out=data.memory.worst)
+        if data.memory:
+            np.maximum(worst, data.memory.worst, out=data.memory.worst)
         scene = Scene([tool], model.device, model.material.friction)
         at, turn, row = _walk(pos, t.mat)
         ends = np.flatnonzero(row >= 0)
@@ -94,12 +120,12 @@ class InSkinSimulator(Simulator):
     def run(self, trajectories, fields=None, exact=True, effects=None, **kw):
         """See `Simulator.run`; where the skin is solved anew, what the material remembers is inside it."""
         effects = self.effects if effects is None else effects
-        memory, rest = memory_of(effects)
-        if exact is False or len(rest) == len(effects):
+        inside = memory_of(effects)
+        if exact is False or len(inside.rest) == len(effects):
             return super().run(trajectories, fields, exact, effects, **kw)
         inner = _Remembering(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Simulator) if f.init} | {"cache": None})
-        inner.memory, inner._models = memory, {}
-        runs = inner.run(trajectories, None, True, rest, **kw)
+        inner.inside, inner._models = inside, {}
+        runs = inner.run(trajectories, None, True, inside.rest, **kw)
         if exact is True:
             return runs
         listed = set(np.atleast_1d(exact).tolist())
@@ -108,7 +134,7 @@ class InSkinSimulator(Simulator):
 
 
 class _Remembering(Simulator):
-    """Solves the skin with `memory`; nothing is cached, since the past decides."""
+    """Solves the skin with what is `inside`; nothing is cached, since the past decides."""
 
     def solve(self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None) -> list:
         poses = [
@@ -124,6 +150,8 @@ class _Remembering(Simulator):
 
         if bubble not in self._models:
             super()._model(0.0, bubble)
-            elastic = self._models[bubble]
-            self._models[bubble] = SkinModel(elastic.geometry, dataclasses.replace(material(self.material), **self.memory), elastic.options)
+            plain = self._models[bubble]
+            rubber = dataclasses.replace(material(self.material), **self.inside.material)
+            options = dataclasses.replace(plain.options, **self.inside.contact)
+            self._models[bubble] = SkinModel(plain.geometry, rubber, options, **self.inside.model)
         return super()._model(log_friction, bubble)
