@@ -194,7 +194,7 @@ class FemStepper:
             contacts=_contacts(self._part(state, "contacts")),
             pressure=self._part(state, "pressure")[0],
         )
-        if d.memory:
+        if self._material.remembers:
             d.memory.load(self._part(state, "memory"), d.x)
         geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
         geoms.advance()
@@ -219,7 +219,7 @@ class FemStepper:
         buffer[1 : 1 + contacts.size] = contacts.ravel()
         if self.inertial:
             self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
-        if d.memory:
+        if self._material.remembers:
             self._part(state, "memory")[:] = d.memory.state()
 
 

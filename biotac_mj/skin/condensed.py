@@ -108,8 +108,10 @@ class CondensedSkin:
             raise ValueError("the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA")
         if model.options.dynamics != "quasistatic":
             raise ValueError("the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier")
-        if model.material.remembers:
-            raise ValueError("the condensed tier is elastic: leave prony and mullins out of the material, or choose the full tier")
+        if model.extensions:
+            raise ValueError(
+                f"the condensed tier is elastic, the same everywhere: leave {' and '.join(model.extensions)} out, or choose the full tier"
+            )
         filled = model.has_liquid and (model.options.fill_volume or model.options.rest_pressure)
         if filled and (model.options.fill_volume < 0 or model.options.rest_pressure < 0):
             raise ValueError(

@@ -96,7 +96,7 @@ class SkinData:
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
-      memory: StressMemory of skin with `prony` or `mullins`, or None; `reset` forgets.
+      memory: StressMemory of skin with `prony`, `mullins`, `hysteresis` or `stiffening`, or None; `reset` forgets.
     """
 
     converged = _Scalar("reason", lambda reason: reason == 0)
@@ -109,14 +109,15 @@ class SkinData:
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
-        if any((m.prony, m.mullins) != (model.material.prony, model.material.mullins) for m in materials):
-            raise ValueError("prony and mullins are the model's: give the worlds' materials the same")
+        beyond = ("prony", "mullins", "hysteresis", "stiffening")
+        if any(getattr(m, name) != getattr(model.material, name) for m in materials for name in beyond):
+            raise ValueError(f"{', '.join(beyond)} are the model's: give the worlds' materials the same")
         self.nworld, self.model = nworld, model
         self.resident = model.device.is_cuda if resident is None else resident
-        if self.resident and model.material.remembers:
+        if self.resident and model.extensions:
             raise ValueError(
-                "skin that remembers (prony, mullins) is solved on the CPU's full tier only: choose device='cpu' and resident=False, "
-                "or leave both out of the material"
+                f"skin with {' and '.join(model.extensions)} is solved on the CPU's full tier only: choose device='cpu' and "
+                "resident=False, or leave this out"
             )
         if model.device.is_cuda and not self.resident:
             raise ValueError("on CUDA the state is always resident: leave resident out, or make the model on the CPU")
@@ -138,7 +139,7 @@ class SkinData:
         if self.resident:
             self._allocate_device()
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
-        self.memory = StressMemory(model, nworld, self.mu, self.lam) if model.material.remembers else None
+        self.memory = StressMemory(model, nworld, self.mu, self.lam) if model.material.extensions else None
         self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
         self.core_pos = np.zeros((nworld, 3))
         self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))

@@ -194,6 +194,13 @@ def incidence(nvert: int, cells: np.ndarray):
     return start, slot
 
 
+def scale_stress(modulus, cauchy, mises):
+    """Multiplies stresses [nelem, nworld] on the CPU by factors (nelem,), or by nothing."""
+    if modulus is not None:
+        cauchy.numpy()[...] *= modulus[:, None, None, None]
+        mises.numpy()[...] *= modulus[:, None]
+
+
 class LinearTetrahedra:
     """Four-node tetrahedra with constant strain (the paper's, CalculiX's C3D4).
 
@@ -205,16 +212,19 @@ class LinearTetrahedra:
       elem: (nelem, 4).
       law: number of the material law, see `material.LAWS`.
       device: Warp device.
+      modulus: (nelem,) factors on the elastic constants, or None.
 
     Raises:
       ValueError: a tetrahedron is inverted or degenerate.
     """
 
-    def __init__(self, vert, elem, law, device):
+    def __init__(self, vert, elem, law, device, modulus=None):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
-        self._elem, self._launch = elem, Launches(device)
+        self._elem, self._launch, self.modulus = elem, Launches(device), modulus
         self._inverse_edges, self._volume = rest_shape(vert, elem)
         self.node_volume = np.bincount(elem.ravel(), np.repeat(self._volume / 4, 4), self.nvert)
+        if modulus is not None:  # energy is linear in the constants: they may as well multiply the volume
+            self._volume = self._volume * modulus
         start, slot = incidence(self.nvert, elem)
         with wp.ScopedDevice(device):
             self.elem = wp.array(elem, dtype=wp.vec4i)
@@ -261,6 +271,7 @@ class LinearTetrahedra:
         cauchy = wp.zeros((self.nelem, x.shape[1]), dtype=mat33, device=self.device)
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
         self._launch(tet_stress, mises.shape, [self.law, mu, lam, self.elem, self.inverse_edges, x], [cauchy, mises])
+        scale_stress(self.modulus, cauchy, mises)
         return cauchy, mises
 
 

@@ -31,7 +31,7 @@ def rest_state(model) -> Rest:
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY)
-    bare.material = dataclasses.replace(model.material, prony=(), mullins=None)  # relaxed and virgin
+    bare.material = dataclasses.replace(model.material, prony=(), mullins=None, hysteresis=())  # relaxed and virgin
     bare.rest = Rest(vert, 0.0, volume, volume)
     data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
     liquid = data.liquid

@@ -36,7 +36,10 @@ class Material:
       liquid: whether the preset fills the space between skin and core with the liquid.
       element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see `SkinOptions`.
       prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term modulus. Steps need their dt.
-      mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `stress_memory` for both. CPU, full tier.
+      mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `stress_memory`.
+      hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus that slips at this von Mises
+        strain, see `hysteresis`.
+      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four: CPU, full tier.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -51,14 +54,17 @@ class Material:
     element: str | None = None
     prony: tuple = ()
     mullins: tuple | None = None
+    hysteresis: tuple = ()
+    stiffening: float = 0.0
 
     def __post_init__(self):
         self._check_memory()
+        self._check_hysteresis()
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
         if self.element not in (None, *ELEMENTS):
             raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the geometry's")
-        for name in ("youngs_modulus", "poissons_ratio", "friction", "density"):
+        for name in ("youngs_modulus", "poissons_ratio", "friction", "density", "stiffening"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
         if self.youngs_modulus <= 0 or self.density <= 0:
@@ -89,10 +95,27 @@ class Material:
         if self.mullins is not None and not (r > 1 and m > 0 and beta >= 0 and math.isfinite(r + m + beta)):
             raise ValueError(f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0")
 
+    def _check_hysteresis(self):
+        try:
+            object.__setattr__(self, "hysteresis", tuple((float(g), float(strain)) for g, strain in self.hysteresis))
+        except (TypeError, ValueError):
+            raise ValueError(f"hysteresis is {self.hysteresis!r}: pass ((g, strain), ...)") from None
+        for g, strain in self.hysteresis:
+            if not (math.isfinite(g) and g >= 0 and math.isfinite(strain) and strain > 0):
+                raise ValueError(
+                    f"a friction element of g {g} and strain {strain}: g must be >= 0 and the strain at which it slips positive"
+                )
+
     @property
     def remembers(self) -> bool:
         """Whether the stress depends on the past."""
-        return bool(self.prony) or self.mullins is not None
+        return bool(self.prony or self.hysteresis) or self.mullins is not None
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """Names of the options in use that the CPU's full tier alone has."""
+        names = ("prony", "mullins", "hysteresis", "stiffening")
+        return tuple(n for n in names if getattr(self, n) not in ((), None, 0.0))
 
     @property
     def mu(self) -> float:

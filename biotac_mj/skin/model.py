@@ -135,9 +135,14 @@ class SkinModel:
       device: "cpu" or a CUDA device of Warp.
       fixed: (n,) nodes of the given geometry that do not move, instead of its own.
       core_faces: (n,) inner faces of the given geometry that can meet the core, instead of all that start clear of it.
+      modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each element of the given geometry, or a
+        function of rest positions (n, 3) [m] that gives (n,), asked at the centroids of the elements that are solved. CPU, full tier.
+
+    Attributes:
+      modulus: (nelem,) of the elements that are solved, or None.
 
     Raises:
-      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed.
+      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed, a modulus of another shape or not positive, or on CUDA.
     """
 
     def __init__(
@@ -148,6 +153,7 @@ class SkinModel:
         device="cpu",
         fixed=None,
         core_faces=None,
+        modulus=None,
     ):
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
@@ -178,7 +184,8 @@ class SkinModel:
         self.crushed_depth = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness  # [m]
 
         formulation = QuadraticTetrahedra if self.element == "quadratic" else elasticity.LinearTetrahedra
-        self.elasticity = formulation(vert, elem, self.law, self.device)
+        self.modulus = None if modulus is None else self._moduli(modulus, given)
+        self.elasticity = formulation(vert, elem, self.law, self.device, modulus=self.modulus)
         mask = np.zeros(self.nvert)
         mask[self.free] = 1
         with wp.ScopedDevice(self.device):
@@ -197,6 +204,29 @@ class SkinModel:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
         self._stiffness = self._of_free(self.elasticity.rest_stiffness(self.material.mu, self.material.lame))
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """Names of the options in use that the CPU's full tier alone has."""
+        return (*self.material.extensions, *([] if self.modulus is None else ["modulus"]))
+
+    def _moduli(self, modulus, given):
+        """(nelem,) factors on Young's modulus of the elements that are solved."""
+        if self.device.is_cuda:
+            raise ValueError("skin with a modulus of its own in every element is solved on the CPU's full tier only: choose device='cpu'")
+        if callable(modulus):
+            at = self.geometry.vert[self._elem[:, :4]].mean(1)
+            factor, n, what = np.asarray(modulus(at), float), self.nelem, f"{self.nelem} positions"
+        else:
+            factor, n = np.asarray(modulus, float), len(given.elem)
+            what = f"{n} elements of {given.name!r}"
+        if factor.shape != (n,):
+            raise ValueError(f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)")
+        if not (np.isfinite(factor) & (factor > 0)).all():
+            raise ValueError(
+                f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not positive finite numbers"
+            )
+        return np.repeat(factor, self.nelem // n)  # the eight linear parts of a ten-node tetrahedron follow each other
 
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
@@ -260,7 +290,7 @@ class SkinModel:
         Raises:
           ValueError: a tetrahedron is inverted there.
         """
-        formulation = type(self.elasticity)(vert_xpos, self._elem, self.law, self.device)
+        formulation = type(self.elasticity)(vert_xpos, self._elem, self.law, self.device, modulus=self.modulus)
         return self._invert(self._of_free(formulation.rest_stiffness(self.material.mu, self.material.lame)))
 
     def _invert(self, stiffness):

@@ -20,7 +20,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..geometry.edge_nodes import shape_gradients
-from .elasticity import gather, incidence, rest_shape
+from .elasticity import gather, incidence, rest_shape, scale_stress
 from .launch import Launches
 from .material import (
     LAWS,
@@ -228,14 +228,15 @@ class QuadraticTetrahedra:
       law: number of the material law, see `material.LAWS`.
       device: Warp device.
       contraction: of the integration points, see above.
+      modulus: (nelem,) factors on the elastic constants, or None.
 
     Raises:
       ValueError: a tetrahedron is inverted or degenerate, or a curved edge folds one.
     """
 
-    def __init__(self, vert, elem, law, device, contraction=CONTRACTION):
+    def __init__(self, vert, elem, law, device, contraction=CONTRACTION, modulus=None):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
-        self._elem, self._launch = elem, Launches(device)
+        self._elem, self._launch, self.modulus = elem, Launches(device), modulus
         rest_shape(vert, elem[:, :4])
         shape = shape_gradients(0.25 + contraction * (_POINTS - 0.25))
         edges = np.einsum("eai,qak->eqik", vert[elem], shape)
@@ -244,11 +245,13 @@ class QuadraticTetrahedra:
         if len(folded):
             raise ValueError(f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): straighten their edges")
         inverse = np.linalg.inv(edges)
-        self._gradient, self._weight = np.einsum("qak,eqki->eqai", shape, inverse), weight
-        self._volume = weight.sum(1)
         # lumped as by the eight linear parts: 1/32 to a corner, 7/48 to an edge (Hinton, Rock and Zienkiewicz 1976)
         share = np.array([1 / 32] * 4 + [7 / 48] * 6)
-        self.node_volume = np.bincount(elem.ravel(), np.outer(self._volume, share).ravel(), self.nvert)
+        self.node_volume = np.bincount(elem.ravel(), np.outer(weight.sum(1), share).ravel(), self.nvert)
+        if modulus is not None:  # energy is linear in the constants: they may as well multiply the volume
+            weight = weight * modulus[:, None]
+        self._gradient, self._weight = np.einsum("qak,eqki->eqai", shape, inverse), weight
+        self._volume = weight.sum(1)
         start, slot = incidence(self.nvert, elem)
         with wp.ScopedDevice(device):
             self.elem = wp.array(elem, dtype=int, ndim=2)
@@ -328,6 +331,7 @@ class QuadraticTetrahedra:
         cauchy = wp.zeros((self.nelem, x.shape[1]), dtype=mat33, device=self.device)
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
         self._launch(quadratic_stress, mises.shape, [*self._mesh(mu, lam), x], [cauchy, mises])
+        scale_stress(self.modulus, cauchy, mises)
         return cauchy, mises
 
 

@@ -98,7 +98,7 @@ class _Step:
         self.M = data.preconditioner
         if data.memory:
             data.memory.begin(dt)
-            self.M.scale = data.stiffness_scale * data.memory.stiffening
+            self.M.scale = data.stiffness_scale * data.memory.stiffness
         self.products = 0
         self.inertia = None
         if model.options.dynamics == "implicit":

@@ -1,4 +1,4 @@
-"""Skin that remembers: stress relaxation by a Prony series and Mullins softening, inside the elements, on top of any law and element.
+"""What a material has beyond its law, at every integration point of any element: relaxation, Mullins softening, friction, stiffening.
 
 Relaxation is finite linear viscoelasticity (Simo 1987; Holzapfel 2000, ch. 6): every term of the series adds an overstress Q_i to the
 second Piola-Kirchhoff stress S of the elastic law, which stays the long-term one,
@@ -14,80 +14,25 @@ the body, so that nothing here depends on rotations (but for the `linear` law, w
 
 Within a step the past is a constant H, S = (1 + c) eta S_elastic + H with c = sum_i g_i h_i: the elastic law again, stiffer, with an
 initial stress. Hence the tangent is symmetric and exact (algorithmic).
+
+Stiffening (`stiffening.py`) belongs to the elastic law, so it relaxes and softens too; friction (`hysteresis.py`) stands beside both.
 """
 
 import numpy as np
 import warp as wp
 
-from . import elasticity, quadratic
+from . import quadratic
+from .hysteresis import FrictionBranches
 from .material import energy_density, polar_rotation, stress, stress_derivative
+from .points import IntegrationPoints
+from .stiffening import added_derivative, added_energy, added_stress
 from .types import mat33, real, vec3
 
 __all__ = ["StressMemory"]
 
 wp.set_module_options({"enable_backward": False})
 
-
-@wp.kernel
-def linear_gradient(
-    # In:
-    elem: wp.array(dtype=wp.vec4i),
-    inverse_edges: wp.array(dtype=mat33),
-    x: wp.array2d(dtype=vec3),
-    # Out:
-    gradient_out: wp.array2d(dtype=mat33),
-):
-    e, w = wp.tid()
-    gradient_out[e, w] = elasticity.edge_matrix(x, elem[e], w) * inverse_edges[e]
-
-
-@wp.kernel
-def quadratic_gradient(
-    # In:
-    elem: wp.array2d(dtype=int),
-    shape: wp.array(dtype=wp.types.matrix(shape=(10, 3), dtype=wp.float64)),
-    inverse: wp.array2d(dtype=mat33),
-    x: wp.array2d(dtype=vec3),
-    # Out:
-    gradient_out: wp.array2d(dtype=mat33),
-):
-    e, w = wp.tid()
-    X = quadratic.nodes(x, elem, e, w)
-    for q in range(4):
-        gradient_out[4 * e + q, w] = X * shape[q] * inverse[e, q]
-
-
-@wp.kernel
-def linear_divergence(
-    # In:
-    inverse_edges: wp.array(dtype=mat33),
-    volume: wp.array(dtype=real),
-    stress: wp.array2d(dtype=mat33),
-    sign: real,
-    # Out:
-    corner_out: wp.array2d(dtype=vec3),
-):
-    """Nodal forces of first Piola stresses, times sign."""
-    e, w = wp.tid()
-    elasticity.write_corners(sign * volume[e] * stress[e, w] * wp.transpose(inverse_edges[e]), e, w, corner_out)
-
-
-@wp.kernel
-def quadratic_divergence(
-    # In:
-    shape: wp.array(dtype=wp.types.matrix(shape=(10, 3), dtype=wp.float64)),
-    inverse: wp.array2d(dtype=mat33),
-    weight: wp.array2d(dtype=real),
-    stress: wp.array2d(dtype=mat33),
-    sign: real,
-    # Out:
-    corner_out: wp.array2d(dtype=vec3),
-):
-    e, w = wp.tid()
-    C = quadratic.mat310()
-    for q in range(4):
-        C += (sign * weight[e, q] * stress[4 * e + q, w] * wp.transpose(inverse[e, q])) * wp.transpose(shape[q])
-    quadratic.scatter(C, e, w, corner_out)
+_ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]  # six numbers of a symmetric 3 x 3, and back
 
 
 @wp.func
@@ -114,8 +59,10 @@ def evaluate(
     mu: wp.array(dtype=real),
     lam: wp.array(dtype=real),
     cap: real,
+    stiffening: real,
     mullins: vec3,
     gain: real,
+    modulus: wp.array(dtype=real),
     worst: wp.array2d(dtype=real),
     past: wp.array2d(dtype=mat33),
     gradient: wp.array2d(dtype=mat33),
@@ -125,7 +72,7 @@ def evaluate(
     slope_out: wp.array2d(dtype=real),
     stress_out: wp.array2d(dtype=mat33),
 ):
-    """First Piola stress that memory adds to that of the elastic law; eta and d eta / dW."""
+    """First Piola stress that is added to that of the law; eta and d eta / dW."""
     i, w = wp.tid()
     F = gradient[i, w]
     R = mat33()
@@ -137,17 +84,24 @@ def evaluate(
     slope = real(0.0)
     if mullins[0] > real(0.0):
         W = energy_density(law, mu[w], part, F, R)
+        if stiffening != real(0.0):
+            W += added_energy(law, mu[w], stiffening, F, R)
+        W *= modulus[i]
         if W < worst[i, w]:
             width = mullins[1] + mullins[2] * worst[i, w]
             s = (worst[i, w] - W) / width
             eta = real(1.0) - wp.erf(s) / mullins[0]
-            slope = real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)  # 2 / sqrt(pi)
+            slope = modulus[i] * real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)  # 2 / sqrt(pi)
     softening_out[i, w] = eta
     slope_out[i, w] = slope
     H = past[i, w]
     if law != 3:
         H = F * H
-    stress_out[i, w] = ((real(1.0) + gain) * eta - real(1.0)) * stress(law, mu[w], part, F, R) + H
+    factor = (real(1.0) + gain) * eta
+    P = (factor - real(1.0)) * stress(law, mu[w], part, F, R) + H
+    if stiffening != real(0.0):
+        P += factor * added_stress(law, mu[w], stiffening, F, R)
+    stress_out[i, w] = P
 
 
 @wp.kernel
@@ -157,6 +111,7 @@ def differentiate(
     mu: wp.array(dtype=real),
     lam: wp.array(dtype=real),
     cap: real,
+    stiffening: real,
     gain: real,
     past: wp.array2d(dtype=mat33),
     gradient: wp.array2d(dtype=mat33),
@@ -177,8 +132,12 @@ def differentiate(
     part = remembering(law, mu[w], lam[w], cap)
     factor = real(1.0) + gain
     dP = (factor * softening[i, w] - real(1.0)) * stress_derivative(law, mu[w], part, F, R, dF)
+    if stiffening != real(0.0):
+        dP += factor * softening[i, w] * added_derivative(law, mu[w], stiffening, F, R, dF)
     if slope[i, w] != real(0.0):
         P = stress(law, mu[w], part, F, R)
+        if stiffening != real(0.0):
+            P += added_stress(law, mu[w], stiffening, F, R)
         dP += (factor * slope[i, w] * wp.ddot(P, dF)) * P
     if law != 3:
         dP += dF * past[i, w]
@@ -192,6 +151,8 @@ def settle(
     mu: wp.array(dtype=real),
     lam: wp.array(dtype=real),
     cap: real,
+    stiffening: real,
+    modulus: wp.array(dtype=real),
     gradient: wp.array2d(dtype=mat33),
     # Out:
     stress_out: wp.array2d(dtype=mat33),
@@ -204,14 +165,19 @@ def settle(
     if law == 0:
         R = polar_rotation(F)
     part = remembering(law, mu[w], lam[w], cap)
-    stress_out[i, w] = pull_back(law, F, stress(law, mu[w], part, F, R))
-    energy_out[i, w] = energy_density(law, mu[w], part, F, R)
+    P = stress(law, mu[w], part, F, R)
+    W = energy_density(law, mu[w], part, F, R)
+    if stiffening != real(0.0):
+        P += added_stress(law, mu[w], stiffening, F, R)
+        W += added_energy(law, mu[w], stiffening, F, R)
+    stress_out[i, w] = pull_back(law, F, P)
+    energy_out[i, w] = modulus[i] * W
 
 
 class StressMemory:
-    """What the points of a skin remember, of every world: overstresses and the largest energy so far.
+    """What the points of a skin remember, of every world: overstresses, the largest energy so far, the slip of friction elements.
 
-    Made by `SkinData` where the model's material has `prony` or `mullins`; on the CPU's full tier.
+    Made by `SkinData` where the model's material has `prony`, `mullins`, `hysteresis` or `stiffening`; on the CPU's full tier.
 
     Args:
       model: SkinModel; nworld: number of worlds; mu, lam: (nworld,) Warp arrays of the elastic constants [Pa].
@@ -219,7 +185,8 @@ class StressMemory:
     Attributes:
       overstress: (nterm, npoint, nworld, 3, 3) second Piola [Pa]; worst: (npoint, nworld) largest energy density [J/m^3].
       last: (npoint, nworld, 3, 3) second Piola stress that relaxes, when the last step ended [Pa].
-      stiffening: factor on the stiffness of a step as long as the current one, without its history.
+      friction: FrictionBranches, or None.
+      stiffness: factor on the stiffness of a step as long as the current one, without its history.
 
     Raises:
       ValueError: the model is not on the CPU.
@@ -228,23 +195,28 @@ class StressMemory:
     def __init__(self, model, nworld, mu, lam):
         if model.device.is_cuda:
             raise ValueError(
-                "skin that remembers (prony, mullins) is solved on the CPU's full tier only: choose device='cpu', or leave both out of the material"  # noqa: E501
+                f"skin with {' and '.join(model.material.extensions)} is solved on the CPU's full tier only: choose device='cpu', "
+                "or leave this out of the material"
             )
-        self.elements, self.law, self.mu, self.lam = model.elasticity, model.law, mu, lam
-        self.prony = np.array(model.material.prony, float).reshape(-1, 2)
-        self.mullins = vec3(*(model.material.mullins or (0.0, 0.0, 0.0)))
-        self.quadratic = model.element == "quadratic"
-        self.cap = float(quadratic.POINTWISE) if self.quadratic else 1e300
-        npoint, ncorner = (4, 10) if self.quadratic else (1, 4)
-        shape = (npoint * model.nelem, nworld)
-        self.gain, self.stiffening = 0.0, 1.0
-        with wp.ScopedDevice("cpu"):
-            self.gradient, self.change, self.rotation, self.past, self.stress = (wp.zeros(shape, dtype=mat33) for _ in range(5))
-            self._worst, self.softening, self.slope, self.energy = (wp.zeros(shape, dtype=real) for _ in range(4))
-            self.corner = wp.zeros((ncorner * model.nelem, nworld), dtype=vec3)
+        material = model.material
+        self.points = points = IntegrationPoints(model.elasticity, nworld)
+        self.prony = np.array(material.prony, float).reshape(-1, 2)
+        self.mullins = vec3(*(material.mullins or (0.0, 0.0, 0.0)))
+        cap = float(quadratic.POINTWISE) if points.quadratic else 1e300
+        self._law = [model.law, mu, lam, cap]
+        self.stiffening = material.stiffening
+        self.gain = 0.0
+        self.gradient, self.change, self.rotation, self.past, self.stress = (points.allocate(mat33) for _ in range(5))
+        self._worst, self.softening, self.slope, self.energy = (points.allocate(real) for _ in range(4))
         self.worst = self._worst.numpy()
-        self.overstress = np.zeros((len(self.prony), *shape, 3, 3))
-        self.last = np.zeros((*shape, 3, 3))
+        self.overstress = np.zeros((len(self.prony), *points.shape, 3, 3))
+        self.last = np.zeros((*points.shape, 3, 3))
+        self.friction = FrictionBranches(material.hysteresis, model.law, mu, points) if material.hysteresis else None
+        self._remembers = material.remembers
+
+    @property
+    def stiffness(self) -> float:
+        return 1 + self.gain + (self.friction.modulus if self.friction else 0.0)
 
     def reset(self, x):
         """Forgets: x (Warp, [nvert, nworld]) is the relaxed and virgin state."""
@@ -252,6 +224,8 @@ class StressMemory:
         self.worst[:] = 0
         self.last = self._settle(x)
         self.worst[:] = self.energy.numpy() if self.mullins[0] > 0 else 0
+        if self.friction:
+            self.friction.reset(self.gradient)
 
     def begin(self, dt):
         """Prepares a step of length dt [s].
@@ -267,27 +241,34 @@ class StressMemory:
         self.decay = np.exp(-dt / tau)
         self.share = -g * np.expm1(-dt / tau) * tau / dt
         self.gain = float(self.share.sum())
-        self.stiffening = 1 + self.gain
         self.past.numpy()[:] = np.tensordot(self.decay, self.overstress, 1) - self.gain * self.last
 
     def add_force(self, x, force):
-        """Adds the nodal forces of what is remembered [N], of the positions x."""
-        self._gradient(x, self.gradient)
-        self._launch(evaluate, self.gradient.shape,
-                     [self.law, self.mu, self.lam, self.cap, self.mullins, self.gain, self._worst, self.past, self.gradient],
-                     [self.rotation, self.softening, self.slope, self.stress])  # fmt: skip
-        self._gather(-1.0, force)
+        """Adds the nodal forces of what the law does not have [N], of the positions x."""
+        points = self.points
+        points.gradient(x, self.gradient)
+        points.launch(evaluate,
+                      [*self._law, self.stiffening, self.mullins, self.gain, points.modulus, self._worst, self.past, self.gradient],
+                      [self.rotation, self.softening, self.slope, self.stress])  # fmt: skip
+        if self.friction:
+            self.friction.add_stress(self.gradient, self.stress)
+        points.add_forces(self.stress, -1.0, force)
 
     def add_product(self, p, product):
         """Adds their tangent stiffness, where `add_force` was last, times p."""
-        self._gradient(p, self.change)
-        self._launch(differentiate, self.gradient.shape,
-                     [self.law, self.mu, self.lam, self.cap, self.gain, self.past, self.gradient, self.rotation, self.softening, self.slope,
-                      self.change], [self.stress])  # fmt: skip
-        self._gather(1.0, product)
+        points = self.points
+        points.gradient(p, self.change)
+        points.launch(differentiate,
+                      [*self._law, self.stiffening, self.gain, self.past, self.gradient, self.rotation, self.softening, self.slope,
+                       self.change], [self.stress])  # fmt: skip
+        if self.friction:
+            self.friction.add_derivative(self.gradient, self.change, self.stress)
+        points.add_forces(self.stress, 1.0, product)
 
     def commit(self, x, good):
         """Takes over the step that has ended at x in the worlds that are good (nworld,); the others keep their past."""
+        if not self._remembers:
+            return
         new = self._settle(x)
         if len(self.prony):
             gained = self.share[:, None, None, None, None] * (new - self.last)
@@ -295,29 +276,33 @@ class StressMemory:
         self.last[:, good] = new[:, good]
         if self.mullins[0] > 0:
             self.worst[:, good] = np.maximum(self.worst, self.energy.numpy())[:, good]
+        if self.friction:
+            self.friction.commit(self.gradient, good)
 
     @staticmethod
     def size(material, npoint) -> int:
         """Doubles of one world's memory."""
-        return (6 * len(material.prony) + 1) * npoint
+        return (6 * len(material.prony) + 6 * len(material.hysteresis) + 1) * npoint
 
     def state(self) -> np.ndarray:
         """(size,) memory of the first world, to be saved."""
-        six = self.overstress[:, :, 0][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        return np.concatenate([six.ravel(), self.worst[:, 0]])
+        parts = [self.overstress, self.friction.slip] if self.friction else [self.overstress]
+        return np.concatenate([*(p[:, :, 0][..., _ROW, _COLUMN].ravel() for p in parts), self.worst[:, 0]])
 
     def load(self, state, x):
         """Sets the first world's memory, of a skin that is at x (Warp, [nvert, nworld]); the inverse of `state`."""
         n = len(self.worst)
-        six = np.asarray(state[:-n]).reshape(len(self.prony), n, 6)
-        self.overstress[:, :, 0] = six[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(len(self.prony), n, 3, 3)
+        parts = np.asarray(state[:-n]).reshape(-1, n, 6)[..., _WHOLE].reshape(-1, n, 3, 3)
+        self.overstress[:, :, 0] = parts[: len(self.prony)]
+        if self.friction:
+            self.friction.slip[:, :, 0] = parts[len(self.prony) :]
         self.worst[:, 0] = state[-n:]
         self.last[:, 0] = self._settle(x)[:, 0]
 
     def _settle(self, x):
         """(npoint, nworld, 3, 3) second Piola stress at x that relaxes, softened by what was borne up to now."""
-        self._gradient(x, self.gradient)
-        self._launch(settle, self.gradient.shape, [self.law, self.mu, self.lam, self.cap, self.gradient], [self.stress, self.energy])
+        self.points.gradient(x, self.gradient)
+        self.points.launch(settle, [*self._law, self.stiffening, self.points.modulus, self.gradient], [self.stress, self.energy])
         out = self.stress.numpy().copy()
         if self.mullins[0] > 0:
             from scipy.special import erf
@@ -326,24 +311,3 @@ class StressMemory:
             worst = np.maximum(self.worst, self.energy.numpy())
             out *= (1 - erf((worst - self.energy.numpy()) / (m + beta * worst)) / r)[..., None, None]
         return out
-
-    def _gradient(self, x, out):
-        e = self.elements
-        if self.quadratic:
-            self._launch(quadratic_gradient, (e.nelem, x.shape[1]), [e.elem, e.shape, e.inverse, x], [out])
-        else:
-            self._launch(linear_gradient, (e.nelem, x.shape[1]), [e.elem, e.inverse_edges, x], [out])
-
-    def _gather(self, sign, node_out):
-        e = self.elements
-        if self.quadratic:
-            self._launch(
-                quadratic_divergence, (e.nelem, node_out.shape[1]), [e.shape, e.inverse, e.weight, self.stress, sign], [self.corner]
-            )
-        else:
-            self._launch(linear_divergence, (e.nelem, node_out.shape[1]), [e.inverse_edges, e.volume, self.stress, sign], [self.corner])
-        self._launch(elasticity.gather, node_out.shape, [e.start, e.slot, self.corner, 1.0, 1], [node_out])
-
-    @staticmethod
-    def _launch(kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu")

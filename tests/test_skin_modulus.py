@@ -1,0 +1,142 @@
+"""Rubber that is not the same everywhere: a factor on Young's modulus for every element."""
+
+import numpy as np
+import pytest
+import warp as wp
+from bars import AREA, LENGTH, NOTHING, E, bar, cube, deform, pull
+from blocks import box, skin
+
+from biotac_mj.geometry.edge_nodes import with_edge_nodes
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.data import view
+from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.types import vec3
+
+
+def halves(p):
+    """Three times as stiff where the bar is moved."""
+    return np.where(p[:, 0] < LENGTH / 2, 1.0, 3.0)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_two_moduli_in_series(element):
+    """nu = 0: k = 1 / (L1 / (E1 A) + L2 / (E2 A)), and in large strain of svk the stretches that bear the same force."""
+    model = bar("linear", element, modulus=halves)
+    force = pull(model, SkinData(model), 1.3, None)
+    assert force == pytest.approx(0.3 * E * AREA * 2 / (1 + 1 / 3), rel=1e-6)
+    model = bar("svk", element, modulus=halves)
+    data = SkinData(model)
+    force = pull(model, data, 1.3, None)
+    middle = data.vert_xpos[0, np.isclose(model.geometry.vert[:, 0], LENGTH / 2), 0]
+    assert np.ptp(middle) < 1e-7 * LENGTH
+    soft = middle.mean() / (LENGTH / 2)
+    for stretch, factor in ((soft, 1), (2.6 - soft, 3)):
+        assert force == pytest.approx(factor * E * stretch * (stretch**2 - 1) / 2 * AREA, rel=1e-5)
+    cauchy = data.stress()[0][0, :, 0, 0]
+    sides = halves(model.geometry.vert[model._elem[:, :4]].mean(1))
+    for side in (1, 3):  # no lateral strain at nu = 0: first Piola and Cauchy stress are the same
+        np.testing.assert_allclose(cauchy[sides == side], force / AREA, rtol=1e-4)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", LAWS)
+def test_one_factor_for_all_is_another_modulus(law, element):
+    """One: the same bits. Two: the stress of twice E, with memory, softening (in energy), friction and stiffening in place."""
+    F = np.eye(3) + 0.1 * np.random.default_rng(1).standard_normal((3, 3))
+    plain, one = cube(law, element), cube(law, element, modulus=lambda p: np.ones(len(p)))
+    np.testing.assert_array_equal(deform(one, SkinData(one), F, None), deform(plain, SkinData(plain), F, None))
+    more = {"prony": ((0.3, 0.5),), "mullins": (2.0, 2e3, 0.2), "hysteresis": ((0.5, 0.03),), "stiffening": 0.6}
+    stress = []
+    for model in (cube(law, element, modulus=np.full(48, 2.0), **more), cube(law, element, young=2 * E, **more)):
+        data = SkinData(model)
+        stress.append([deform(model, data, np.eye(3) + share * (F - np.eye(3)), 0.1) for share in (1.0, 0.4, 0.7)])
+    np.testing.assert_allclose(stress[0], stress[1], rtol=1e-10, atol=1e-10 * np.abs(stress).max())
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
+def test_the_tangent_is_the_forces_derivative(law, element):
+    rng = np.random.default_rng(3)
+    model = cube(law, element, nu=0.49, modulus=lambda p: rng.uniform(0.3, 3, len(p)))
+    data, rest = SkinData(model), model.geometry.vert
+    x = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
+    p = 1e-4 * rng.standard_normal(rest.shape)
+
+    def force(h):
+        model.elasticity.force(data.elastic, data.mu, data.lam, wp.array((x + h * p)[:, None], dtype=vec3, ndim=2), data.force)
+        return data.force.numpy()[:, 0].copy()
+
+    h = 1e-3
+    expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
+    at, along = (wp.array(a[:, None], dtype=vec3, ndim=2) for a in (x, p))
+    force(0.0)
+    model.elasticity.product(data.elastic, data.mu, data.lam, at, along, data.product)
+    np.testing.assert_allclose(view(data.product)[:, 0], expected, atol=2e-7 * abs(expected).max())
+    # the factor that preconditions is that of the same rubber
+    force_at_rest = wp.array(rest[:, None], dtype=vec3, ndim=2)
+    model.elasticity.force(data.elastic, data.mu, data.lam, force_at_rest, data.force)
+    model.elasticity.product(data.elastic, data.mu, data.lam, force_at_rest, along, data.product)
+    K = model.elasticity.rest_stiffness(model.material.mu, model.material.lame)
+    np.testing.assert_allclose(view(data.product)[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max())
+
+
+def slab(**kw):
+    vert, elem = box([np.linspace(0, 1.2e-2, 7), np.linspace(0, 4e-3, 3), np.linspace(0, 6e-3, 4)])
+    options = SkinOptions(element=kw.pop("element", "quadratic"), liquid=False, tolerance=1e-5)
+    return SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)), Material("corotational", E, 0.4), options, **kw)
+
+
+def pressed(model, x):
+    """Force of a ball pressed 0.4 mm into the slab at x [N], and the iterations it took."""
+    data, ball = SkinData(model), GeomSet(["sphere"], [(3e-3, 0, 0)])
+    count = 0
+    for depth in (0.0, 0.2e-3, 0.4e-3):
+        ball.set_pose(np.array([[x, 7e-3 - depth, 3e-3]]), np.eye(3)[None])
+        step(model, data, ball)
+        assert data.converged[0]
+        count += data.iterations[0]
+    return data.wrench[0, 0, 1], count
+
+
+def test_a_ball_feels_the_modulus_below_it():
+    """A modulus that rises along x by 1/cm: the ball feels that of its place, as the reduced form says, in as many iterations."""
+    field = lambda p: 1 + 100 * (p[:, 0] - 6e-3)  # noqa: E731
+    even, uneven = slab(), slab(modulus=field)
+    for x in (3e-3, 6e-3, 9e-3):
+        (plain, few), (force, count) = pressed(even, x), pressed(uneven, x)
+        assert force / plain == pytest.approx(1 + 100 * (x - 6e-3), rel=0.03), x
+        assert count <= few + 2
+
+
+def test_inertia_is_not_scaled():
+    one, two = slab(), slab(modulus=lambda p: np.full(len(p), 2.0))
+    np.testing.assert_array_equal(one.elasticity.node_volume, two.elasticity.node_volume)
+
+
+@pytest.mark.parametrize("element, parts", [("quadratic", 1), ("linear", 8)])
+def test_elements_of_a_ten_node_geometry_keep_their_factors(element, parts):
+    vert, elem = box([np.linspace(0, 1e-2, 3)] * 3)
+    geometry = with_edge_nodes(skin(vert, elem, np.flatnonzero(vert[:, 0] == 0)))
+    factor = np.random.default_rng(2).uniform(0.5, 2, len(elem))
+    model = SkinModel(geometry, Material(), SkinOptions(element=element), modulus=factor)
+    assert model.nelem == parts * len(elem)
+    at = geometry.vert[model._elem[:, :4]].mean(1)
+    home = [np.argmin(np.linalg.norm(vert[elem].mean(1) - p, axis=1)) for p in at.reshape(-1, parts, 3).mean(1)]
+    np.testing.assert_array_equal(model.modulus.reshape(-1, parts), np.repeat(factor[home], parts).reshape(-1, parts))
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"modulus has shape \(3,\): give one factor for each of the 48 elements of .*, shape \(48,\)"):
+        cube("linear", "linear", modulus=[1, 2, 3])
+    with pytest.raises(ValueError, match=r"modulus has shape \(\): give one factor for each of the 48 positions"):
+        cube("linear", "linear", modulus=lambda p: 2.0)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="1 of the 48 factors of modulus are not positive finite numbers"):
+            cube("linear", "linear", modulus=np.r_[bad, np.ones(47)])
+    model = cube("corotational", "linear", modulus=np.full(48, 2.0))
+    with pytest.raises(ValueError, match="skin with modulus is solved on the CPU's full tier only"):
+        SkinData(model, resident=True)
+    from biotac_mj.skin.condensed import CondensedSkin
+
+    with pytest.raises(ValueError, match="the same everywhere: leave modulus out"):
+        CondensedSkin(model, NOTHING)

@@ -1,0 +1,143 @@
+"""Stiffening of every law: Yeoh's closed forms in large strain, forces against differences of an energy written down here, robustness."""
+
+import numpy as np
+import pytest
+import warp as wp
+from bars import NOTHING, E, cube, deform
+from blocks import box, skin
+from scipy.linalg import polar
+from scipy.optimize import minimize
+
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.data import view
+from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.types import vec3
+
+
+def invariant(law, F):
+    """q of `stiffening.py`: 2 |dev A|^2 of the law's strain, the isochoric first invariant less 3 for neo_hookean."""
+    eye = np.eye(3)
+    if law == "neo_hookean":
+        return np.linalg.det(F) ** (-2 / 3) * np.sum(F * F, axis=(-2, -1)) - 3
+    C = np.swapaxes(F, -1, -2) @ F
+    if law == "corotational":
+        A = np.array([polar(f)[1] for f in F.reshape(-1, 3, 3)]).reshape(F.shape) - eye
+    else:
+        A = (C - eye) / 2 if law == "svk" else (F + np.swapaxes(F, -1, -2)) / 2 - eye
+    deviator = A - np.trace(A, axis1=-2, axis2=-1)[..., None, None] / 3 * eye
+    return 2 * np.sum(deviator**2, axis=(-2, -1))
+
+
+def beyond(s, q):
+    """Energy over mu / 2 beyond q."""
+    return s * q**2 if s >= 0 else (np.sqrt(1 - 4 * s * q) - 1) / (-2 * s) - q
+
+
+def gradients(elements, x):
+    """Deformation gradients at all integration points and the volumes that belong to them, from the shape functions."""
+    if hasattr(elements, "_gradient"):
+        return np.einsum("eai,eqaj->eqij", x[elements._elem], elements._gradient).reshape(-1, 3, 3), elements._weight.ravel()
+    edges = np.moveaxis(x[elements._elem[:, 1:]] - x[elements._elem[:, :1]], 1, 2)
+    return edges @ elements._inverse_edges, elements._volume
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("s", [0.0, 0.7, -0.4])
+def test_uniaxial_and_equibiaxial_rubber(element, s):
+    """Differences of Cauchy stress of an isochoric stretch: mu (a^2 - b^2) h'(I1 - 3), with Yeoh's h' = 1 + 2 s (I1 - 3)."""
+    model = cube("neo_hookean", element, nu=0.45, stiffening=s)
+    data, mu = SkinData(model), model.material.mu
+    for stretch in (0.6, 0.9, 1.3, 1.8):
+        for F in (np.diag([stretch, stretch**-0.5, stretch**-0.5]), np.diag([stretch, stretch, stretch**-2])):
+            q = np.trace(F @ F) - 3
+            growth = 1 + 2 * s * q if s >= 0 else (1 - 4 * s * q) ** -0.5
+            cauchy = deform(model, data, F, None) @ F
+            for i in (0, 1):
+                expected = mu * (F[i, i] ** 2 - F[2, 2] ** 2) * growth
+                assert cauchy[i, i] - cauchy[2, 2] == pytest.approx(expected, rel=1e-8, abs=1e-6 * mu)
+
+
+@pytest.mark.parametrize("s, t", [(0.5, 1.2e6), (0.5, -1.2e6), (-0.4, 0.2e6)])
+def test_a_bar_with_free_sides(s, t):
+    """Pulled by a traction t: the stretches (a, b, b) that make W - t a least, found here by themselves, bear t, nothing aside."""
+    model = cube("neo_hookean", "quadratic", nu=0.4, stiffening=s)
+    mu, kappa = model.material.mu, model.material.bulk
+
+    def energy(ab):
+        a, b = ab
+        J = a * b * b
+        q = J ** (-2 / 3) * (a * a + 2 * b * b) - 3
+        return (mu / 2 * (q + beyond(s, q)) + kappa / 2 * (J - 1) ** 2 - t * a) / mu
+
+    a, b = minimize(energy, [1.0, 1.0], method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-15, "maxiter": 4000}).x
+    assert abs(a - 1) > 0.25
+    P = deform(model, SkinData(model), np.diag([a, b, b]), None)
+    assert P[0, 0] == pytest.approx(t, rel=1e-5) and abs(P[1, 1]) < 1e-5 * abs(t)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("s", [0.9, -0.5])
+def test_force_is_the_energys_gradient(law, element, s):
+    model = cube(law, element, stiffening=s)
+    data, rng = SkinData(model), np.random.default_rng(6)
+    rest = model.geometry.vert
+    x = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T + 1e-4 * rng.standard_normal(rest.shape)
+    p = 1e-4 * rng.standard_normal(rest.shape)
+
+    def energy(h):
+        F, volume = gradients(model.elasticity, x + h * p)
+        return volume @ (model.material.mu / 2 * beyond(s, invariant(law, F)))
+
+    h = 1e-2
+    expected = -(8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
+    force = wp.zeros_like(data.force)
+    data.memory.begin(None)
+    data.memory.add_force(wp.array(x[:, None], dtype=vec3, ndim=2), force)
+    assert np.vdot(force.numpy()[:, 0], p) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_small_strains_do_not_stiffen(law):
+    """Twice the strain, twice the stress, to second order in the strain: the same tangent at rest."""
+    F = np.eye(3) + 1e-5 * np.random.default_rng(7).standard_normal((3, 3))
+    plain, stiff = (deform(m, SkinData(m), F, None) for m in (cube(law, "linear"), cube(law, "linear", stiffening=1.5)))
+    np.testing.assert_allclose(stiff, plain, atol=1e-8 * abs(plain).max())
+
+
+@pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
+@pytest.mark.parametrize("s", [1.5, -0.5])
+def test_absurd_presses_leave_a_sound_state(law, s):
+    """A ball pushed at once through nearly the whole slab: whatever becomes of the step, no NaN, no inverted element called a balance."""
+    vert, elem = box([np.linspace(0, 1e-2, 4), np.linspace(0, 4e-3, 3), np.linspace(0, 1e-2, 4)])
+    material = Material(law, E, 0.45, stiffening=s, friction=0.3)
+    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)), material, SkinOptions(element="quadratic", liquid=False))
+    data, ball = SkinData(model), GeomSet(["sphere"], [(3e-3, 0, 0)])
+    forces = []
+    for depth in (-0.1e-3, 0.5e-3, 3.6e-3, 0.5e-3):
+        ball.set_pose(np.array([[5e-3, 7e-3 - depth, 5e-3]]), np.eye(3)[None])
+        step(model, data, ball)
+        assert np.isfinite(data.vert_xpos).all() and np.isfinite(view(data.force)).all()
+        assert not data.converged[0] or model.elasticity.smallest_jacobian(data.elastic)[0] > 0
+        forces.append(data.wrench[0, 0, 1] if data.converged[0] else None)
+    assert forces[0] == 0 and forces[1] == pytest.approx(forces[3], rel=0.02) and forces[3] > 0.1
+
+
+def test_without_stiffening_nothing_is_added():
+    assert SkinData(cube("corotational", "linear")).memory is None
+    assert Material(stiffening=0).extensions == () and Material(stiffening=0.2).extensions == ("stiffening",)
+    assert not Material(stiffening=0.2).remembers
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="stiffening is nan: pass a finite number"):
+        Material(stiffening=np.nan)
+    model = cube("corotational", "linear", stiffening=0.3)
+    with pytest.raises(ValueError, match="skin with stiffening is solved on the CPU's full tier only"):
+        SkinData(model, resident=True)
+    with pytest.raises(ValueError, match="stiffening are the model's: give the worlds' materials the same"):
+        SkinData(model, material=[Material("corotational", E, 0.3)])
+    from biotac_mj.skin.condensed import CondensedSkin
+
+    with pytest.raises(ValueError, match="condensed tier is elastic, the same everywhere: leave stiffening out"):
+        CondensedSkin(model, NOTHING)
