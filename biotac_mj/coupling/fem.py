@@ -77,6 +77,11 @@ class FemStepper:
             device=self._config.device,
         )
 
+    @functools.cached_property
+    def _reach(self):
+        """Distance at which geoms act on the skin, by adhesion [m]."""
+        return 0.0 if self._options.contact_law is None else float(self._data.laws.range.max())
+
     def _part(self, state, name):
         return state[self._slices[name]]
 
@@ -155,7 +160,7 @@ class FemStepper:
     def _untouched(self, state, geom_pos, geom_mat):
         if not self.resting(state) or self._model.device.is_cuda or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all()):
             return False
-        if not self._search.clear(geom_pos, geom_mat, 0.0):
+        if not self._search.clear(geom_pos, geom_mat, self._reach):
             return False
         self._search.refuse_core(geom_pos, geom_mat)
         return True

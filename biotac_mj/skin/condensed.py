@@ -112,6 +112,8 @@ class CondensedSkin:
             raise ValueError(
                 f"the condensed tier is elastic, the same everywhere: leave {' and '.join(model.extensions)} out, or choose the full tier"
             )
+        if model.options.contact_law is not None:
+            raise ValueError("the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, or choose the full tier")
         filled = model.has_liquid and (model.options.fill_volume or model.options.rest_pressure)
         if filled and (model.options.fill_volume < 0 or model.options.rest_pressure < 0):
             raise ValueError(

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from .contact_law import world_laws
 from .launch import Launches
 from .liquid import Liquid
 from .model import SkinModel
@@ -24,7 +25,7 @@ class ContactState:
 
     def __init__(self, surface, nsample, nvert, nworld):
         nface = len(surface.face)
-        self.surface = surface
+        self.surface, self.bond = surface, None
         self.anchor_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
         self.anchor = wp.zeros((nface * nsample, nworld), dtype=vec3)
         self.trial_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
@@ -51,7 +52,7 @@ class ContactState:
         return faces, _host(view(self.block)[6 * faces[:, None] + np.arange(6), w])
 
     def commit(self):
-        wp.copy(self.anchor_geom, self.trial_geom)
+        wp.copy(self.anchor_geom, self.trial_geom if self.bond is None else self.bond)
         wp.copy(self.anchor, self.trial_anchor)
 
 
@@ -135,6 +136,7 @@ class SkinData:
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
             self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
+        self.laws = world_laws(model, nworld, self.resident, self.outer)
         self.worlds, self.device_memory, self.device_steps = None, None, {}
         if self.resident:
             self._allocate_device()
@@ -207,11 +209,9 @@ class SkinData:
             self._motion, self._wrench = np.zeros((self.nworld, 0, 3)), np.zeros((self.nworld, 0, 6))
         self.force.zero_()
         self.external = None
-        self.outer.reset()
-        if self.core:
-            self.core.reset()
-        if self.liquid:
-            self.liquid.reset()
+        for part in (self.outer, self.core, self.liquid):
+            if part:
+                part.reset()
         if self.memory:
             self.memory.reset(self.x)
         self.converged = np.ones(self.nworld, bool)

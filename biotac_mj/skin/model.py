@@ -10,6 +10,7 @@ import warp as wp
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import clearance, contact, elasticity, liquid
+from .contact_law import ContactLaw
 from .factor import DenseFactor, SparseFactor
 from .fill import rest_state
 from .geoms import GeomSet
@@ -42,6 +43,7 @@ class SkinOptions:
       contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference solutions' ratio.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
+      contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's law. On the CPU's full tier.
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
       tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below this fraction of the energy
         norm of the load.
@@ -62,6 +64,7 @@ class SkinOptions:
     contact_stiffness: float | None = None
     stick_ratio: float = 0.1
     samples: int = 3
+    contact_law: ContactLaw | None = None
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
     tolerance: float = 1e-3
@@ -78,6 +81,8 @@ class SkinOptions:
             raise ValueError(f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf")
         if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (self.fill_volume and self.rest_pressure):
             raise ValueError(f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of them, a finite number")
+        if isinstance(self.contact_law, dict):
+            object.__setattr__(self, "contact_law", ContactLaw(**self.contact_law))
         for name in ("stick_ratio", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

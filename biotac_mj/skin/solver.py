@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from threadpoolctl import ThreadpoolController
 
-from . import clearance, contact, elasticity
+from . import clearance, contact, contact_law, elasticity
 from .data import SkinData, view
 from .geoms import GeomSet
 from .model import SkinModel
@@ -46,6 +46,8 @@ def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = No
         _step_on_device(model, data, geoms, dt, core_pos, core_mat)
         return
     _refuse_core(model, geoms)
+    if data.laws:
+        data.laws.check(geoms)
     with _threads.limit(limits=1, user_api="blas"):
         _Step(model, data, geoms, dt, core_pos, core_mat).run()
 
@@ -213,11 +215,10 @@ class _Step:
 
         Along a descent direction of an energy that is its minimum; friction has no energy, its work along dx still has to balance.
         """
-        base = self.x.copy()
-        slope = (residual * dx).sum((0, 2))
+        base, slope = self.x.copy(), (residual * dx).sum((0, 2))
         low, high = np.zeros_like(slope), np.full_like(slope, np.nan)
         slope_low, slope_high = slope.copy(), slope.copy()
-        alpha = np.where(active, 1.0, 0.0)
+        alpha, soft = np.where(active, 1.0, 0.0), self.d.laws and self.d.laws.pulls
         side = np.zeros(len(slope), int)
         for _ in range(12):
             self.x[...] = base + alpha[:, None] * dx
@@ -227,7 +228,7 @@ class _Step:
             if self.m.material.law == "neo_hookean":
                 valid &= self.m.elasticity.smallest_jacobian(self.d.elastic) > 0.02
             enough = ~active | (valid & (now >= -0.5 * slope))
-            enough &= ~active | np.isnan(high) | (now <= 0.5 * slope)
+            enough &= ~active | (now <= 0.2 * slope if soft else np.isnan(high) | (now <= 0.5 * slope))
             if enough.all():
                 break
             over = ~enough & (~valid | (now < 0))
@@ -240,8 +241,11 @@ class _Step:
             high, slope_high = np.where(over, alpha, high), np.where(over, np.where(valid, now, -np.inf), slope_high)
             with np.errstate(invalid="ignore", divide="ignore"):
                 secant = low + (high - low) * slope_low / (slope_low - slope_high)
+                further = alpha * np.clip(slope / np.maximum(slope - now, slope / 4), 1.25, 4)
             secant = np.where(np.isfinite(slope_high), secant, (low + high) / 2)
             secant = np.clip(secant, low + 0.05 * (high - low), high - 0.05 * (high - low))
+            if soft:  # a pull that falls as the gap opens is in no tangent: the way goes on
+                secant = np.where(np.isnan(high), further, secant)
             alpha = np.where(enough, alpha, secant)
 
     def _evaluate(self):
@@ -270,14 +274,17 @@ class _Step:
     def _contact(self, state, geoms):
         m, d = self.m, self.d
         surface, launch = state.surface, d.launch
-        still = state is d.core
+        kernel, known, out = contact.contact_force, [], []
+        if state is d.core:
+            kernel, known = contact.core_contact_force, [state.seen, state.clearance]
+        elif d.laws:
+            kernel, known, out = contact_law.lawful_contact_force, [d.laws.struct], [state.bond]
         launch(
-            contact.core_contact_force if still else contact.contact_force,
+            kernel,
             state.touching.shape,
             [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
-            + [state.anchor_geom, state.anchor]
-            + ([state.seen, state.clearance] if still else []),
-            [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force],
+            + [state.anchor_geom, state.anchor, *known],
+            [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force, *out],
         )
         launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
         self.force += view(state.node_force)
