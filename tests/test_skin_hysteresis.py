@@ -41,7 +41,7 @@ def test_shear_of_the_linear_law(element):
 
 
 def test_a_pulled_bar_with_free_sides():
-    """Linear law, traction t: modulus 9 K m / (3 K + m) with m = mu (1 + g) until the von Mises strain is reached; then the friction's stress
+    """Linear law, traction t: modulus 9 K m / (3 K + m), m = mu (1 + g), until the von Mises strain is reached; then the friction's stress
     3 g mu e lies beside the law's own and t = E strain + 2/3 (1 + nu) of it."""
     g, slips, nu = 0.8, 0.01, 0.3
     model = bar("linear", "linear", nu=nu, held=False, hysteresis=((g, slips),))

@@ -1,4 +1,4 @@
-"""Relaxation, creep and Mullins softening inside the finite elements instead of on the forces that they bear: the exact proof.
+"""Constitutive effects inside the finite elements instead of on the forces that they bear: the exact proof.
 
     sim = InSkinSimulator(skin="coarse", tier="full")
     sim.run(trajectories, effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})])         # the skin itself relaxes
@@ -17,6 +17,14 @@ from .simulator import Simulator, _impedance, placed
 __all__ = ["Inside", "InSkinSimulator", "memory_of", "solve_with_memory"]
 
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
+# what benchmarks/discrepancy_in_skin_maps.py measured on presses of the coarse skin (docs/memory.md):
+# the c2 that the force of a stiffening c2 / c1 of the rubber looks like
+_STIFFENING = (-120, -40, -12, -4, -1, 0, 1, 4, 12, 40, 120, 400, 1000)
+_C2 = (-0.7168, -0.3972, -0.1518, -0.0522, -0.0131, 0.0, 0.0128, 0.0470, 0.1197, 0.2990, 0.6382, 1.3962, 2.4646)
+# and for widths of the hysteresis [m] the strain at which a friction branch slips and its modulus over the fraction
+_WIDTH = (0.05e-3, 0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.6e-3)
+_STRAIN = (0.00030, 0.00105, 0.00319, 0.00436, 0.00683, 0.01297)
+_BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
 _ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
 
 
@@ -57,13 +65,46 @@ def _mullins(inside, theta):
         inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
 
 
-_BECOMES = {"relax": _relax, "creep": _creep, "mullins": _mullins}  # effect id -> function that writes it into an Inside
+def modulus_of(theta):
+    """Function of positions (n, 3) [m] that gives the factors (n,) on Young's modulus of `effects_skin.Inhomogeneity`."""
+
+    def modulus(at):
+        return np.maximum(1 + theta["along"] * 100 * (at[:, 0] + 8e-3) + theta["across"] * 100 * at[:, 2], 0.1)
+
+    return modulus
+
+
+def _inhomog(inside, theta):
+    mine, other = modulus_of(theta), inside.model.get("modulus")
+    inside.model["modulus"] = mine if other is None else lambda at: mine(at) * other(at)
+
+
+def _stiffen(inside, theta):
+    c2 = theta["c2"] + np.interp(inside.material.get("stiffening", 0.0), _STIFFENING, _C2)
+    inside.material["stiffening"] = float(np.interp(c2, _C2, _STIFFENING))
+
+
+def _hyster(inside, theta):
+    if theta["fraction"] > 0:
+        width = np.log(theta["width"])
+        strain, ratio = (np.exp(np.interp(width, np.log(_WIDTH), np.log(table))) for table in (_STRAIN, _BRANCH))
+        inside.material["hysteresis"] = (*inside.material.get("hysteresis", ()), (float(ratio * theta["fraction"]), float(strain)))
+
+
+_BECOMES = {
+    "relax": _relax,
+    "creep": _creep,
+    "mullins": _mullins,
+    "hyster": _hyster,
+    "stiffen": _stiffen,
+    "inhomog": _inhomog,
+}  # effect id -> function that writes it into an Inside
 
 
 def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> list:
     """Walks trajectories in their order through a skin that remembers.
 
-    Overstress is forgotten between trajectories, the largest energy of every point is not.
+    Overstress and slip are forgotten between trajectories, the largest energy of every point is not.
 
     Args:
       model: SkinModel on the CPU; film: FilmConduction.
@@ -104,7 +145,8 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
 
 @dataclasses.dataclass
 class InSkinSimulator(Simulator):
-    """A Simulator of the full tier in which relaxation, creep and Mullins softening act inside the elements.
+    """A Simulator of the full tier in which relaxation, creep, Mullins softening, hysteresis, stiffening and a modulus that varies with
+    place act inside the elements.
 
     Raises:
       ValueError: another tier.
@@ -115,10 +157,10 @@ class InSkinSimulator(Simulator):
 
     def __post_init__(self):
         if self.tier != "full":
-            raise ValueError(f"the {self.tier} tier is elastic: relaxation inside the elements needs tier='full'")
+            raise ValueError(f"the {self.tier} tier is elastic: constitutive effects inside the elements need tier='full'")
 
     def run(self, trajectories, fields=None, exact=True, effects=None, **kw):
-        """See `Simulator.run`; where the skin is solved anew, what the material remembers is inside it."""
+        """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
         if exact is False or len(inside.rest) == len(effects):
