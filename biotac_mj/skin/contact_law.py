@@ -2,8 +2,9 @@
 
 Both act at the samples inside the faces, as contact itself does (`contact`), each on its share of the face's area:
 
-- mu = friction (p / friction_pressure)^-friction_exponent, p the sample's pressure. With exponent 1 the shear stress is one number
-  whatever the pressure (smooth rubber: Sahli et al., PNAS 2018); Hertz's contact turns p^-n into N^(-n/3).
+- mu = friction (p / friction_pressure)^-friction_exponent, p the face's mean pressure (flat faces touch round bodies in spots, whose
+  pressure is the mesh's). With exponent 1 the shear stress is one number whatever the pressure (smooth rubber: Sahli et al., PNAS 2018);
+  Hertz's contact turns p^-n into N^(-n/3).
 - traction t(g) at the gap g: the contact's own spring k carries on into tension up to the peak 2 W / range, then the traction falls
   in a straight line to zero at `adhesion_range`. The area under it is W, the work of adhesion, whatever k. A sample that has touched
   is parted by `adhesion_hysteresis` times W until it is out of range: both laws have one branch where it touches, so that within a
@@ -173,6 +174,23 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
 
 
 @wp.func
+def friction_factor(w: int, t: wp.vec3i, sample: wp.array(dtype=vec3), k: real, laws: Laws, geoms: Geoms, x: wp.array2d(dtype=vec3)):
+    """mu over its value at laws.pressure, from the mean pressure of a face with contact stiffness k [Pa/m]."""
+    total = real(0.0)
+    for s in range(sample.shape[0]):
+        b = sample[s]
+        p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+        gap = real(0.0)
+        for g in range(geoms.count):
+            y = wp.transpose(geoms.mat[g, w]) * (p - geoms.pos[g, w])
+            dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            gap = wp.min(gap, dn[3])
+        total -= k * gap
+    pressure = wp.max(total / real(sample.shape[0]), real(_LEAST) * laws.pressure)
+    return wp.pow(pressure / laws.pressure, -laws.exponent[w])
+
+
+@wp.func
 def touch_sample(
     i: int,
     w: int,
@@ -184,13 +202,15 @@ def touch_sample(
     k: real,
     kt: real,
     share: real,
+    factor: real,
     laws: Laws,
     geoms: Geoms,
     x_last: wp.array2d(dtype=vec3),
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
 ):
-    """Contact of sample i with its share of area [m^2]: geom (-1: none), whether it has touched, force [N], its tangent [N/m], anchor."""
+    """Contact of sample i with its share of area [m^2], friction times a factor: geom (-1: none), the geom that it has touched, force [N],
+    its tangent [N/m], anchor."""
     p = b[0] * x0 + b[1] * x1 + b[2] * x2
     touched = int(-1)
     gap = laws.reach[w]
@@ -226,11 +246,8 @@ def touch_sample(
         force = fn * normal
         nn = wp.outer(normal, normal)
         K = tn[1] * nn
-        mu = geoms.friction[touched, w]
+        mu = factor * geoms.friction[touched, w]
         if mu > real(0.0) and fn > real(0.0):
-            if laws.exponent[w] != real(0.0):
-                pressure = wp.max(fn / share, real(_LEAST) * laws.pressure)
-                mu = mu * wp.pow(pressure / laws.pressure, -laws.exponent[w])
             if anchor_geom[i, w] == touched:
                 stick = anchor[i, w]
             else:
@@ -306,13 +323,18 @@ def lawful_contact_force(
     share = area[f] / real(nsample)
     k = stiffness * area[f] / real(nsample)
     kt = k * stick_ratio
+    factor = real(1.0)
+    if near == 1 and laws.exponent[w] != real(0.0):
+        factor = friction_factor(w, t, sample, stiffness, laws, geoms, x)
     for s in range(nsample):
         i = f * nsample + s
         geom_out[i, w] = -1
         bond_out[i, w] = -1
         if near == 1:
             b = sample[s]
-            touched, bond, force, K, stick = touch_sample(i, w, b, t, x0, x1, x2, k, kt, share, laws, geoms, x_last, anchor_geom, anchor)
+            touched, bond, force, K, stick = touch_sample(
+                i, w, b, t, x0, x1, x2, k, kt, share, factor, laws, geoms, x_last, anchor_geom, anchor
+            )
             if touched >= 0:
                 touching = 1
                 geom_out[i, w] = touched
