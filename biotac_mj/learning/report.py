@@ -79,11 +79,24 @@ def table(result) -> str:
             lines.append(
                 f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, {error['all']['moved']:.4f} mm where it moves more than 0.05"
             )
+        lines += _objects(found["mesh_mm"])
         for name, error in found["inverse_mm"].items():
             centre = f", patch centre {error['centre_median']:.2f} mm" if "centre_median" in error else ""
             lines.append(f"  inverse, {name}: {error['mean']:.4f} mm mean, {error['moved']:.4f} mm where it moves{centre}")
     lines.append(f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}")
     return "\n".join(lines)
+
+
+def _objects(codes):
+    """Lines of the mesh codes' mean node error by object, where there are several."""
+    names = sorted(set().union(*(error["objects"] for error in codes.values())))
+    if len(names) < 2:
+        return []
+    lines = [f"  {'mean node error [mm]':<24}" + "".join(f"{code:>12}" for code in codes)]
+    for name in names:
+        values = (error["objects"].get(name, {}).get("mean") for error in codes.values())
+        lines.append(f"  {name:<24}" + "".join(f"{'' if v is None else format(v, '.4f'):>12}" for v in values))
+    return lines
 
 
 def _split(folder, split, reports):
@@ -179,7 +192,7 @@ def _figures(result, drawn, out):
         axis.invert_yaxis()
         axis.set_xlabel("RMS error per interaction [counts]")
         axis.set_title(f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor")
-        axis.legend(fontsize=7, loc="lower right")
+        axis.legend(fontsize=7, loc="upper right")
         for k, name in enumerate(names):
             heavy = name in ("latent_projection", "pointnet", "tare", result["default"])
             below.plot(_LEVELS, drawn[split]["coverage"][name], lw=1.8 if heavy else 0.7, label=name, alpha=1 if heavy else 0.7,
