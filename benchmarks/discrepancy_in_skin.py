@@ -19,6 +19,11 @@ CASES = (
     ("relax", {"g": 0.1, "tau": 0.3}),
     ("creep", {"n": 0.04}),
     ("mullins", {"softening": 0.2, "width": 0.6}),
+    ("stiffen", {"c2": 0.15}),
+    ("stiffen", {"c2": -0.15}),
+    ("inhomog", {"along": 0.3, "across": 0.0}),
+    ("hyster", {"fraction": 0.1, "width": 0.2e-3}),
+    ("hyster", {"fraction": 0.1, "width": 0.4e-3}),
 )
 
 
@@ -87,7 +92,8 @@ def main(argv=None):
         + f"{'released: Pa':>14}{'missed':>8}{'counts':>8}{'s':>5}"
     )  # noqa: E501
     for r in rows:
-        label = f"{r['effect']} " + ", ".join(f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening") if k in r)
+        label = f"{r['effect']} " + ", ".join(f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening", "c2", "along", "fraction") if k in r)
+        label += f", {1e3 * r['width']:g} mm" if r["effect"] == "hyster" else ""
         cells = "".join(f"{r[f'{n}_changes']:>20.3g}{r[f'{n}_missed']:>8.2g}" for n, _ in names)
         print(
             f"{label:<26}{cells}{r['pressure_after']:>14.3g}{r['pressure_after_missed']:>8.2g}{r['counts_after']:>8.2g}{r['seconds']:>5.0f}"

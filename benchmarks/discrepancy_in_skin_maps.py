@@ -7,11 +7,13 @@
 - hyster: twice in to 1.2 mm and out with a friction branch of every strain; for each width of the reduced form the strain and the branch's
   modulus over its fraction that come nearest, and how much of the effect stays (RMS).
 - inhomog: presses at several places with a modulus that varies along and across, against the factor of the reduced form.
+- lost: steps that found no balance in presses of 2 mm, through the contact with the core, and out, and their processor time.
 """
 
 import argparse
 import json
 import pathlib
+import time
 
 import numpy as np
 
@@ -115,7 +117,25 @@ def places():
     return rows
 
 
-PARTS = {"stiffen": stiffening, "hyster": hysteresis, "inhomog": places}
+def lost():
+    depths, rows = np.concatenate([np.linspace(0, 2e-3, 21), np.linspace(1.8e-3, 0, 10)]), []
+    laws = {"corotational": {}, "svk": {"law": "svk"}, "corotational, four nodes": {"element": "linear"},
+            "neo_hookean": {"law": "neo_hookean", "youngs_modulus": 2.8e5, "poissons_ratio": 0.45, "friction": 0.186}}  # fmt: skip
+    options = [{}, {"stiffening": 1.0}, {"stiffening": 12.0}, {"stiffening": 120.0}, {"stiffening": -12.0}, {"hysteresis": ((0.5, 0.003),)},
+               {"hysteresis": ((4.0, 0.001),)}, {"modulus": lambda at: np.maximum(1 + 100 * (at[:, 0] + 8e-3), 0.1)},
+               {"hysteresis": ((0.5, 0.003),), "stiffening": 12.0}]  # fmt: skip
+    print("lost: steps of", len(depths), "and processor time")
+    for law, base in laws.items():
+        for extra in options:
+            began = time.process_time()
+            force = press(depths, **base, **extra)[0]
+            named = {k: "along" if k == "modulus" else v for k, v in extra.items()}
+            rows.append({"law": law, **named, "lost": int(np.isnan(force).sum()), "seconds": time.process_time() - began})
+            print(f"{law:<26}{str(named):<58}{rows[-1]['lost']:>4} {rows[-1]['seconds']:>5.1f} s {np.nanmax(force):>6.2f} N", flush=True)
+    return rows
+
+
+PARTS = {"stiffen": stiffening, "hyster": hysteresis, "inhomog": places, "lost": lost}
 
 
 def main(argv=None):

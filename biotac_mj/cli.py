@@ -304,7 +304,7 @@ def _add_diagnose(verbs):
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
     verb.add_argument(
-        "--in-skin", action="store_true", help="relaxation, creep and softening inside the finite elements (full tier) in the proof"
+        "--in-skin", action="store_true", help="constitutive effects inside the finite elements (full tier) in the proof"
     )
     verb.add_argument("--device", default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0")
     verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")

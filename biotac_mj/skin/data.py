@@ -386,7 +386,7 @@ class SkinData:
         return made
 
     def stress(self):
-        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa], of the elastic law alone."""
+        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa], of the law alone."""
         cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
         return _leading(cauchy), _leading(mises)
 
