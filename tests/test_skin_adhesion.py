@@ -169,7 +169,7 @@ def evaluate(model, data, geoms, x):
     surface = state.surface
     wp.launch(contact_law.lawful_contact_force, dim=state.touching.shape, device="cpu",
               inputs=[surface.face, surface.area, model.sample, model.contact_stiffness, model.options.stick_ratio, geoms.struct,
-                      xs, data.x_last, state.anchor_geom, state.anchor, data.laws.struct],
+                      xs, data.x_last, state.anchor_geom, state.anchor, data.laws.struct, data.laws.node_push],
               outputs=[state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force,
                        state.bond])  # fmt: skip
 

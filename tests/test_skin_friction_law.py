@@ -55,7 +55,7 @@ def test_exponent_zero_is_coulomb_bit_by_bit():
     np.testing.assert_array_equal(force, again)
     two, both = slide(ContactLaw(), 5e-5, nworld=2, exponents=[0.0, 0.5])
     np.testing.assert_allclose(two[0], force[0], rtol=1e-6)
-    np.testing.assert_allclose(two[1, 0] / two[1, 1], MU * (two[1, 1] / AREA / 2e4) ** -0.5, rtol=0.01)
+    np.testing.assert_allclose(two[1, 0] / two[1, 1], MU * (two[1, 1] / AREA / 3e5) ** -0.5, rtol=0.01)
     _, twice = slide(None, 5e-5, nworld=2)
     np.testing.assert_allclose(both[:, 0], twice[:, 0], atol=1e-12)
 
@@ -64,9 +64,9 @@ def test_under_hertz_the_ratio_falls_with_the_cube_root():
     """A sliding sphere: the integral of mu(p) p over Hertz's pressures is mu N (p_max / p0)^-n 3 / (3 - n), and p_max goes as N^(1/3)."""
     R, E, nu, n, p0 = 10e-3, 1e6, 0.3, 0.6, 1e4
     radius = np.sqrt(R * 6e-5)
-    grid = list(np.arange(0, 1.3, 1 / 6))
+    grid = list(np.arange(0, 1.3, 1 / 4))
     while grid[-1] < 4.5:
-        grid.append(grid[-1] + 1.27 * (grid[-1] - grid[-2]))
+        grid.append(grid[-1] + 1.4 * (grid[-1] - grid[-2]))
     lateral = radius * np.concatenate([-np.array(grid[:0:-1]), grid])
     vert, elem = box([lateral, lateral, -radius * np.array(grid[::-1])])
     held = np.flatnonzero((abs(vert[:, :2]) == lateral[-1]).any(1) | (vert[:, 2] == -lateral[-1]))
@@ -76,7 +76,7 @@ def test_under_hertz_the_ratio_falls_with_the_cube_root():
     options = SkinOptions(contact_law=law, tolerance=1e-4, max_newton=100, max_cg=200)
     data = SkinData(SkinModel(skin(vert, elem, held, outer_face=top), Material("linear", E, nu), options))
     geoms, ratio, load = GeomSet(["sphere"], [(R,)], [MU]), [], []
-    for depth in (2e-5, 6e-5):
+    for depth in (2e-5, 4e-5, 6e-5):
         data.reset()
         for x in np.linspace(0, 4e-5, 4):
             geoms.set_pose([[x, 0, R - depth]])
@@ -86,7 +86,7 @@ def test_under_hertz_the_ratio_falls_with_the_cube_root():
         ratio.append(drag / normal), load.append(normal)
     ratio, load = np.array(ratio), np.array(load)
     peak = (6 * load * (E / (1 - nu**2)) ** 2 / (np.pi**3 * R**2)) ** (1 / 3)
-    np.testing.assert_allclose(ratio, MU * (peak / p0) ** -n * 3 / (3 - n), rtol=0.1)  # 8 cells a radius: 6, 4, 3 %
+    np.testing.assert_allclose(ratio, MU * (peak / p0) ** -n * 3 / (3 - n), rtol=0.06)  # 8 cells a radius: 2 %
     assert np.polyfit(np.log(load), np.log(ratio), 1)[0] == pytest.approx(-n / 3, abs=0.03)
 
 
@@ -98,8 +98,12 @@ def test_no_sample_leaves_its_cone():
         plane_at(geoms, x, HEIGHT - 5e-5)
         step(model, data, geoms)
     force = data.outer.sample_force.numpy()[:, 0].reshape(len(data.outer.surface.face_np), -1, 3)
-    area = data.outer.surface.area.numpy()
+    face, area, b = data.outer.surface.face_np, data.outer.surface.area.numpy(), model.sample.numpy()
     normal, drag = -force[..., 2], np.linalg.norm(force[..., :2], axis=-1)
     touching = data.outer.trial_geom.numpy()[:, 0].reshape(normal.shape) >= 0
-    limit = MU * (np.maximum(normal.sum(1) / area, 1e2) / 1e4)[:, None] ** -0.5 * normal  # the pressure is the face's
+    node, nodal_area = np.zeros(model.nvert), np.zeros(model.nvert)
+    np.add.at(node, face, np.einsum("fs,sc->fc", np.where(touching, normal, 0), b))
+    np.add.at(nodal_area, face, area[:, None] / 3)
+    pressure = np.einsum("sc,fc->fs", b, (node / np.where(nodal_area > 0, nodal_area, 1))[face])
+    limit = MU * (np.maximum(pressure, 1e2) / 1e4) ** -0.5 * normal
     assert (drag <= limit * (1 + 1e-9) + 1e-15)[touching].all() and (drag > 0.99 * limit)[touching].any()

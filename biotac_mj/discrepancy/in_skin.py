@@ -25,6 +25,10 @@ _C2 = (-0.7168, -0.3972, -0.1518, -0.0522, -0.0131, 0.0, 0.0128, 0.0470, 0.1197,
 _WIDTH = (0.05e-3, 0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.6e-3)
 _STRAIN = (0.00030, 0.00105, 0.00319, 0.00436, 0.00683, 0.01297)
 _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
+_PARTING = 3.0  # work of parting over that of joining, as in `effects_skin.Adhesion`
+# under a 7 mm sphere on the coarse skin (benchmarks/discrepancy_contact.py) the nodes' pressure [Pa] is the second times force^the first:
+# force^-n is pressure^(-n / the first), and at 1 N mu is the material's
+_PRESSURE = 0.70, 1.65e5
 _ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
 
 
@@ -91,6 +95,18 @@ def _hyster(inside, theta):
         inside.material["hysteresis"] = (*inside.material.get("hysteresis", ()), (float(ratio * theta["fraction"]), float(strain)))
 
 
+def _adhesion(inside, theta):
+    if theta["W"] > 0:
+        inside.contact.setdefault("contact_law", {}).update(adhesion=theta["W"], adhesion_hysteresis=_PARTING)
+
+
+def _fric_load(inside, theta):
+    if theta["exponent"]:
+        inside.contact.setdefault("contact_law", {}).update(
+            friction_exponent=theta["exponent"] / _PRESSURE[0], friction_pressure=_PRESSURE[1]
+        )
+
+
 _BECOMES = {
     "relax": _relax,
     "creep": _creep,
@@ -98,6 +114,8 @@ _BECOMES = {
     "hyster": _hyster,
     "stiffen": _stiffen,
     "inhomog": _inhomog,
+    "adhesion": _adhesion,
+    "fric_load": _fric_load,
 }  # effect id -> function that writes it into an Inside
 
 
@@ -146,7 +164,7 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
 @dataclasses.dataclass
 class InSkinSimulator(Simulator):
     """A Simulator of the full tier in which relaxation, creep, Mullins softening, hysteresis, stiffening and a modulus that varies with
-    place act inside the elements.
+    place act inside the elements, adhesion and load-dependent friction inside the contact.
 
     Raises:
       ValueError: another tier.

@@ -2,9 +2,9 @@
 
 Both act at the samples inside the faces, as contact itself does (`contact`), each on its share of the face's area:
 
-- mu = friction (p / friction_pressure)^-friction_exponent, p the face's mean pressure (flat faces touch round bodies in spots, whose
-  pressure is the mesh's). With exponent 1 the shear stress is one number whatever the pressure (smooth rubber: Sahli et al., PNAS 2018);
-  Hertz's contact turns p^-n into N^(-n/3).
+- mu = friction (p / friction_pressure)^-friction_exponent, p the push on a node over its area, linear between nodes (flat faces touch
+  round bodies in spots, whose pressure is the mesh's). With exponent 1 the shear stress is one number whatever the pressure (smooth
+  rubber: Sahli et al., PNAS 2018); Hertz's contact turns p^-n into N^(-n/3).
 - traction t(g) at the gap g: the contact's own spring k carries on into tension up to the peak 2 W / range, then the traction falls
   in a straight line to zero at `adhesion_range`. The area under it is W, the work of adhesion, whatever k. A sample that has touched
   is parted by `adhesion_hysteresis` times W until it is out of range: both laws have one branch where it touches, so that within a
@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from .contact import Geoms
+from .elasticity import gather
 from .shapes import distance, distance_bound
 from .types import mat33, real, vec3
 
@@ -35,7 +36,8 @@ class ContactLaw:
 
     Attributes:
       friction_exponent: n in mu = friction (p / friction_pressure)^-n; the geoms' `friction` is the coefficient at that pressure.
-      friction_pressure: [Pa]; the default is about what a sphere of 7 mm presses with at 1 N. Below a hundredth of it mu stays.
+      friction_pressure: [Pa]; the default is what a sphere of 7 mm presses with at 1 N (Hertz: 0.24 MPa on the average). Below a
+        hundredth of it mu stays.
       adhesion: work of adhesion W [J/m^2] of surfaces that come together. Rubber: 0.02-0.1.
       adhesion_hysteresis: factor on W once surfaces have touched.
       adhesion_range: gap at which adhesion ends [m]; None takes the shortest that the mesh resolves, sqrt(4 W h / E*) with the work that
@@ -46,7 +48,7 @@ class ContactLaw:
     """
 
     friction_exponent: float = 0.0
-    friction_pressure: float = 2e4
+    friction_pressure: float = 3e5
     adhesion: float = 0.0
     adhesion_hysteresis: float = 1.0
     adhesion_range: float | None = None
@@ -66,13 +68,14 @@ class ContactLaw:
 
 @wp.struct
 class Laws:
-    """One number for each world: n; W of coming together and of parting [J/m^2]; range [m]."""
+    """One number for each world: n; W of coming together and of parting [J/m^2]; range [m]. For all: p0 [Pa]; nodal areas [m^2]."""
 
     exponent: wp.array(dtype=real)
     work: wp.array(dtype=real)
     parting: wp.array(dtype=real)
     reach: wp.array(dtype=real)
     pressure: real
+    node_area: wp.array(dtype=real)
 
 
 class WorldLaws:
@@ -93,6 +96,9 @@ class WorldLaws:
         self.modulus = model.material.youngs_modulus / (1 - model.material.poissons_ratio**2)
         self.struct = Laws()
         self.struct.pressure = self.law.friction_pressure
+        area = np.bincount(face.ravel(), np.repeat(model.outer.area.numpy() / 3, 3), len(vert))
+        self.struct.node_area = wp.array(area, dtype=real, device="cpu")
+        self.node_push = wp.zeros((len(vert), nworld), dtype=vec3, device="cpu")
         for name in ("exponent", "work", "parting", "reach"):
             setattr(self.struct, name, wp.zeros(nworld, dtype=real, device="cpu"))
         self.bond = wp.full((len(face) * len(model.sample), nworld), -1, dtype=int, device="cpu")
@@ -136,6 +142,14 @@ class WorldLaws:
         """Whether there is adhesion in any world."""
         return bool(self.struct.parting.numpy().any())
 
+    def inputs(self, launch, state, sample, stiffness, geoms, x) -> list:
+        """What `lawful_contact_force` needs beyond `contact.contact_force`: the laws, and how the geoms push the nodes now."""
+        if self.struct.exponent.numpy().any():
+            surface = state.surface
+            launch(push, state.touching.shape, [surface.face, surface.area, sample, stiffness, geoms.struct, x], [state.corner])
+            launch(gather, x.shape, [surface.start, surface.slot, state.corner, 1.0, 0], [self.node_push])
+        return [self.struct, self.node_push]
+
     def check(self, geoms):
         """Refuses meshes whose distance is not exact as far as adhesion reaches (ValueError)."""
         spacing = geoms.struct.grids.spacing.numpy()
@@ -173,21 +187,37 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
     return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
 
 
-@wp.func
-def friction_factor(w: int, t: wp.vec3i, sample: wp.array(dtype=vec3), k: real, laws: Laws, geoms: Geoms, x: wp.array2d(dtype=vec3)):
-    """mu over its value at laws.pressure, from the mean pressure of a face with contact stiffness k [Pa/m]."""
-    total = real(0.0)
-    for s in range(sample.shape[0]):
-        b = sample[s]
-        p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
-        gap = real(0.0)
-        for g in range(geoms.count):
-            y = wp.transpose(geoms.mat[g, w]) * (p - geoms.pos[g, w])
-            dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-            gap = wp.min(gap, dn[3])
-        total -= k * gap
-    pressure = wp.max(total / real(sample.shape[0]), real(_LEAST) * laws.pressure)
-    return wp.pow(pressure / laws.pressure, -laws.exponent[w])
+@wp.kernel
+def push(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+):
+    """Size of the normal push on the corners of every face [N], as the first component."""
+    f, w = wp.tid()
+    t = face[f]
+    c0 = x[t[0], w]
+    center = (c0 + x[t[1], w] + x[t[2], w]) / real(3.0)
+    radius = wp.max(wp.length(c0 - center), wp.max(wp.length(x[t[1], w] - center), wp.length(x[t[2], w] - center)))
+    total = vec3()
+    k = stiffness * area[f] / real(sample.shape[0])
+    for g in range(geoms.count):
+        R = wp.transpose(geoms.mat[g, w])
+        y = R * (center - geoms.pos[g, w])
+        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < radius:
+            for s in range(sample.shape[0]):
+                b = sample[s]
+                y = R * (b[0] * c0 + b[1] * x[t[1], w] + b[2] * x[t[2], w] - geoms.pos[g, w])
+                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                total += wp.max(-k * dn[3], real(0.0)) * b
+    for c in range(3):
+        corner_out[3 * f + c, w] = vec3(total[c], real(0.0), real(0.0))
 
 
 @wp.func
@@ -202,15 +232,15 @@ def touch_sample(
     k: real,
     kt: real,
     share: real,
-    factor: real,
+    node_push: wp.array2d(dtype=vec3),
     laws: Laws,
     geoms: Geoms,
     x_last: wp.array2d(dtype=vec3),
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
 ):
-    """Contact of sample i with its share of area [m^2], friction times a factor: geom (-1: none), the geom that it has touched, force [N],
-    its tangent [N/m], anchor."""
+    """Contact of sample i with its share of area [m^2]: geom (-1: none), the geom that it has touched, force [N], its tangent [N/m],
+    anchor."""
     p = b[0] * x0 + b[1] * x1 + b[2] * x2
     touched = int(-1)
     gap = laws.reach[w]
@@ -246,8 +276,14 @@ def touch_sample(
         force = fn * normal
         nn = wp.outer(normal, normal)
         K = tn[1] * nn
-        mu = factor * geoms.friction[touched, w]
+        mu = geoms.friction[touched, w]
         if mu > real(0.0) and fn > real(0.0):
+            if laws.exponent[w] != real(0.0):
+                pressure = real(0.0)
+                for c in range(3):
+                    pressure += b[c] * node_push[t[c], w][0] / laws.node_area[t[c]]
+                pressure = wp.max(pressure, real(_LEAST) * laws.pressure)
+                mu = mu * wp.pow(pressure / laws.pressure, -laws.exponent[w])
             if anchor_geom[i, w] == touched:
                 stick = anchor[i, w]
             else:
@@ -285,6 +321,7 @@ def lawful_contact_force(
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
     laws: Laws,
+    node_push: wp.array2d(dtype=vec3),
     # Out:
     corner_out: wp.array2d(dtype=vec3),
     block_out: wp.array2d(dtype=mat33),
@@ -323,9 +360,6 @@ def lawful_contact_force(
     share = area[f] / real(nsample)
     k = stiffness * area[f] / real(nsample)
     kt = k * stick_ratio
-    factor = real(1.0)
-    if near == 1 and laws.exponent[w] != real(0.0):
-        factor = friction_factor(w, t, sample, stiffness, laws, geoms, x)
     for s in range(nsample):
         i = f * nsample + s
         geom_out[i, w] = -1
@@ -333,7 +367,7 @@ def lawful_contact_force(
         if near == 1:
             b = sample[s]
             touched, bond, force, K, stick = touch_sample(
-                i, w, b, t, x0, x1, x2, k, kt, share, factor, laws, geoms, x_last, anchor_geom, anchor
+                i, w, b, t, x0, x1, x2, k, kt, share, node_push, laws, geoms, x_last, anchor_geom, anchor
             )
             if touched >= 0:
                 touching = 1

@@ -273,12 +273,12 @@ class _Step:
 
     def _contact(self, state, geoms):
         m, d = self.m, self.d
-        surface, launch = state.surface, d.launch
-        kernel, known, out = contact.contact_force, [], []
+        surface, launch, kernel, known, out = state.surface, d.launch, contact.contact_force, [], []
         if state is d.core:
             kernel, known = contact.core_contact_force, [state.seen, state.clearance]
         elif d.laws:
-            kernel, known, out = contact_law.lawful_contact_force, [d.laws.struct], [state.bond]
+            known, out = d.laws.inputs(launch, state, m.sample, m.contact_stiffness, geoms, d.x), [state.bond]
+            kernel = contact_law.lawful_contact_force
         launch(
             kernel,
             state.touching.shape,

@@ -1,0 +1,62 @@
+"""Adhesion and load-dependent friction of the catalogue inside the contact: what the skin becomes, and what comes out."""
+
+import numpy as np
+import pytest
+
+from biotac_mj.discrepancy.catalogue import by_id
+from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
+from biotac_mj.discrepancy.simulator import load_simulator
+from biotac_mj.discrepancy.trajectories import Trajectory
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import ContactLaw, SkinOptions
+
+
+def walk(depth, along=None, rows=8):
+    """A Trajectory of the 7 mm sphere over the pad through depths and places along x [m], `rows` rows between each two."""
+    vert = load_skin("coarse").vert
+    surface = vert[(abs(vert[:, 0] + 12e-3) < 2e-3) & (abs(vert[:, 2]) < 2e-3), 1].min()
+    knots = np.arange(len(depth))
+    t = np.linspace(0, knots[-1], rows * knots[-1] + 1)
+    x = np.interp(t, knots, along) if along is not None else 0 * t
+    pos = np.column_stack([-11e-3 + x, surface + np.interp(t, knots, depth), 0 * t])
+    return Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+
+
+def test_effects_become_the_contact_s_law():
+    effects = [(by_id("adhesion"), {"W": 0.05}), (by_id("friction"), {"log_mu": 0.1}), (by_id("fric_load"), {"exponent": 0.14})]
+    inside = memory_of(effects)
+    assert [e.id for e, _ in inside.rest] == ["friction"]
+    law = SkinOptions(**inside.contact).contact_law
+    assert law == ContactLaw(friction_exponent=0.14 / 0.7, friction_pressure=1.65e5, adhesion=0.05, adhesion_hysteresis=3.0)
+    none = memory_of([(by_id("adhesion"), {"W": 0.0}), (by_id("fric_load"), {"exponent": 0.0})])
+    assert none.contact == {} and not none.rest
+
+
+def test_it_sticks_to_what_is_drawn_off(tmp_path):
+    """The skin follows the object, by millinewtons (JKR: 1.5 pi W R = 2.5 mN for the work of parting); without adhesion it does not."""
+    press = walk([-0.1e-3, 0.1e-3, -0.1e-3], rows=16)
+    sim = InSkinSimulator(effects=[(by_id("adhesion"), {"W": 0.05})])
+    sim.save(tmp_path / "s.yaml")
+    sim = load_simulator(tmp_path / "s.yaml")
+    assert type(sim) is InSkinSimulator
+    sticking, plain = sim.run([press])[0], sim.run([press], effects=[])[0]
+    pull = -(-sticking.force @ press.heading)
+    assert 1e-3 < pull.max() < 3.5e-3 and np.argmax(pull) > 16  # on the way out
+    assert (-plain.force @ press.heading).min() > -1e-9
+    assert abs(sticking.counts - plain.counts).max() < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exponent", [0.2, -0.1])
+def test_a_slide_s_ratio_follows_the_load(exponent):
+    """Three loads: T / N over Coulomb's goes as N^-exponent, within what the mesh scatters."""
+    depth = np.array([-0.1, 0.4, 0.4, 0.8, 0.8, 1.2, 1.2, -0.1]) * 1e-3
+    slide = walk(depth, np.array([-1, -1, 1, 1, -1, -1, 1, 1]) * 1.5e-3)
+    sim, rows = InSkinSimulator(), np.r_[11:17, 27:33, 43:49]
+    ratio, load = [], None
+    for n in (0.0, exponent):
+        run = sim.run([slide], effects=[(by_id("fric_load"), {"exponent": n})])[0]
+        load = run.normal_force[rows]
+        ratio.append(run.force[rows, 0] / load)
+    slope, level = np.polyfit(np.log(load), np.log(ratio[1] / ratio[0]), 1)
+    assert slope == pytest.approx(-exponent, abs=0.04) and np.exp(level) == pytest.approx(1, abs=0.04)
