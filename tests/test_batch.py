@@ -24,6 +24,13 @@ RADIUS = 3.5e-3
 K = 2.8e11  # [Pa/m] one contact stiffness, so that materials differ in nothing but what is said
 
 
+@pytest.fixture(scope="module", autouse=True)
+def where_batches_run(default_device):
+    """mujoco_warp's arrays are on Warp's default device: here, as for its users, a GPU where there is one."""
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        yield
+
+
 @functools.cache
 def shell():
     """A closed shell of a finger's size of 324 nodes, one layer, with 19 electrodes: every path of the code, but no real sensor."""
