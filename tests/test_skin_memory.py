@@ -213,6 +213,22 @@ def test_worlds_remember_each_their_own():
     assert abs(reactions[0]) < 1e-9 and reactions[1] == pytest.approx(force, rel=1e-9)
 
 
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
+def test_stress_of_elements_is_that_on_the_surface(law, element):
+    """Cauchy stress P F^T / J of homogeneous steps, P from the forces on the cube's surface, with all that a material can have."""
+    more = {"prony": ((G, TAU), (0.2, 0.1)), "mullins": (2.0, 2e3, 0.1), "hysteresis": ((0.5, 0.03),), "stiffening": 0.5}
+    model, rng = cube(law, element, modulus=np.full(48, 1.7), **more), np.random.default_rng(6)
+    data = SkinData(model)
+    for dt in (0.1, 0.4, 0.05):
+        F = np.eye(3) + 0.12 * rng.standard_normal((3, 3))
+        expected = deform(model, data, F, dt) @ F.T / np.linalg.det(F)
+        cauchy, mises = data.stress()
+        np.testing.assert_allclose(cauchy[0], np.broadcast_to(expected, cauchy[0].shape), atol=1e-6 * abs(expected).max())
+        deviator = expected - np.trace(expected) / 3 * np.eye(3)
+        np.testing.assert_allclose(mises[0], 1.5**0.5 * np.linalg.norm(deviator), rtol=1e-5)
+
+
 def test_filled_skin_rests():
     """Rest on the filling is relaxed and virgin: nothing moves when time passes."""
     vert, elem, inner = shell(10e-3, 7e-3, subdivisions=1, layers=2)

@@ -110,9 +110,8 @@ class SkinData:
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
-        beyond = ("prony", "mullins", "hysteresis", "stiffening")
-        if any(getattr(m, name) != getattr(model.material, name) for m in materials for name in beyond):
-            raise ValueError(f"{', '.join(beyond)} are the model's: give the worlds' materials the same")
+        if any(m.beyond_law != model.material.beyond_law for m in materials):
+            raise ValueError(f"{', '.join(model.material.beyond_law)} are the model's: give the worlds' materials the same")
         self.nworld, self.model = nworld, model
         self.resident = model.device.is_cuda if resident is None else resident
         if self.resident and model.extensions:
@@ -386,8 +385,10 @@ class SkinData:
         return made
 
     def stress(self):
-        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa], of the law alone."""
+        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
         cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
+        if self.memory:
+            self.memory.add_cauchy(self.x, cauchy, mises)
         return _leading(cauchy), _leading(mises)
 
 

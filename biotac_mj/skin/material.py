@@ -112,10 +112,14 @@ class Material:
         return bool(self.prony or self.hysteresis) or self.mullins is not None
 
     @property
+    def beyond_law(self) -> dict:
+        """What there is beside the law, by name: the CPU's full tier alone has it."""
+        return {name: getattr(self, name) for name in ("prony", "mullins", "hysteresis", "stiffening")}
+
+    @property
     def extensions(self) -> tuple[str, ...]:
-        """Names of the options in use that the CPU's full tier alone has."""
-        names = ("prony", "mullins", "hysteresis", "stiffening")
-        return tuple(n for n in names if getattr(self, n) not in ((), None, 0.0))
+        """Names of what is in use of it."""
+        return tuple(name for name, value in self.beyond_law.items() if value not in ((), None, 0.0))
 
     @property
     def mu(self) -> float:

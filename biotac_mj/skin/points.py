@@ -1,5 +1,6 @@
 """From nodes to integration points and back: deformation gradients there, and the nodal forces of stresses there, for both elements."""
 
+import numpy as np
 import warp as wp
 
 from . import elasticity, quadratic
@@ -80,7 +81,7 @@ class IntegrationPoints:
       nworld: number of worlds.
 
     Attributes:
-      shape: (npoint, nworld). modulus: (npoint,) Warp array of factors on the elastic constants.
+      shape: (npoint, nworld). modulus: (npoint,) Warp array of factors on the elastic constants. share: (npoint,) of the element's volume.
     """
 
     def __init__(self, elements, nworld):
@@ -90,6 +91,7 @@ class IntegrationPoints:
         with wp.ScopedDevice("cpu"):
             self._corner = wp.zeros((corners * elements.nelem, nworld), dtype=vec3)
             self.modulus = wp.full(self.shape[0], real(1.0), dtype=real)
+        self.share = (elements._weight / elements._volume[:, None]).ravel() if self.quadratic else np.ones(elements.nelem)
         if elements.modulus is not None:
             self.modulus.numpy()[:] = elements.modulus.repeat(each)
 

@@ -245,6 +245,10 @@ class StressMemory:
 
     def add_force(self, x, force):
         """Adds the nodal forces of what the law does not have [N], of the positions x."""
+        self._evaluate(x)
+        self.points.add_forces(self.stress, -1.0, force)
+
+    def _evaluate(self, x):
         points = self.points
         points.gradient(x, self.gradient)
         points.launch(evaluate,
@@ -252,7 +256,6 @@ class StressMemory:
                       [self.rotation, self.softening, self.slope, self.stress])  # fmt: skip
         if self.friction:
             self.friction.add_stress(self.gradient, self.stress)
-        points.add_forces(self.stress, -1.0, force)
 
     def add_product(self, p, product):
         """Adds their tangent stiffness, where `add_force` was last, times p."""
@@ -278,6 +281,22 @@ class StressMemory:
             self.worst[:, good] = np.maximum(self.worst, self.energy.numpy())[:, good]
         if self.friction:
             self.friction.commit(self.gradient, good)
+
+    def add_cauchy(self, x, cauchy, mises):
+        """Adds what the law does not have, at x where the last step ended, to the elements' mean Cauchy stresses [nelem, nworld] mat33 and
+        renews their von Mises stresses [nelem, nworld] [Pa]."""
+        nworld = x.shape[1]
+        self.past.numpy()[:] = self.overstress.sum(0)
+        gain, self.gain = self.gain, 0.0
+        self._evaluate(x)
+        self.gain = gain
+        F, P = self.gradient.numpy(), self.stress.numpy()
+        at_points = np.einsum("pwik,pwjk->pwij", P, F) / np.linalg.det(F)[..., None, None]
+        share = (self.points.share * self.points.modulus.numpy()).reshape(cauchy.shape[0], -1, 1, 1, 1)
+        total = cauchy.numpy()
+        total += (share * at_points.reshape(*share.shape[:2], nworld, 3, 3)).sum(1)
+        deviator = total - np.trace(total, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
+        mises.numpy()[:] = np.sqrt(1.5 * (deviator**2).sum((-1, -2)))
 
     @staticmethod
     def size(material, npoint) -> int:
