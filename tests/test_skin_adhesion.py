@@ -9,7 +9,18 @@ from blocks import boundary, box, faces_on, place, skin
 from test_skin_contact import nodal, pad, plane_at
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, contact, contact_law, step
+from biotac_mj.skin import (
+    ContactLaw,
+    GeomSet,
+    Material,
+    SkinData,
+    SkinModel,
+    SkinOptions,
+    bake_distance_grid,
+    contact,
+    lawful_contact,
+    step,
+)
 
 HEIGHT, AREA, BAR = 4e-3, 1e-4, 1e6 / 4e-3  # of the pad; its stiffness per area at nu = 0 [Pa/m]
 
@@ -167,7 +178,7 @@ def evaluate(model, data, geoms, x):
     """Nodal contact forces at positions x with what the last step left, and the kernel's tangent as a product."""
     xs, state = wp.array(x[:, None], dtype=wp.vec3d, ndim=2), data.outer
     surface = state.surface
-    wp.launch(contact_law.lawful_contact_force, dim=state.touching.shape, device="cpu",
+    wp.launch(lawful_contact.lawful_contact_force, dim=state.touching.shape, device="cpu",
               inputs=[surface.face, surface.area, model.sample, model.contact_stiffness, model.options.stick_ratio, geoms.struct,
                       xs, data.x_last, state.anchor_geom, state.anchor, data.laws.struct, data.laws.node_push],
               outputs=[state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force,

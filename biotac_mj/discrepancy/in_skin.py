@@ -98,6 +98,7 @@ def _hyster(inside, theta):
 def _adhesion(inside, theta):
     if theta["W"] > 0:
         inside.contact.setdefault("contact_law", {}).update(adhesion=theta["W"], adhesion_hysteresis=_PARTING)
+        inside.contact["tolerance"] = 1e-4  # it pulls with millinewtons
 
 
 def _fric_load(inside, theta):
@@ -177,19 +178,19 @@ class InSkinSimulator(Simulator):
         if self.tier != "full":
             raise ValueError(f"the {self.tier} tier is elastic: constitutive effects inside the elements need tier='full'")
 
-    def run(self, trajectories, fields=None, exact=True, effects=None, **kw):
+    def run(self, trajectories, fields=None, exact=True, effects=None, *more, **kw):
         """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
         if exact is False or len(inside.rest) == len(effects):
-            return super().run(trajectories, fields, exact, effects, **kw)
+            return super().run(trajectories, fields, exact, effects, *more, **kw)
         inner = _Remembering(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Simulator) if f.init} | {"cache": None})
         inner.inside, inner._models = inside, {}
-        runs = inner.run(trajectories, None, True, inside.rest, **kw)
+        runs = inner.run(trajectories, None, True, inside.rest, *more, **kw)
         if exact is True:
             return runs
         listed = set(np.atleast_1d(exact).tolist())
-        others = super().run(trajectories, fields, False, effects, **kw)
+        others = super().run(trajectories, fields, False, effects, *more, **kw)
         return [runs[i] if i in listed else other for i, other in enumerate(others)]
 
 

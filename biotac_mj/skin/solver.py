@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from threadpoolctl import ThreadpoolController
 
-from . import clearance, contact, contact_law, elasticity
+from . import clearance, contact, elasticity, lawful_contact
 from .data import SkinData, view
 from .geoms import GeomSet
 from .model import SkinModel
@@ -278,7 +278,7 @@ class _Step:
             kernel, known = contact.core_contact_force, [state.seen, state.clearance]
         elif d.laws:
             known, out = d.laws.inputs(launch, state, m.sample, m.contact_stiffness, geoms, d.x), [state.bond]
-            kernel = contact_law.lawful_contact_force
+            kernel = lawful_contact.lawful_contact_force
         launch(
             kernel,
             state.touching.shape,
