@@ -1,10 +1,9 @@
-"""What the reduced forms of adhesion and fric_load miss: a press and a slide with the effect on the forces and inside the contact.
+"""What the reduced forms of adhesion, fric_load, fluidloss and asper miss: presses and slides with the effect after the skin and inside it.
 
     python benchmarks/discrepancy_contact.py --json out/contact.json
 
 Printed are: how the pressure of the nodes under a sphere of 7 mm grows with its load (the map from fric_load's exponent to the contact's);
-how hard the sphere sticks when it is drawn off, against Johnson, Kendall and Roberts; the two comparisons. Forces are signed: positive
-pushes.
+how hard the sphere sticks when it is drawn off, against Johnson, Kendall and Roberts; the comparisons. Forces are signed: positive pushes.
 """
 
 import argparse
@@ -152,6 +151,30 @@ def friction(sim, rows):
     return out
 
 
+def film(sim, rows):
+    """Press of 1 mm, held: largest changes inside the film, in the reduced form, and its error RMS (electrodes); at rest and while held."""
+    import dataclasses
+
+    path = trajectory(np.arange(4.0), np.array([-0.1e-3, 1e-3, 1e-3, -0.1e-3]), np.full(4, PLACES[0]), (rows, 4, rows))
+    out = []
+    for effect, theta, clock in (
+        ("asper", {"log_p": 0.3}, 0.0), ("asper", {"log_p": -0.3}, 0.0),
+        ("fluidloss", {"rate": 0.2}, 900.0), ("fluidloss", {"rate": 0.2}, 3600.0),
+    ):  # fmt: skip
+        none = dict.fromkeys(theta, 1e-12)
+        plain, inside, reduced = both(sim, dataclasses.replace(path, clock=clock), effect, theta, none)
+        row = {"effect": effect, **dict(zip(("parameter", "clock"), (*theta.values(), clock)))}
+        for when, k in (("rest", 0), ("held", rows + 2)):
+            a, b, c = (r.counts[k] for r in (plain, inside, reduced))
+            row |= {f"{when}_counts": float(np.abs(b - a).max()), f"{when}_reduced": float(np.abs(c - a).max()),
+                    f"{when}_missed": float(np.sqrt(((c - b) ** 2).mean()))}  # fmt: skip
+        k = rows + 2
+        row |= {"N_plain": float(plain.normal_force[k]), "N_inside": float(inside.normal_force[k]), "Pa_plain": float(plain.pressure[k]),
+                "Pa_inside": float(inside.pressure[k]), "Pa_rest": float(inside.pressure[0])}  # fmt: skip
+        out.append(row)
+    return out
+
+
 def table(rows):
     """Prints dicts as a table."""
 
@@ -172,6 +195,7 @@ def main(argv=None):
         "--skins", default="coarse,default", help="of the pressure's map and of the sticking; comparisons are on the coarse one"
     )
     args.add_argument("--rows", type=int, default=12, help="rows of each part of press and slide")
+    args.add_argument("--only", help="first letters of one table")
     args.add_argument("--json")
     args = args.parse_args(argv)
     from biotac_mj.discrepancy.in_skin import InSkinSimulator
@@ -182,7 +206,10 @@ def main(argv=None):
         ("sticking [N]", lambda: [sticking(skin, W, reach) for skin in skins for W, reach in ((0.05, None), (0.05, 4e-5), (0.2, None))]),
         ("adhesion, press of 1 mm [N]", lambda: adhesion(sim, args.rows)),
         ("fric_load, slides [N]", lambda: friction(sim, args.rows)),
+        ("film: rough walls, liquid lost", lambda: film(sim, args.rows)),
     ):
+        if args.only and not name.startswith(args.only):
+            continue
         began = time.process_time()
         out[name] = make()
         print(f"{name}: {time.process_time() - began:.0f} s of processor time")

@@ -12,6 +12,7 @@ import typing
 
 import numpy as np
 
+from .in_film import RoughFilm, drain, left
 from .simulator import Simulator, _impedance, placed
 
 __all__ = ["Inside", "InSkinSimulator", "memory_of", "solve_with_memory"]
@@ -33,18 +34,20 @@ _ENERGY, _SHARE = 1.0, 0.6  # m [J/m^3] and, where the effect has no width, beta
 
 
 class Inside(typing.NamedTuple):
-    """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact), arguments of its `SkinModel`; and
-    the effects [(Effect, theta)] that are left to act as they do without the skin."""
+    """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact), arguments of its `SkinModel`, the
+    liquid's `loss` [1/h] and the `power` of its film's conductance; and the effects [(Effect, theta)] that are left to act as they do
+    without the skin."""
 
     material: dict
     contact: dict
     model: dict
+    film: dict
     rest: list
 
 
 def memory_of(effects) -> Inside:
     """What effects [(Effect, theta)] change of a skin in which they act themselves."""
-    inside = Inside({"prony": ()}, {}, {}, [])
+    inside = Inside({"prony": ()}, {}, {}, {}, [])
     for effect, theta in effects:
         becomes = _BECOMES.get(effect.id)
         if becomes is None:
@@ -108,6 +111,16 @@ def _fric_load(inside, theta):
         )
 
 
+def _fluidloss(inside, theta):
+    if theta["rate"] > 0:
+        inside.film["loss"] = inside.film.get("loss", 0.0) + theta["rate"]
+
+
+def _asper(inside, theta):
+    if theta["log_p"]:
+        inside.film["power"] = inside.film.get("power", 1.0) * float(np.exp(theta["log_p"]))
+
+
 _BECOMES = {
     "relax": _relax,
     "creep": _creep,
@@ -117,10 +130,12 @@ _BECOMES = {
     "inhomog": _inhomog,
     "adhesion": _adhesion,
     "fric_load": _fric_load,
+    "fluidloss": _fluidloss,
+    "asper": _asper,
 }  # effect id -> function that writes it into an Inside
 
 
-def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> list:
+def solve_with_memory(model, film, trajectories, poses=None, progress=None, loss=0.0) -> list:
     """Walks trajectories in their order through a skin that remembers.
 
     Overstress and slip are forgotten between trajectories, the largest energy of every point is not.
@@ -128,6 +143,7 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
     Args:
       model: SkinModel on the CPU; film: FilmConduction.
       poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
+      loss: of liquid, as a share of what there was at the session's beginning [1/h].
 
     Returns:
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19), converged (n,).
@@ -148,9 +164,14 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
         count = np.diff(ends, prepend=-1)  # steps to each row
         dt = np.repeat(np.diff(t.time, prepend=t.time[0] - 1.0) / count, count)
         scene.place(at[:1], turn[:1])
+        clock = t.clock + t.time[0] + np.cumsum(dt) - dt[0]
+        if loss:
+            drain(model, data, left(loss, clock[0]))
         one = {"force": [], "pressure": [], "x": [], "converged": []}
-        for p, R, r, h in zip(at, turn, row, dt):
+        for p, R, r, h, now in zip(at, turn, row, dt, clock):
             scene.place(p[None], R[None])
+            if loss:
+                data.set_liquid(fill_volume=(left(loss, now) - 1) * model.liquid_volume)
             step(model, data, scene.geoms, h)
             if r >= 0:
                 one["force"].append(data.wrench[0, 0, :3]), one["pressure"].append(data.pressure[0])
@@ -165,7 +186,7 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None) -> l
 @dataclasses.dataclass
 class InSkinSimulator(Simulator):
     """A Simulator of the full tier in which relaxation, creep, Mullins softening, hysteresis, stiffening and a modulus that varies with
-    place act inside the elements, adhesion and load-dependent friction inside the contact.
+    place act inside the elements, adhesion and load-dependent friction inside the contact, loss and roughness of the liquid's film in it.
 
     Raises:
       ValueError: another tier.
@@ -203,7 +224,9 @@ class _Remembering(Simulator):
             for i, t in enumerate(trajectories)
         ]
         model, film = self._model(log_friction, bubble)
-        return solve_with_memory(model, film, trajectories, poses, progress)
+        power = self.inside.film.get("power")
+        film = film if power is None else RoughFilm(film, power)
+        return solve_with_memory(model, film, trajectories, poses, progress, self.inside.film.get("loss", 0.0))
 
     def _model(self, log_friction, bubble):
         from ..skin.material import material

@@ -1,0 +1,71 @@
+"""Rough walls in the film's conductance and liquid lost under the skin."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from biotac_mj.discrepancy.catalogue import by_id
+from biotac_mj.discrepancy.in_film import RoughFilm, drain, left
+from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
+from biotac_mj.discrepancy.trajectories import Trajectory
+from biotac_mj.geometry import load_skin
+from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin import SkinData, SkinModel, SkinOptions
+
+
+@pytest.fixture(scope="module")
+def film():
+    return FilmConduction(load_skin("coarse"))
+
+
+def thinner(film, share):
+    """The skin with the film `share` times as thick everywhere."""
+    x = film.geometry.vert.copy()
+    middle, thickness = film.film(x)
+    foot = 2 * middle - x[film.node]
+    x[film.node] = foot + share * (x[film.node] - foot)
+    np.testing.assert_allclose(film.film(x)[1], np.maximum(share * thickness, film.residual_film), rtol=0.02)
+    return x
+
+
+def test_a_rough_film_conducts_as_a_power_of_its_thickness(film):
+    """A film 0.8 times as thick with power 2 is one 0.64 times as thick, but for where its middle lies; at rest nothing changes."""
+    rough, rest = RoughFilm(film, 2.0), film.geometry.vert
+    np.testing.assert_allclose(rough.impedance(rest), film.impedance(rest), rtol=1e-12)
+    np.testing.assert_array_equal(RoughFilm(film, 1.0).film(thinner(film, 0.8))[1].round(12), film.film(thinner(film, 0.8))[1].round(12))
+    np.testing.assert_allclose(rough.impedance(thinner(film, 0.8)), film.impedance(thinner(film, 0.64)), rtol=0.03)
+
+
+def test_a_drained_skin_holds_what_is_left():
+    """Its liquid's volume, counted by the divergence theorem, and suction; the share of the session's clock."""
+    model = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True))
+    data = SkinData(model)
+    drain(model, data, 0.95)
+    assert data.converged.all() and data.volume[0] == pytest.approx(0.95 * model.liquid_volume, rel=1e-5)
+    assert -1e4 < data.pressure[0] < -500
+    assert left(0.2, 900.0) == pytest.approx(0.95) and left(5.0, 3600.0) == pytest.approx(0.2)
+
+
+def test_effects_become_the_film():
+    effects = [
+        (by_id("fluidloss"), {"rate": 0.1}),
+        (by_id("asper"), {"log_p": 0.2}),
+        (by_id("gain"), {}),
+        (by_id("asper"), {"log_p": -0.1}),
+    ]
+    inside = memory_of(effects)
+    assert inside.film == {"loss": 0.1, "power": pytest.approx(np.exp(0.1))} and [e.id for e, _ in inside.rest] == ["gain"]
+    assert memory_of([(by_id("fluidloss"), {"rate": 0.0}), (by_id("asper"), {"log_p": 0.0})]).film == {}
+
+
+def test_liquid_lost_raises_impedances_and_sucks():
+    """In air, an hour apart: unlike its reduced form, the film thins where the skin gives way."""
+    t = np.linspace(0, 1, 8)
+    pos = np.tile([-12e-3, -30e-3, 0], (8, 1))
+    air = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (8, 1, 1)), np.full((8, 19), 2500.0))
+    sim, effects = InSkinSimulator(), [(by_id("fluidloss"), {"rate": 0.1})]
+    fresh, late = sim.run([air, dataclasses.replace(air, clock=3600.0)], effects=effects)
+    change = late.log_z[0] - fresh.log_z[0]
+    assert (change > 0).all() and change.mean() < -np.log(0.9) and np.ptp(change) > 0.005
+    assert late.pressure[0] < -1e3 and abs(fresh.pressure[0]) < 100
