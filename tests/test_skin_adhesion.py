@@ -268,6 +268,8 @@ def test_default_range_is_what_the_mesh_resolves():
         (dict(adhesion_range=0.0), "pass a positive length in m, or None"),
         (dict(friction_exponent=5.0), "from -1 to 2; 0 is Coulomb's law"),
         (dict(friction_pressure=0.0), "pass a positive number of Pa"),
+        (dict(adhesive=1.0), "or a dict with some of friction_exponent, friction_pressure, adhesion"),
+        (0.05, "contact_law is 0.05: pass a ContactLaw, or a dict"),
     ],
 )
 def test_laws_that_cannot_be_are_refused(law, text):

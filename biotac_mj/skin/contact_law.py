@@ -21,7 +21,7 @@ from .elasticity import gather
 from .lawful_contact import Laws, push
 from .types import real, vec3
 
-__all__ = ["ContactLaw", "WorldLaws", "world_laws"]
+__all__ = ["ContactLaw", "WorldLaws", "contact_law", "world_laws"]
 
 _RESOLVED = 4.0  # range^2 = this W h / E*: softening then takes half of the stiffness E* / h of a patch as wide as a face
 
@@ -60,6 +60,20 @@ class ContactLaw:
             raise ValueError(f"adhesion_hysteresis is {self.adhesion_hysteresis}: parting takes at least the work of joining, pass >= 1")
         if self.adhesion_range is not None and not (math.isfinite(self.adhesion_range) and self.adhesion_range > 0):
             raise ValueError(f"adhesion_range is {self.adhesion_range}: pass a positive length in m, or None")
+
+
+def contact_law(choice) -> ContactLaw | None:
+    """A ContactLaw, a dict of its fields or None, as a ContactLaw or None.
+
+    Raises:
+      ValueError: anything else, or an unknown field.
+    """
+    if choice is None or isinstance(choice, ContactLaw):
+        return choice
+    fields = [f.name for f in dataclasses.fields(ContactLaw)]
+    if not isinstance(choice, dict) or set(choice) - set(fields):
+        raise ValueError(f"contact_law is {choice!r}: pass a ContactLaw, or a dict with some of {', '.join(fields)}")
+    return ContactLaw(**choice)
 
 
 class WorldLaws:

@@ -10,7 +10,7 @@ import warp as wp
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import clearance, contact, elasticity, liquid
-from .contact_law import ContactLaw
+from .contact_law import ContactLaw, contact_law
 from .factor import DenseFactor, SparseFactor
 from .fill import rest_state
 from .geoms import GeomSet
@@ -81,8 +81,7 @@ class SkinOptions:
             raise ValueError(f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf")
         if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (self.fill_volume and self.rest_pressure):
             raise ValueError(f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of them, a finite number")
-        if isinstance(self.contact_law, dict):
-            object.__setattr__(self, "contact_law", ContactLaw(**self.contact_law))
+        object.__setattr__(self, "contact_law", contact_law(self.contact_law))
         for name in ("stick_ratio", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
