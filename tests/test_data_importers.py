@@ -152,7 +152,7 @@ def test_text_with_forces(tmp_path):
     with pytest.raises(ValueError, match="e.txt has 50 rows and .*g.txt has 1"):
         read_text(tmp_path / "e.txt", tmp_path / "g.txt")
     (tmp_path / "g.txt").write_text("1 2 3 4\n")
-    with pytest.raises(ValueError, match="line 1 of .*g.txt has 4 columns: 19 are needed, e1..e19"):
+    with pytest.raises(ValueError, match=r"g.txt, line 1: 4 columns, 19 are needed \(e1..e19\)"):
         read_text(tmp_path / "g.txt")
     with pytest.raises(ValueError, match="rate is 0 Hz"):
         read_text(tmp_path / "e.txt", rate=0)

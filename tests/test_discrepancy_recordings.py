@@ -107,8 +107,8 @@ def test_colour_of_noise_is_told_from_differences():
     "text, message",
     [
         ("1 2 3\n", "3 columns, 19 are needed"),
-        ("", "holds no numbers"),
-        (" ".join(["x1"] + ["5"] * 18) + "\n" + " ".join(["5"] * 18 + ["oops"]) + "\n", "is not 19 numbers"),
+        ("", "is empty: 19 columns of numbers"),
+        (" ".join(["x1"] + ["5"] * 18) + "\n" + " ".join(["5"] * 18 + ["oops"]) + "\n", "line 1: e1 is 'x1', not a finite number"),
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like volts"),
         ((" ".join(["-40"] * 19) + "\n") * 500, "give the raw values, not tared"),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),

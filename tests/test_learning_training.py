@@ -230,15 +230,49 @@ def test_a_batch_gives_what_single_sensors_give(weights):
 
 
 def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
-    rng = np.random.default_rng(0)
-    p = rng.normal(size=(200, 19))
-    gain = rng.uniform(0.5, 1.5, 19)
-    np.testing.assert_allclose(adapt(p, gain * p, strength=1e-9), gain, atol=1e-6)
     other = make_set(tmp_path / "other", count=24, seed=5, gain=1.4)
     result = evaluate_new_sensor(other, weights, tmp_path / "new.json", touches=(0, 5), draws=3)["median_rms_counts_after_touches"]
     assert result["5"] < 0.5 * result["0"] < result["tare"]
+    p = np.ones((20, 19))
     with pytest.raises(ValueError, match="the same rows"):
-        adapt(p, p[:3])
+        adapt(p, p[:3], np.zeros(20), p)
+
+
+@pytest.mark.parametrize(("touches", "between"), [(5, 0.2), (5, 0.3), (20, 0.1), (20, 0.3)])
+def test_gains_of_few_touches_are_better_than_none(touches, between):
+    """Gains drawn around a common one, scattered from touch to touch, touches of all sizes, noise of 3 counts."""
+    error = np.zeros(3)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        gain = 1 + 0.1 * rng.normal() + between * rng.normal(size=19)
+        slope = rng.uniform(300, 1000, (20 * touches, 19))
+        owner = np.repeat(np.arange(touches), 20)
+        size = np.exp(rng.normal(-3, 1.2, (touches, 19)))
+        p = size[owner] * rng.uniform(0, 1, (len(owner), 1))
+        y = p * (gain + 0.15 * rng.normal(size=(touches, 19)))[owner] + 3 * rng.normal(size=p.shape) / slope
+        plain = (slope**2 * p * y).sum(0) / (slope**2 * p * p).sum(0)
+        error += [((g - gain) ** 2).mean() for g in (adapt(p, y, owner, slope), plain, np.ones(19))]
+    assert error[0] < 0.9 * error[2]
+    assert error[0] < 0.9 * error[1] or touches == 5  # five seldom tell for sure: then none are used
+
+
+def test_gains_that_touches_do_not_ask_for_stay_one():
+    """A sensor that differs from touch to touch alone, in most of 20 draws; and one or two touches never tell."""
+    kept = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        owner, p = np.repeat(np.arange(8), 10), rng.normal(size=(80, 19)) * 0.1
+        y = p * (1 + 0.2 * rng.normal(size=(8, 19)))[owner]
+        kept += (adapt(p, y, owner, np.full(p.shape, 800.0)) == 1).all()
+        few = owner < 2
+        assert (adapt(p[few], 1.4 * p[few], owner[few], np.full((20, 19), 800.0)) == 1).all()
+    assert kept >= 17
+
+
+def test_gains_without_scatter_are_found():
+    rng = np.random.default_rng(0)
+    p, gain = rng.normal(size=(200, 19)), rng.uniform(0.5, 1.5, 19)
+    np.testing.assert_allclose(adapt(p, gain * p, np.arange(200) // 10, np.full(p.shape, 1e6)), gain, atol=2e-3)
 
 
 def test_contact_patch_finds_the_touch(trained, tmp_path):

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 
 from ..sensor.channels import CHANNELS, FULL_SCALE
+from .columns import read_columns
 from .schema import Interaction
 from .splits import assign
 from .store import shard_path, write_shard
@@ -102,7 +103,7 @@ def read_ruppel(path, object="sphere_4mm") -> list[Interaction]:  # noqa: A002 -
 
 
 def read_text(path, force=None, rate: float = 100.0, block: float | None = None, object="plate") -> list[Interaction]:  # noqa: A002
-    """A log of 19 columns e1..e19 without times, and perhaps one of 3 columns Fx Fy Fz [N] beside it; blanks or commas between them.
+    """A log of 19 columns e1..e19 without times, and perhaps one of 3 columns Fx Fy Fz [N] beside it (`data.columns`).
 
     Args:
       path: electrodes. force: forces, as many rows.
@@ -115,9 +116,9 @@ def read_text(path, force=None, rate: float = 100.0, block: float | None = None,
     """
     if not (np.isfinite(rate) and rate > 0) or (block is not None and not block > 0):
         raise ValueError(f"rate is {rate} Hz and block is {block} s: both must be positive")
-    path = _file(path, "a text file with 19 columns e1..e19")
-    counts = _table(path, CHANNELS[:19])
-    newtons = None if force is None else _table(_file(force, "a text file with 3 columns Fx Fy Fz"), ("Fx", "Fy", "Fz"))
+    path = pathlib.Path(path)
+    counts = read_columns(path, CHANNELS[:19])
+    newtons = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
     if newtons is not None and len(newtons) != len(counts):
         raise ValueError(f"{path} has {len(counts)} rows and {force} has {len(newtons)}: they must be samples of the same instants")
     n = len(counts)
@@ -200,17 +201,6 @@ def _file(path, what):
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}: give {what}")
     return path
-
-
-def _table(path, names):
-    lines = [(i, line.replace(",", " ").split()) for i, line in enumerate(path.read_text().splitlines(), 1)]
-    lines = [(i, row) for i, row in lines if row and not row[0].startswith("#")]
-    if not lines:
-        raise ValueError(f"{path} is empty: it needs {len(names)} columns, {names[0]}..{names[-1]}")
-    for i, row in lines:
-        if len(row) != len(names):
-            raise ValueError(f"line {i} of {path} has {len(row)} columns: {len(names)} are needed, {names[0]}..{names[-1]}")
-    return _numbers(path, [row for _, row in lines], 1, names)
 
 
 def _numbers(path, rows, first, names):

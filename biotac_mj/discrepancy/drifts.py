@@ -4,8 +4,8 @@ import abc
 
 import numpy as np
 
+from ..sensor.channels import counts_from_log_impedance, log_impedance
 from .recorded_effect import Finding, Parameter, RecordedEffect
-from .recording import counts_of, log_impedance
 from .shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 
 __all__ = [
@@ -32,10 +32,10 @@ class TimeShaped(RecordedEffect):
     kinds = ("exponential", "ramp", "step")
 
     def apply(self, counts, time, channels, theta):
-        return counts_of(log_impedance(counts) + np.outer(self._level(time, theta), theta["pattern"]))
+        return counts_from_log_impedance(log_impedance(counts) + np.outer(self._level(time, theta), theta["pattern"]))
 
     def correct(self, counts, time, channels, theta):
-        return counts_of(log_impedance(counts) - np.outer(self._level(time, theta), theta["pattern"]))
+        return counts_from_log_impedance(log_impedance(counts) - np.outer(self._level(time, theta), theta["pattern"]))
 
     @staticmethod
     def _level(time, theta):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ..sensor.channels import counts_from_log_impedance, log_impedance
 from .drifts import LENGTH, ONSET, Common, TimeShaped, counts_per_log, least_squares
 from .recorded_effect import Finding, Parameter, RecordedEffect
-from .recording import counts_of, log_impedance
 from .shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 
 __all__ = ["Drift", "GainChange"]
@@ -166,7 +166,7 @@ class GainChange(RecordedEffect):
         out = counts.copy()
         rows = (time >= theta["start"]) & (time < theta["end"])
         z = log_impedance(counts[rows, channels[0]]) - theta["rest"]
-        out[rows, channels[0]] = counts_of(theta["rest"] + ((z - shift) * factor if inverse else z * factor + shift))
+        out[rows, channels[0]] = counts_from_log_impedance(theta["rest"] + ((z - shift) * factor if inverse else z * factor + shift))
         return out
 
 

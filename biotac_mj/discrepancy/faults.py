@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from ..sensor.channels import counts_from_log_impedance, log_impedance
 from .recorded_effect import Finding, Parameter, RecordedEffect, runs, spans
-from .recording import counts_of, log_impedance
 from .timeline import noise_level
 
 __all__ = ["Freeze", "Quantise", "Saturate", "Spikes", "Stuck", "Swap"]
@@ -378,4 +378,4 @@ def interpolated(counts, masked, line):
         good = ~masked[:, k]
         if good.any():
             z[~good, k] = np.interp(rows[~good], rows[good], z[good, k])
-    return counts_of(z)
+    return counts_from_log_impedance(z)

@@ -10,9 +10,9 @@ import abc
 import numpy as np
 from scipy.signal import lfilter
 
+from ..sensor.channels import log_impedance
 from .evidence import sign_flip
 from .recorded_effect import Finding, Parameter, RecordedEffect
-from .recording import log_impedance
 
 __all__ = ["ForceView", "Hysteresis", "Latency", "LoadLowPass", "Relaxation", "force_features"]
 

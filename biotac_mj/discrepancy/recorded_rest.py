@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.stats import norm
 
+from ..sensor.channels import log_impedance
 from .loads import force_features, lagged
 from .recorded_effect import Session
 from .recorded_views import cross_residual, whole_line
-from .recording import log_impedance
 from .shapes import correlation_length
 
 __all__ = ["cells", "remainder"]

@@ -9,12 +9,12 @@ import dataclasses
 
 import numpy as np
 
+from ..sensor.channels import counts_from_log_impedance, log_impedance
 from .drifts import TimeShaped
 from .electrode_drifts import GainChange
 from .loads import ForceEffect, force_features
 from .noises import LowPass
 from .recorded_effect import Session
-from .recording import counts_of, log_impedance
 
 __all__ = ["Amended", "Choice", "VIEWS", "choose", "cross_residual", "options", "whole_line"]
 
@@ -100,7 +100,7 @@ def electrodes_from_force(a):
 
 
 def electrodes_at_rest(a):
-    level = counts_of(log_impedance(a.counts[a.session.fit]).mean(0))
+    level = counts_from_log_impedance(log_impedance(a.counts[a.session.fit]).mean(0))
     return a.measured_counts(np.tile(level, (len(a.counts), 1))), a.session.recording.electrodes, a.time
 
 
@@ -255,4 +255,4 @@ def _from_force(force, counts, fit):
         if best is None or error < best[0]:
             best = error, ridge
     w = np.linalg.solve(A[rows].T @ A[rows] + best[1], A[rows].T @ y[rows])
-    return counts_of(A @ w)
+    return counts_from_log_impedance(A @ w)

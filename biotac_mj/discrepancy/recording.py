@@ -6,9 +6,10 @@ import pathlib
 
 import numpy as np
 
-from ..sensor.channels import FULL_SCALE, REST_COUNTS
+from ..data.columns import read_columns
+from ..sensor.channels import CHANNELS, FULL_SCALE, REST_COUNTS, log_impedance
 
-__all__ = ["BUS_RATE", "Recording", "log_impedance", "counts_of", "read_recording"]
+__all__ = ["BUS_RATE", "Recording", "read_recording"]
 
 BUS_RATE = 100.0  # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
@@ -102,18 +103,8 @@ class Recording:
         return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
 
 
-def log_impedance(counts):
-    """ln(Z / 10 kohm) of raw counts, any shape; counts are kept half a count inside 0..4095."""
-    return np.log(FULL_SCALE / np.clip(counts, 0.5, FULL_SCALE - 0.5) - 1)
-
-
-def counts_of(log_z):
-    """Raw counts of ln(Z / 10 kohm)."""
-    return FULL_SCALE / (np.exp(np.clip(log_z, -9, 9)) + 1)
-
-
 def read_recording(electrodes, force=None, tdc=None, rate=None) -> Recording:
-    """Reads text files of numbers (blanks, tabs, commas or semicolons between them; lines that start with a letter or # are headers).
+    """Reads text files of numbers (`data.columns`).
 
     Args:
       electrodes: path, 19 columns of raw counts.
@@ -122,9 +113,9 @@ def read_recording(electrodes, force=None, tdc=None, rate=None) -> Recording:
     Raises:
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
-    table = _read_table(electrodes, 19, "--electrodes")
-    push = None if force is None else _read_table(force, 3, "--force")
-    temperature = None if tdc is None else _read_table(tdc, 1, "--tdc")[:, 0]
+    table = read_columns(electrodes, CHANNELS[:19])
+    push = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
+    temperature = None if tdc is None else read_columns(tdc, ("tdc",))[:, 0]
     for name, path, value in (("--force", force, push), ("--tdc", tdc, temperature)):
         if value is not None and len(value) != len(table):
             raise ValueError(
@@ -132,29 +123,6 @@ def read_recording(electrodes, force=None, tdc=None, rate=None) -> Recording:
                 "together; cut both to the time they share (a clock gap cannot be guessed)"
             )
     return Recording(table, push, temperature, rate, "given" if rate else "", pathlib.Path(electrodes).name)
-
-
-def _read_table(path, width, option):
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{option} {path}: no such file; give the path of a text file with {width} columns")
-    rows = []
-    with open(path, errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            cells = line.replace(",", " ").replace(";", " ").split()
-            if not cells or cells[0].startswith("#") or (not rows and cells[0][0].isalpha() and cells[0].lower() not in ("nan", "inf")):
-                continue
-            if len(cells) != width:
-                raise ValueError(
-                    f"{option} {path}, line {number}: {len(cells)} columns, {width} are needed; leave out times and other channels"
-                )
-            try:
-                rows.append([float(c) for c in cells])
-            except ValueError:
-                raise ValueError(f"{option} {path}, line {number}: {line.strip()[:60]!r} is not {width} numbers") from None
-    if not rows:
-        raise ValueError(f"{option} {path} holds no numbers: {width} columns, one row per sample, are needed")
-    return np.array(rows)
 
 
 def _check_numbers(value, label):

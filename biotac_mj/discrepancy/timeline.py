@@ -9,7 +9,8 @@ other 18, with p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain 
 
 import numpy as np
 
-from .recording import Recording, log_impedance
+from ..sensor.channels import log_impedance
+from .recording import Recording
 
 __all__ = ["Timeline", "noise_level"]
 

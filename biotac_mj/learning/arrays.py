@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from ..sensor.channels import CHANNELS, counts_from_impedance
-from .recording import log_impedance
+from ..sensor.channels import CHANNELS, counts_from_impedance, log_impedance
 
 __all__ = ["Arrays", "load_arrays"]
 

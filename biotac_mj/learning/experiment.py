@@ -161,8 +161,8 @@ def _linear(arrays, now, fit, check, both):
 
 def _physics_gain(arrays, fit, both):
     """The simulation's own d ln Z, times one gain for each electrode."""
+    from ..sensor.channels import log_impedance
     from .local import counts_change
-    from .recording import log_impedance
 
     z = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device)
     z = z - z[arrays.first]

@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from scipy.signal import lfilter
 
-from .recording import counts_of, log_impedance
+from ..sensor.channels import counts_from_log_impedance, log_impedance
 
 __all__ = ["ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
 
@@ -105,7 +105,7 @@ def _features(log_z, force, part, candidate):
         if candidate.shared:
             log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
     if candidate.raw:
-        log_z = counts_of(log_z) / 1000
+        log_z = counts_from_log_impedance(log_z) / 1000
     columns = [log_z, *(causal_average(log_z, tau) for tau in candidate.window)]
     if candidate.products:
         centred = log_z - log_z[part].mean(0)

@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from ..sensor.channels import log_impedance
 from .electrode_vae import mlp
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
 from .heads import steady
-from .recording import log_impedance
 
 __all__ = ["InverseHead", "contact_centre", "field_errors", "log_change_of", "patch_overlap", "train_inverse"]
 

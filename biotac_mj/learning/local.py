@@ -2,12 +2,11 @@
 
 import torch
 
-from ..sensor.channels import FULL_SCALE
+from ..sensor.channels import FULL_SCALE, log_impedance
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
 from .fitting import cycle, root_mean_square
 from .graph import SparseMatrix
 from .heads import LocalHead, PodHead, averages
-from .recording import log_impedance
 
 __all__ = ["Features", "counts_change", "train_head"]
 

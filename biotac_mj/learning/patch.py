@@ -6,10 +6,11 @@ import pathlib
 import numpy as np
 import torch
 
+from ..data.columns import read_columns
 from ..geometry import load_skin
 from ..press_record import replacing
+from ..sensor.channels import CHANNELS
 from .inverse import PATCH, contact_centre, log_change_of
-from .recording import load_counts
 from .weights import load_inverse, shipped
 
 __all__ = ["contact_patch", "draw_skin", "estimate"]
@@ -45,7 +46,7 @@ def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", wei
       FileNotFoundError: no such file.
       ValueError: a bad table, or a tare or row that the recording does not have.
     """
-    counts = load_counts(source)
+    counts = read_columns(source, CHANNELS[:19])
     if not 1 <= tare < len(counts):
         raise ValueError(f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at")
     if not -len(counts) <= row < len(counts):

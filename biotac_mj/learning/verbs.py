@@ -78,8 +78,11 @@ def _evaluate(args):
         from .weights import shipped
 
         one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json or "out/evaluate/new_sensor.json")
+        same = one["as_it_is_on_the_same_touches"]
         for name, value in one["median_rms_counts_after_touches"].items():
-            print(f"  {'predict the tare' if name == 'tare' else name + ' touches':<20}{value:>8.2f} counts, median RMS per interaction")
+            text = "predict the tare" if name == "tare" else f"{name} touches"
+            beside = f" (without adaptation {same[name]:.2f})" if name in same and name != "0" else ""
+            print(f"  {text:<20}{value:>8.2f} counts, median RMS per interaction{beside}")
     elif args.folder:
         _evaluate_models(args)
     else:

@@ -14,12 +14,14 @@ __all__ = [
     "REST_TEMPERATURE",
     "counts_from_heating",
     "counts_from_impedance",
+    "counts_from_log_impedance",
     "counts_from_pac",
     "counts_from_pressure",
     "counts_from_temperature",
     "electrode_noise",
     "heating_from_counts",
     "impedance_from_counts",
+    "log_impedance",
     "pac_from_counts",
     "pressure_from_counts",
     "temperature_from_counts",
@@ -54,6 +56,16 @@ def impedance_from_counts(counts):
     """Z = (4095 / E - 1) * 10 kohm [ohm]; infinite at E = 0."""
     with np.errstate(divide="ignore"):
         return (FULL_SCALE / np.asarray(counts, dtype=float) - 1) * _DIVIDER
+
+
+def log_impedance(counts):
+    """ln(Z / 10 kohm) = ln(4095 / E - 1) of counts, any shape; 0 and 4095 are taken as half a count away, so that it stays finite."""
+    return np.log(FULL_SCALE / np.clip(counts, 0.5, FULL_SCALE - 0.5) - 1)
+
+
+def counts_from_log_impedance(log_z):
+    """Counts (fractional) of ln(Z / 10 kohm), any shape: the inverse of `log_impedance`, held where 12 bits end."""
+    return FULL_SCALE / (1 + np.exp(np.clip(log_z, -9.1, 9.1)))
 
 
 def counts_from_pressure(pressure):
