@@ -47,6 +47,16 @@ def test_effects_become_what_the_rubber_is():
     np.testing.assert_allclose(twice.model["modulus"](at), factors**2)
 
 
+def test_it_is_run_as_any_simulator(monkeypatch):
+    """What `Simulator.run` takes by position reaches it, inside the skin and outside."""
+    seen = []
+    monkeypatch.setattr(Simulator, "run", lambda self, *args, **kw: seen.append((args, kw)) or ["run"])
+    gain, relax = (by_id("gain"), {}), (by_id("relax"), {"g": 0.2, "tau": 1.0})
+    for effects in ([gain], [relax, gain]):
+        assert InSkinSimulator().run(["press"], None, True, effects, 1.1, ["slip"], nuisance="known") == ["run"]
+    assert seen == [((["press"], None, True, [gain], 1.1, ["slip"]), {"nuisance": "known"})] * 2
+
+
 def test_a_file_says_where_constitutive_effects_act(tmp_path):
     InSkinSimulator(effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})]).save(tmp_path / "s.yaml")
     again = load_simulator(tmp_path / "s.yaml")

@@ -1,5 +1,7 @@
 """Rubber that is not the same everywhere: a factor on Young's modulus for every element."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -133,6 +135,9 @@ def test_what_cannot_be_is_refused():
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="1 of the 48 factors of modulus are not positive finite numbers"):
             cube("linear", "linear", modulus=np.r_[bad, np.ones(47)])
+    on_a_gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True))
+    with pytest.raises(ValueError, match="solved on the CPU's full tier only: choose device='cpu'"):
+        SkinModel._moduli(on_a_gpu, np.ones(48), None)
     model = cube("corotational", "linear", modulus=np.full(48, 2.0))
     with pytest.raises(ValueError, match="skin with modulus is solved on the CPU's full tier only"):
         SkinData(model, resident=True)
