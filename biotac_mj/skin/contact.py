@@ -18,6 +18,7 @@ __all__ = [
     "contact_wrench",
     "core_contact_force",
     "face_samples",
+    "stick_or_slip",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -51,6 +52,24 @@ def face_samples(order: int) -> np.ndarray:
                 points.append((i + 2 / 3, j + 2 / 3))
     ab = np.array(points) / order
     return np.column_stack([ab, 1 - ab.sum(axis=1)])
+
+
+@wp.func
+def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
+    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`: force, its tangent, anchor."""
+    slip = local - stick
+    slip = slip - wp.dot(slip, normal) * normal
+    length = wp.length(slip)
+    tangent = wp.identity(n=3, dtype=real) - wp.outer(normal, normal)
+    force = -kt * slip
+    K = kt * tangent
+    anchor = stick
+    if kt * length > most:
+        along = slip / length
+        force = -most * along
+        K = most / length * (tangent - wp.outer(along, along))
+        anchor = local - most / kt * along
+    return force, K, anchor
 
 
 @wp.func
@@ -92,8 +111,7 @@ def touch_sample(
     if touched >= 0:
         fn = -k * gap
         force = fn * normal
-        nn = wp.outer(normal, normal)
-        K = k * nn
+        K = k * wp.outer(normal, normal)
         mu = geoms.friction[touched, w]
         if mu > real(0.0):
             if anchor_geom[i, w] == touched:
@@ -102,18 +120,9 @@ def touch_sample(
                 # touched within this step: slip counts from where the sample was on the geom when the step began
                 last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
                 stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
-            slip = local - stick
-            slip = slip - wp.dot(slip, normal) * normal
-            length = wp.length(slip)
-            tangent = wp.identity(n=3, dtype=real) - nn
-            if kt * length <= mu * fn:
-                force = force - kt * slip
-                K = K + kt * tangent
-            else:
-                along = slip / length
-                force = force - mu * fn * along
-                K = K + mu * fn / length * (tangent - wp.outer(along, along))
-                stick = local - mu * fn / kt * along
+            ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
+            force = force + ft
+            K = K + Kt
         R = geoms.mat[touched, w]
         force = R * force
         K = R * K * wp.transpose(R)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .contact import Geoms
+from .contact import Geoms, stick_or_slip
 from .shapes import distance, distance_bound
 from .types import mat33, real, vec3
 
@@ -120,8 +120,7 @@ def touch_sample(
         tn = normal_traction(k, peak, laws.reach[w], gap)
         fn = tn[0]
         force = fn * normal
-        nn = wp.outer(normal, normal)
-        K = tn[1] * nn
+        K = tn[1] * wp.outer(normal, normal)
         mu = geoms.friction[touched, w]
         if mu > real(0.0) and fn > real(0.0):
             if laws.exponent[w] != real(0.0):
@@ -135,18 +134,9 @@ def touch_sample(
             else:
                 last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
                 stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
-            slip = local - stick
-            slip = slip - wp.dot(slip, normal) * normal
-            length = wp.length(slip)
-            tangent = wp.identity(n=3, dtype=real) - nn
-            if kt * length <= mu * fn:
-                force = force - kt * slip
-                K = K + kt * tangent
-            else:
-                along = slip / length
-                force = force - mu * fn * along
-                K = K + mu * fn / length * (tangent - wp.outer(along, along))
-                stick = local - mu * fn / kt * along
+            ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
+            force = force + ft
+            K = K + Kt
         R = geoms.mat[touched, w]
         force = R * force
         K = R * K * wp.transpose(R)
