@@ -18,7 +18,7 @@ from biotac_mj.data.generate import GenerateOptions, batches, generate
 from biotac_mj.data.objects import OBJECTS, make_object
 from biotac_mj.data.plan import KINDS, plan_motions, sensing_faces
 from biotac_mj.data.readings import sample
-from biotac_mj.data.simulate import _walk, simulate
+from biotac_mj.data.simulate import _simulate, _walk, simulate
 from biotac_mj.geometry import INDENTERS, load_skin
 from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressure
 from biotac_mj.sensor.film import FilmConduction
@@ -159,12 +159,12 @@ def test_a_small_set_is_physics(small, skin):
 
 
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
-    # three objects in one batch against each alone; the host's solver works world by world, so only sums of other lengths differ
+    # three objects in one batch, as on a GPU, against each alone; only sums of other lengths differ
     names = ["ring_7mm", "table_edge", "sphere_7mm"]
     motions = [plan_motions(skin, name, [[0, k + 1]], 8)[0] for k, name in enumerate(names)]
     model = SkinModel(skin, "default", SkinOptions())
     ticks = []
-    both = simulate(model, names, motions, ticks.append)
+    both = _simulate(model, names, motions, ticks.append)
     assert sum(ticks) == 3 * 8 and both.converged.all()
     for k, name in enumerate(names):
         alone = simulate(model, name, motions[k : k + 1])

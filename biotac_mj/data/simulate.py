@@ -43,7 +43,8 @@ class Fields:
 
 
 def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
-    """Walks all motions at once, each world at its own pace. A step that does not converge keeps the last good state and is marked.
+    """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a batch takes as many iterations
+    as its worst world, with nothing won. A step that does not converge keeps the last good state and is marked.
 
     Args:
       model: the skin, on any device.
@@ -55,6 +56,13 @@ def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
       ValueError: an object deep inside the rigid core (plans keep clear of it).
     """
     names = [names] * len(motions) if isinstance(names, str) else list(names)
+    if not model.device.is_cuda:
+        ones = [_simulate(model, [name], [motion], progress) for name, motion in zip(names, motions)]
+        return Fields(*(np.concatenate([getattr(one, field.name) for one in ones]) for field in dataclasses.fields(Fields)))
+    return _simulate(model, names, motions, progress)
+
+
+def _simulate(model, names, motions, progress):
     nworld, nstep = len(motions), len(motions[0].pos)
     data = SkinData(model, nworld)
     scene = Scene(names, model.device, model.material.friction)

@@ -35,7 +35,7 @@ class Simulator:
     Attributes:
       skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
-      device: of the full tier, "cpu" or "cuda:0": trajectories are worlds of one batch.
+      device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
     """
