@@ -12,7 +12,7 @@ import numpy as np
 __all__ = ["ALSO", "EFFECTS", "NATURAL", "OUTSIDE", "SEEDS", "bases", "hash_of", "hide", "make_case"]
 
 REAL = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
-SEEDS = {"development": 0, "practice": 100_000, "blind": 900_000, "second blind": 1_700_000}
+SEEDS = {"development": 0, "practice": 100_000, "blind": 900_000, "second blind": 1_700_000, "third blind": 2_600_000}
 NATURAL = {"loaded, real": {"warmup", "lowpass", "latency", "relax", "hyster"}, "unloaded, real": {"warmup"}}
 PLACES = np.array([[-14.5, 71], [-9.6, 44], [-6.1, 44], [-4.3, 71], [-1.8, 44], [1.1, 71], [-17, 0], [-15.3, 30], [-15.3, -30], [-13.6, 0],
                    [-14.5, -71], [-9.6, -44], [-6.1, -44], [-4.3, -71], [-1.8, -44], [1.1, -71], [-9.5, 0], [-2.5, 0], [1.3, 0]])  # fmt: skip  # noqa: E501
@@ -206,9 +206,12 @@ def relax(e, force, rng, rate):
 
 def hyster(e, force, rng, rate):
     out, width = force.copy(), 0.5 * force.std(0)
-    z = np.zeros(3)
+    z, half = np.zeros(3), max(2, int(0.1 * rate))
+    # of the movement, not of the force sensor's noise: going to and fro by a hundredth of a newton wears a loop off within a second
+    kernel = np.hanning(2 * half + 3)[1:-1]
+    smooth = np.stack([np.convolve(np.pad(x, half, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1)
     for i in range(1, len(force)):
-        step = force[i] - force[i - 1]
+        step = smooth[i] - smooth[i - 1]
         z = z + step * (1 - np.sign(step) * z / width)  # Dahl's law, not the play operator that is fitted
         z = np.clip(z, -width, width)
         out[i] += 0.5 * z

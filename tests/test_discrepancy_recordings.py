@@ -208,6 +208,49 @@ def test_latency_against_the_force_is_measured():
     assert "latency" not in ids(diagnose_recording(Recording(noisy(e, rng), force)))
 
 
+def test_memory_between_force_and_electrodes_is_named_and_measured():
+    """Relaxation by its differential equation, a loop by friction elements in parallel with a spring: neither is a low-pass nor a delay."""
+    e, force, rng = pressed(10)
+    slow, relaxed = force[0].copy(), np.empty_like(force)
+    for i, f in enumerate(force):
+        slow += (f - slow) * 0.01 / 1.2
+        relaxed[i] = f + 0.3 * (f - slow)
+    d = diagnose_recording(Recording(noisy(e, rng), relaxed))
+    (found,) = d.findings
+    assert found.id == "relax" and found.verified and not found.ties
+    assert abs(found.theta["fraction"] - 0.3) < 0.06 and abs(found.theta["tau"] - 1.2) < 0.3
+    spring, kernel = np.zeros(3), np.hanning(23)[1:-1]
+    clean = np.stack([np.convolve(np.pad(x, 10, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1)
+    width, loop = 0.3 * force.std(0), np.zeros_like(force)
+    for i in range(1, len(force)):
+        spring = np.maximum(np.minimum(spring + clean[i] - clean[i - 1], width), -width)
+        loop[i] = 0.5 * spring
+    d = diagnose_recording(Recording(noisy(e, rng), force + loop))
+    found = d.findings[0]
+    assert found.id == "hyster" and abs(found.theta["fraction"] - 0.5) < 0.15, d.verdict
+    assert ids(diagnose_recording(Recording(noisy(e, rng), force))) == []
+
+
+def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
+    from biotac_mj.discrepancy.load_search import BETWEEN, ForceView
+
+    e, force, rng = pressed(11)
+    view = ForceView(noisy(e, rng), force, np.arange(len(e)) < 5000, np.arange(19), RATE)
+    relax = next(b for b in BETWEEN if b.id == "relax")
+    theta = {"fraction": 0.3, "tau": 1.6}
+    x = relax.unsee(view.x, RATE, theta)[:: view.step]
+    a, b = view.edges[4:6]
+    train = np.r_[0:a, b : len(x)]
+    A = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+    ridge = np.sqrt(np.r_[0, 1e-4 * (x**2).sum(0)])
+    w = np.linalg.lstsq(
+        np.concatenate([A[train], np.diag(ridge)]), np.concatenate([view.target[train], np.zeros((A.shape[1], 3))]), rcond=None
+    )[0]
+    expected = np.log(((view.target[a:b] - A[a:b] @ w) ** 2).mean(0))
+    np.testing.assert_allclose(view.errors([(relax, theta)])[4], expected, rtol=1e-4)
+    np.testing.assert_allclose(view.table(relax, [theta])[0, 4], expected.mean(), rtol=1e-4)
+
+
 def test_gain_of_one_electrode_under_load():
     e, _, rng = pressed(6)
     k = int(np.argmax(e.std(0)))

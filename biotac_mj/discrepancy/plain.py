@@ -13,7 +13,7 @@ from .drifts import CountGain, CountOffset, SharedGain, Thermal, TimeShaped
 from .electrode_drifts import Drift, GainChange
 from .faults import Freeze, Quantise, Saturate, Spikes, Stuck, Swap
 from .hum import Hum
-from .loads import Hysteresis, Latency, LoadLowPass, Relaxation
+from .load_search import BETWEEN, find_between
 from .noises import CommonNoise, CrossTalk, LowPass, Noise
 from .recorded_effect import Session
 from .recorded_gap import gap, statistics
@@ -23,11 +23,10 @@ from .recording import Recording
 __all__ = ["EFFECTS", "RecordingDiagnosis", "diagnose_recording"]
 
 EFFECTS = [Quantise(), Freeze(), Stuck(), Saturate(), Spikes(), Swap(), Hum(), LowPass(), CrossTalk(), CommonNoise(), Noise(), SharedGain(),
-           CountOffset(), CountGain(), Thermal(), Drift(), GainChange(), Latency(), LoadLowPass(), Relaxation(), Hysteresis()]  # fmt: skip
+           CountOffset(), CountGain(), Thermal(), Drift(), GainChange(), *BETWEEN]  # fmt: skip
 _COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
 _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
 _MOVING = [EFFECTS[5], *EFFECTS[11:17]]
-_FORCE = EFFECTS[17:]
 _MOST = 8
 _CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 6 / 12, 2 / 5  # confidence: of 42, 10 and 3 names 42, 5 and 1 right
 
@@ -119,12 +118,10 @@ def _search(session, effects, bar):
             break
         session.accept(chosen)
     bar.update()
-    for _ in range(4):
-        done = {f.id for f in session.findings}
-        candidates = [f for effect in _FORCE if effect.id not in done for f in effect.find(session)]
-        if not candidates:
-            break
-        session.accept(_choose_force(candidates))
+    known = {f.id for f in session.findings}
+    for finding in find_between(session):
+        if finding.id not in known:  # a low-pass that coloured the noise was named already
+            session.accept(finding)
     bar.update()
 
 
@@ -173,17 +170,6 @@ def _energy(session, finding):
     shape = finding.theta.get("shape")
     share = shape.explained if shape is not None else 1.0
     return float(((series - series.mean()) ** 2).sum() * share / sd**2)
-
-
-def _choose_force(candidates):
-    """The effect with the largest gain; those within one standard error of it (paired, over blocks) are ties."""
-    best = max(candidates, key=lambda f: f.theta["gain"].mean())
-    for other in candidates:
-        if other is not best:
-            lead = best.theta["gain"] - other.theta["gain"]
-            if lead.mean() < lead.std(ddof=1) / np.sqrt(len(lead)):
-                best.ties = (*best.ties, other.id)
-    return best
 
 
 def _late(session, effects):

@@ -120,15 +120,20 @@ class Session:
 
     def force_view(self):
         """ForceView of the corrected counts, or None where force and electrodes are not related."""
-        from .loads import ForceView
-
         if self.force is None or self.force[self.fit].std(0).max() < 0.02:
             return None
         if self._view is None:
-            usable = np.flatnonzero(~(self.masked[self.fit].mean(0) > 0.02))
-            view = ForceView(self.counts, self.force, self.fit, usable)
-            self._view = view if len(usable) >= 6 and view.explained() > 0.3 else False
+            view = self.force_view_of(self.fit)
+            self._view = view if view is not None and view.explained() > 0.3 else False
         return self._view or None
+
+    def force_view_of(self, rows):
+        """ForceView of contiguous rows (n,) bool with what was found between force and electrodes, or None with too few electrodes."""
+        from .load_search import ForceView
+
+        usable = np.flatnonzero(~(self.masked[rows].mean(0) > 0.02))
+        chain = [(f.effect, f.theta) for f in self.findings if hasattr(f.effect, "see")]
+        return ForceView(self.counts, self.recording.force, rows, usable, self.recording.rate, chain) if len(usable) >= 6 else None
 
     def timeline(self, rows=None, counts=None) -> Timeline:
         """Bins of the rows to fit, or of others (a slice, contiguous)."""

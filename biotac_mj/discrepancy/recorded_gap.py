@@ -3,7 +3,7 @@
 import numpy as np
 
 from .hum import Hum
-from .loads import ForceEffect, ForceView
+from .loads import ForceEffect
 from .noises import CrossTalk, LowPass, _lag_one, quiet, windows
 from .recorded_effect import Session
 from .recorded_views import VIEWS, Amended, Choice, choose, cross_residual, whole_line
@@ -114,9 +114,8 @@ def _mean_correlation(session, rows):
 
 def _force_error(session):
     """RMS error of force from electrodes, map and error both from the part kept aside, by blocks left out [N]."""
-    usable = np.flatnonzero(~(session.masked.mean(0) > 0.02))
-    view = ForceView(session.counts, session.force, ~session.fit, usable)
-    return float(np.exp(0.5 * view.errors(session.force).mean()))
+    view = session.force_view_of(~session.fit)
+    return float("nan") if view is None else float(np.exp(0.5 * view.errors().mean()))
 
 
 def gap(session, findings, late=()) -> dict:
