@@ -101,8 +101,8 @@ def diagnose(make, folder):
 def code_hash():
     """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
     folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    names = "drifts electrode_drifts faults hum load_search loads noises plain recorded_effect recorded_gap recorded_rest recorded_views recording shapes"
-    names += " timeline"
+    names = "drifts electrode_drifts faults hum load_search loads noises plain recorded_effect recorded_gap recorded_rest"
+    names += " recorded_views recording shapes timeline"
     return hashlib.sha256(b"".join((folder / f"{n}.py").read_bytes() for n in names.split())).hexdigest()[:12]
 
 

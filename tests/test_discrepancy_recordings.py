@@ -260,6 +260,19 @@ def test_gain_of_one_electrode_under_load():
     assert any(f.id == "gain" and f.channels == (k,) for f in d.findings), d.verdict
 
 
+def test_a_channel_that_comes_back_is_an_event_and_no_fault():
+    """Two seconds away from the others name nothing, but are noted; the same step for good is a jump of the channel."""
+    e, _, rng = pressed(12)
+    counts = noisy(e, rng)
+    movement = np.convolve(np.abs(np.diff(np.log(4095 / e - 1), axis=0)).sum(1), np.ones(160), "same")
+    first = 2500 + int(movement[2500:3500].argmin())  # while the hand holds still
+    for last, named in ((first + 200, []), (len(e), ["drift"])):
+        moved = counts.copy()
+        moved[first:last, 8] = np.clip(moved[first:last, 8] - 350, 0, 4095)
+        d = diagnose_recording(Recording(moved))
+        assert ids(d) == named and any("e9 leaves the others" in n and "comes back" in n for n in d.notes) == (not named), d.verdict
+
+
 def test_what_has_no_name_is_called_unknown():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)

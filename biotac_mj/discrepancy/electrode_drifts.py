@@ -13,6 +13,8 @@ __all__ = ["Drift", "GainChange"]
 # (practice seeds); a fault stands out of what the other electrodes seem to do.
 _SLOW, _ALONE = 90.0, 2.0
 _STAYS, _GOES = 50.0, 80.0  # a gain that changes and stays so; one that comes and goes
+_COMES_BACK = 10.0  # [s] a jump of a channel stays; what comes back sooner was a place pressed only then, or a loose contact
+_STAYED = 0.4  # of the jump
 
 
 class Drift(TimeShaped):
@@ -81,11 +83,20 @@ class Drift(TimeShaped):
         z = np.abs(alone) / np.hypot(line.noise * np.sqrt(2 / w), 0.5 * moving[:, None])
         order = np.sort(z, axis=1)
         lone = order[:, -2] < 0.35 * order[:, -1]
-        score = np.where(lone, order[:, -1], 0)
-        i = int(np.argmax(score))
-        k = int(np.argmax(z[i]))
-        slope = np.abs(np.median(counts_per_log(session.counts), axis=0))[line.used][k]
-        if score[i] < 10 or abs(alone[i, k]) * slope < 15:
+        whole = whole_electrodes(session, line)
+        score = np.where(lone & np.isin(z.argmax(1), whole), order[:, -1], 0)
+        slopes = np.abs(np.median(counts_per_log(session.counts), axis=0))[line.used]
+        for _ in range(4):
+            i = int(np.argmax(score))
+            k = int(np.argmax(z[i]))
+            slope = slopes[k]
+            if score[i] < 10 or abs(alone[i, k]) * slope < 15:
+                return []
+            if not line.loaded or _lasts(line, k, at[i], alone[i, k]):
+                break
+            session.events[int(line.used[k]), round(float(line.time[at[i]]))] = float(abs(alone[i, k]) * slope)
+            score[np.abs(at - at[i]) * line.period < _COMES_BACK] = 0
+        else:
             return []
         time = float(line.time[at[i]])
         unit = np.zeros(c)
@@ -98,6 +109,14 @@ class Drift(TimeShaped):
         found.ties = ("gain",)
         found.note += f"; the other electrodes stand still meanwhile ({abs(value) * slope:.0f} counts)"
         return [found]
+
+
+def _lasts(line, k, row, value):
+    """Whether electrode used[k], departing by `value` [ln Z] at bin `row`, stays where it went, by what the others say."""
+    departure = line.explained_by_others(k)(line.value[:, k] - line.value[:, k].mean())
+    reach, gap = int(_COMES_BACK / line.period), int(round(0.6 / line.period))
+    before, after = departure[max(row - reach, 0) : max(row - gap, 1)], departure[row + gap : row + reach]
+    return len(after) > 2 and (np.median(after) - np.median(before)) / value > _STAYED
 
 
 class GainChange(RecordedEffect):

@@ -26,6 +26,7 @@ _ROWS = 4000
 _GAIN = {"latency": 0.03, "lowpass": 0.03, "relax": 0.06, "hyster": 0.06}  # least mean fall of a block's log mean square error
 _FURTHER = 1.5  # times that beside another effect
 _P = 0.02
+_REMAINDER = 0.1  # of the other's gain that a second effect needs: what a law a little different leaves is no effect
 _LEAST = 0.06  # fraction of a relaxation or a loop
 _TIE = 1.64  # standard errors, paired over blocks
 
@@ -165,12 +166,16 @@ def find_between(session) -> list:
             reference = mirror if mirror.mean() < without.mean() else without
         return reference - score
 
+    null = view.errors().mean()
+
     def choose(effects, chain):
         """The effect of some that predicts best beside a chain, if its evidence is enough: list of none or one."""
         without, options = view.errors(chain).mean(1), []
+        least = _REMAINDER * (null - without.mean())
         for effect in effects:
             theta, score, _ = best(effect, chain)
-            if _enough(effect, gain(effect, theta, score, chain, without), bool(chain)):
+            g = gain(effect, theta, score, chain, without)
+            if _enough(effect, g, bool(chain)) and g.mean() > least:
                 options.append((score.mean(), effect, theta))
         return [min(options, key=lambda o: o[0])[1:]] if options else []
 

@@ -11,6 +11,7 @@ from .recorded_effect import Finding, Parameter, RecordedEffect, spans
 
 __all__ = ["CommonNoise", "CrossTalk", "LowPass", "Noise"]
 
+_LOADED = 90.0  # nats of cross-talk under load: skin that moves correlates electrodes too, up to 84 nats of pairs (practice seeds)
 _THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _WINDOWS = 24
 _ELECTRODES_MM = {  # Lin et al. 2013, in the sensor's frame [mm]; E11..E16 mirror E1..E6
@@ -201,6 +202,8 @@ class CrossTalk(RecordedEffect):
         half = 2 / np.sqrt(n)
         theta = {"kappa": value, "matrix": np.eye(19) + value * K, "centre": np.median(session.counts[session.fit], axis=0)}
         nats = min(0.5 * n * float(np.nansum((2 * value * K[np.triu_indices(19, 1)]) ** 2)), 1e4)
+        if session.timeline().loaded and nats < _LOADED:
+            return []
         parameters = {"kappa": (value, value - half, value + half)}
         if pattern.startswith("distance"):
             parameters["length"] = (float(pattern.split()[1]), np.nan, np.nan)

@@ -28,7 +28,7 @@ _COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
 _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
 _MOVING = [EFFECTS[5], *EFFECTS[11:17]]
 _MOST = 8
-_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 6 / 12, 2 / 5  # confidence: of 42, 10 and 3 names 42, 5 and 1 right
+_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 17 / 19, 2 / 5  # confidence: of 42, 17 and 3 names 42, 16 and 1 right
 
 
 @dataclasses.dataclass
@@ -38,7 +38,8 @@ class RecordingDiagnosis:
     Attributes:
       recording; locked: share kept aside at the end; verdict: one line; findings: accepted, the strongest first; rejected: those that the
       part kept aside does not confirm; where: list of cells (channel, from, to, z, p); gap: dict of views with before and after;
-      remainder: dict that describes what is left; notes: what the data cannot tell; session: counts without the effects.
+      remainder: dict that describes what is left; notes: what the data cannot tell; session: counts without the effects;
+      events: (electrode, second) -> counts by which it left the others for a few seconds.
     """
 
     recording: Recording
@@ -51,6 +52,7 @@ class RecordingDiagnosis:
     remainder: dict
     notes: list
     session: Session
+    events: dict = dataclasses.field(default_factory=dict)
 
 
 def diagnose_recording(recording: Recording, locked: float | None = None, effects=(), progress: bool = False) -> RecordingDiagnosis:
@@ -76,7 +78,7 @@ def diagnose_recording(recording: Recording, locked: float | None = None, effect
         late = _late(session, effects)
         bar.update()
         rejected = statistics(session)
-        result = RecordingDiagnosis(recording, locked, "", session.findings, rejected, [], {}, {}, [], session)
+        result = RecordingDiagnosis(recording, locked, "", session.findings, rejected, [], {}, {}, [], session, session.events)
         _settle(result, late)
         result.where = cells(session)
         result.gap = gap(result.session, [f for f in result.session.findings if f not in late], late)
@@ -118,9 +120,11 @@ def _search(session, effects, bar):
             break
         session.accept(chosen)
     bar.update()
-    known = {f.id for f in session.findings}
+    filters = [f.theta["tau"] for f in session.findings if f.id == "lowpass" and len(f.channels) > 12]
     for finding in find_between(session):
-        if finding.id not in known:  # a low-pass that coloured the noise was named already
+        # A low-pass that coloured the noise was named already, and it delays by its own time constant.
+        known = filters and (finding.id == "lowpass" or finding.id == "latency" and 0 < finding.theta["delay"] < 2 * filters[0])
+        if not known:
             session.accept(finding)
     bar.update()
 
@@ -248,6 +252,10 @@ def _notes(result):
     r, session = result.recording, result.session
     line = session.timeline()
     notes = [f"rate {r.rate:.1f} Hz ({r.rate_source})"]
+    for (k, second), counts in sorted(result.events.items(), key=lambda item: -item[1])[:3]:
+        notes.append(
+            f"e{k + 1} leaves the others at {second} s by {counts:.0f} counts and comes back: a place pressed only then or a loose contact; press it again there"  # noqa: E501
+        )
     if r.force is None:
         notes.append("no force: latency, relaxation and hysteresis against the load cannot be known; give --force to see them")
     elif result.session.force_view() is None:

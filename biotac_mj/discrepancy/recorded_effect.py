@@ -108,6 +108,7 @@ class Session:
         self._timelines = {}
         self._view = None
         self.unnamed = []  # what was seen and given up: texts
+        self.events = {}  # (electrode, second) -> counts: left the others and came back, no effect
 
     def give_up(self, findings, text):
         """Takes findings back: what they describe belongs to something that has no name here."""
