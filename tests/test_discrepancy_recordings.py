@@ -231,6 +231,18 @@ def test_memory_between_force_and_electrodes_is_named_and_measured():
     assert ids(diagnose_recording(Recording(noisy(e, rng), force))) == []
 
 
+def test_a_tie_says_what_would_tell_it_apart():
+    """A memory shorter than the movements: the relaxation is tied with hysteresis, and the summary gives the experiment."""
+    e, force, rng = pressed(13)
+    slow, relaxed = force[0].copy(), np.empty_like(force)
+    for i, f in enumerate(force):
+        slow += (f - slow) * 0.01 / 0.25
+        relaxed[i] = f + 0.3 * (f - slow)
+    d = diagnose_recording(Recording(noisy(e, rng), relaxed))
+    assert d.findings[0].id == "relax" and "hyster" in d.findings[0].ties
+    assert "to tell it from rate-independent hysteresis: hold 0, 1 and 30 s at the same depth" in summary(d)
+
+
 def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
     from biotac_mj.discrepancy.load_search import BETWEEN, ForceView
 

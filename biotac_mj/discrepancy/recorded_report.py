@@ -89,6 +89,8 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
         lines.append(f"  {f.effect.name} [{STAGES[f.effect.stage]}], confidence {f.confidence:.2f}, from {f.start:.1f} s to {f.end:.1f} s")
         lines.append(f"    {numbers}")
         lines.append(f"    {f.note}")
+        apart = {e.name: f.effect.confusable[e.id] for e in EFFECTS if e.id in f.ties and e.id in f.effect.confusable}
+        lines += [f"    to tell it from {name}: {how}" for name, how in apart.items()]
         s = f.statistic
         if s:
             sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[f.verified]
