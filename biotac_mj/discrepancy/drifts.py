@@ -120,7 +120,7 @@ class Common(TimeShaped):
             if inside.sum() < max(8, 0.7 * len(pattern)):
                 return []
             agreement = abs(float(own[inside] @ pattern[inside] / np.linalg.norm(own[inside]) / np.linalg.norm(pattern[inside])))
-            if agreement < 0.93:
+            if not agreement >= 0.93:  # nan: none of it in the electrodes
                 return []
             fit = pattern * (own[inside] @ pattern[inside]) / (pattern[inside] @ pattern[inside])
             factor = float(np.mean(fit / pattern) / shape.amplitude) if abs(shape.amplitude) > 0 else 1.0
