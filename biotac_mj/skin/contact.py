@@ -12,6 +12,7 @@ from .shapes import Grids, distance, distance_bound
 from .types import mat33, real, vec3
 
 __all__ = [
+    "FaceSum",
     "Geoms",
     "contact_force",
     "contact_product",
@@ -19,6 +20,8 @@ __all__ = [
     "core_contact_force",
     "face_samples",
     "stick_or_slip",
+    "with_sample",
+    "write_face",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -129,6 +132,59 @@ def touch_sample(
     return touched, clearance, force, K, stick
 
 
+@wp.struct
+class FaceSum:
+    """Force on the corners of a face, and the six blocks of its tangent between them, of the samples so far."""
+
+    f0: vec3
+    f1: vec3
+    f2: vec3
+    b00: mat33
+    b01: mat33
+    b02: mat33
+    b11: mat33
+    b12: mat33
+    b22: mat33
+
+
+@wp.func
+def with_sample(total: FaceSum, b: vec3, force: vec3, K: mat33):
+    """The sum with a sample at barycentric b."""
+    total.f0 += b[0] * force
+    total.f1 += b[1] * force
+    total.f2 += b[2] * force
+    total.b00 += (b[0] * b[0]) * K
+    total.b01 += (b[0] * b[1]) * K
+    total.b02 += (b[0] * b[2]) * K
+    total.b11 += (b[1] * b[1]) * K
+    total.b12 += (b[1] * b[2]) * K
+    total.b22 += (b[2] * b[2]) * K
+    return total
+
+
+@wp.func
+def write_face(
+    f: int,
+    w: int,
+    touching: int,
+    total: FaceSum,
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+):
+    touching_out[f, w] = touching
+    corner_out[3 * f, w] = total.f0
+    corner_out[3 * f + 1, w] = total.f1
+    corner_out[3 * f + 2, w] = total.f2
+    if touching == 1:
+        block_out[6 * f, w] = total.b00
+        block_out[6 * f + 1, w] = total.b01
+        block_out[6 * f + 2, w] = total.b02
+        block_out[6 * f + 3, w] = total.b11
+        block_out[6 * f + 4, w] = total.b12
+        block_out[6 * f + 5, w] = total.b22
+
+
 @wp.func
 def touch_face(
     f: int,
@@ -173,15 +229,7 @@ def touch_face(
     if near == 1:
         clearance = real(1.0)
     touching = int(0)
-    f0 = vec3()
-    f1 = vec3()
-    f2 = vec3()
-    b00 = mat33()
-    b01 = mat33()
-    b02 = mat33()
-    b11 = mat33()
-    b12 = mat33()
-    b22 = mat33()
+    total = FaceSum()
     k = stiffness * area[f] / real(nsample)
     kt = k * stick_ratio
     for s in range(nsample):
@@ -196,26 +244,8 @@ def touch_face(
                 geom_out[i, w] = touched
                 anchor_out[i, w] = stick
                 force_out[i, w] = force
-                f0 += b[0] * force
-                f1 += b[1] * force
-                f2 += b[2] * force
-                b00 += (b[0] * b[0]) * K
-                b01 += (b[0] * b[1]) * K
-                b02 += (b[0] * b[2]) * K
-                b11 += (b[1] * b[1]) * K
-                b12 += (b[1] * b[2]) * K
-                b22 += (b[2] * b[2]) * K
-    touching_out[f, w] = touching
-    corner_out[3 * f, w] = f0
-    corner_out[3 * f + 1, w] = f1
-    corner_out[3 * f + 2, w] = f2
-    if touching == 1:
-        block_out[6 * f, w] = b00
-        block_out[6 * f + 1, w] = b01
-        block_out[6 * f + 2, w] = b02
-        block_out[6 * f + 3, w] = b11
-        block_out[6 * f + 4, w] = b12
-        block_out[6 * f + 5, w] = b22
+                total = with_sample(total, b, force, K)
+    write_face(f, w, touching, total, corner_out, block_out, touching_out)
     return clearance
 
 

@@ -84,6 +84,15 @@ def push_forward_change(law: int, F: mat33, Q: mat33, dF: mat33, dQ: mat33):
     return dP
 
 
+@wp.func
+def held(T: mat33, most: real):
+    """Share of a trial strain T that does not slip: radial return to the size `most`."""
+    size = wp.sqrt(wp.ddot(T, T))
+    if size > most:
+        return most / size
+    return real(1.0)
+
+
 @wp.kernel
 def add_stress(
     # In:
@@ -102,11 +111,7 @@ def add_stress(
     Q = mat33()
     for b in range(branch.shape[0]):
         T = deviator(A - slip[b, i, w])
-        size = wp.sqrt(wp.ddot(T, T))
-        held = real(1.0)
-        if size > branch[b][1]:
-            held = branch[b][1] / size
-        Q += (real(2.0) * branch[b][0] * mu[w] * held) * T
+        Q += (real(2.0) * branch[b][0] * mu[w] * held(T, branch[b][1])) * T
     stress_out[i, w] = stress_out[i, w] + push_forward(law, F, Q)
 
 
@@ -133,14 +138,11 @@ def add_derivative(
     for b in range(branch.shape[0]):
         T = deviator(A - slip[b, i, w])
         modulus = real(2.0) * branch[b][0] * mu[w]
-        size = wp.sqrt(wp.ddot(T, T))
-        if size > branch[b][1]:
-            held = branch[b][1] / size
-            Q += (modulus * held) * T
-            dQ += (modulus * held) * (dA - (wp.ddot(T, dA) / (size * size)) * T)
-        else:
-            Q += modulus * T
-            dQ += modulus * dA
+        share = held(T, branch[b][1])
+        Q += (modulus * share) * T
+        dQ += (modulus * share) * dA
+        if share < real(1.0):
+            dQ -= (modulus * share * wp.ddot(T, dA) / wp.ddot(T, T)) * T
     stress_out[i, w] = stress_out[i, w] + push_forward_change(law, F, Q, dF, dQ)
 
 
@@ -160,10 +162,7 @@ def slide(
     for b in range(branch.shape[0]):
         E = slip[b, i, w]
         T = deviator(A - E)
-        size = wp.sqrt(wp.ddot(T, T))
-        if size > branch[b][1]:
-            E = E + (real(1.0) - branch[b][1] / size) * T
-        slip_out[b, i, w] = E
+        slip_out[b, i, w] = E + (real(1.0) - held(T, branch[b][1])) * T
 
 
 class FrictionBranches:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .contact import Geoms, stick_or_slip
+from .contact import FaceSum, Geoms, stick_or_slip, with_sample, write_face
 from .shapes import distance, distance_bound
 from .types import mat33, real, vec3
 
@@ -184,15 +184,7 @@ def lawful_contact_force(
         if bound < radius + laws.reach[w]:
             near = 1
     touching = int(0)
-    f0 = vec3()
-    f1 = vec3()
-    f2 = vec3()
-    b00 = mat33()
-    b01 = mat33()
-    b02 = mat33()
-    b11 = mat33()
-    b12 = mat33()
-    b22 = mat33()
+    total = FaceSum()
     share = area[f] / real(nsample)
     k = stiffness * area[f] / real(nsample)
     kt = k * stick_ratio
@@ -211,23 +203,5 @@ def lawful_contact_force(
                 bond_out[i, w] = bond
                 anchor_out[i, w] = stick
                 force_out[i, w] = force
-                f0 += b[0] * force
-                f1 += b[1] * force
-                f2 += b[2] * force
-                b00 += (b[0] * b[0]) * K
-                b01 += (b[0] * b[1]) * K
-                b02 += (b[0] * b[2]) * K
-                b11 += (b[1] * b[1]) * K
-                b12 += (b[1] * b[2]) * K
-                b22 += (b[2] * b[2]) * K
-    touching_out[f, w] = touching
-    corner_out[3 * f, w] = f0
-    corner_out[3 * f + 1, w] = f1
-    corner_out[3 * f + 2, w] = f2
-    if touching == 1:
-        block_out[6 * f, w] = b00
-        block_out[6 * f + 1, w] = b01
-        block_out[6 * f + 2, w] = b02
-        block_out[6 * f + 3, w] = b11
-        block_out[6 * f + 4, w] = b12
-        block_out[6 * f + 5, w] = b22
+                total = with_sample(total, b, force, K)
+    write_face(f, w, touching, total, corner_out, block_out, touching_out)
