@@ -10,7 +10,7 @@ from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.skin.data import view
 
-__all__ = ["boundary", "box", "faces_on", "four_nodes", "nodal_areas", "place", "shell", "skin"]
+__all__ = ["boundary", "box", "faces_on", "four_nodes", "half_space", "nodal_areas", "place", "shell", "skin"]
 
 
 def box(axes, jitter=0.0, seed=0):
@@ -77,6 +77,23 @@ def nodal_areas(vert, face):
     out = np.zeros(len(vert))
     np.add.at(out, face.ravel(), np.repeat(np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 6, 3))
     return out
+
+
+def half_space(cells, radius, fine, touched):
+    """Block below z = 0 that reaches 4.5 radii: `cells` cells per radius within `fine` radii of the origin, coarser away from it.
+
+    Returns:
+      vert, elem, held (nodes of sides and bottom), and the faces on top within `touched` radii.
+    """
+    grid = list(np.arange(0, fine, 1 / cells))
+    while grid[-1] < 4.5:
+        grid.append(grid[-1] + (1 + 1.6 / cells) * (grid[-1] - grid[-2]))
+    grid = np.array(grid) * radius
+    lateral = np.concatenate([-grid[:0:-1], grid])
+    vert, elem = box([lateral, lateral, -grid[::-1]])
+    held = np.flatnonzero((abs(vert[:, :2]) == grid[-1]).any(1) | (vert[:, 2] == -grid[-1]))
+    top = faces_on(vert, boundary(elem), 2, 0.0)
+    return vert, elem, held, top[np.linalg.norm(vert[top].mean(1), axis=1) < touched * radius]
 
 
 def skin(vert, elem, fixed, outer_face=None, inner_face=None, name="block", core=None):

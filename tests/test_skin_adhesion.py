@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 import warp as wp
-from blocks import boundary, box, faces_on, place, skin
+from blocks import boundary, box, faces_on, half_space, place, skin
 from scipy.optimize import brentq
 from test_skin_contact import nodal, pad, plane_at
 
@@ -98,15 +98,7 @@ DEPTH = (np.pi**2 * W**2 * R / MODULUS**2) ** (1 / 3)
 def sphere_on_half_space(cells, law, depths):
     """Forces [pi W R] of a sphere at depths [DEPTH] in a fine block, as in `test_skin_contact.hertz`, until it has come off."""
     radius = 1.3 * (9 * np.pi * W * R**2 / (2 * MODULUS)) ** (1 / 3)  # of JKR's contact without load, and a margin
-    grid = list(np.arange(0, 1.6, 1 / cells))
-    while grid[-1] < 4.5:
-        grid.append(grid[-1] + (1 + 1.6 / cells) * (grid[-1] - grid[-2]))
-    grid = np.array(grid) * radius
-    lateral = np.concatenate([-grid[:0:-1], grid])
-    vert, elem = box([lateral, lateral, -grid[::-1]])
-    held = np.flatnonzero((abs(vert[:, :2]) == grid[-1]).any(1) | (vert[:, 2] == -grid[-1]))
-    top = faces_on(vert, boundary(elem), 2, 0.0)
-    top = top[np.linalg.norm(vert[top].mean(1), axis=1) < 1.9 * radius]
+    vert, elem, held, top = half_space(cells, radius, 1.6, 1.9)
     options = SkinOptions(contact_law=law, max_newton=60, max_cg=200)
     data = SkinData(SkinModel(skin(vert, elem, held, outer_face=top), Material("linear", E, NU), options))
     x, y, z = vert[held].T

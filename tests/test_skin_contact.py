@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from blocks import boundary, box, faces_on, place, shell, skin
+from blocks import boundary, box, faces_on, half_space, place, shell, skin
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, contact, step
 from biotac_mj.skin.contact import face_samples
@@ -49,15 +49,7 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
     at one point (the spread of the load matters less than 0.5 % there). Contact springs 40 times stiffer than usual give way by 0.1 %.
     """
     radius = np.sqrt(R * depths[-1])
-    grid = list(np.arange(0, 1.3, 1 / cells))
-    while grid[-1] < 4.5:
-        grid.append(grid[-1] + (1 + 1.6 / cells) * (grid[-1] - grid[-2]))
-    grid = np.array(grid) * radius
-    lateral = np.concatenate([-grid[:0:-1], grid])
-    vert, elem = box([lateral, lateral, -grid[::-1]])
-    held = np.flatnonzero((abs(vert[:, :2]) == grid[-1]).any(1) | (vert[:, 2] == -grid[-1]))
-    top = faces_on(vert, boundary(elem), 2, 0.0)
-    top = top[np.linalg.norm(vert[top].mean(1), axis=1) < 1.5 * radius]
+    vert, elem, held, top = half_space(cells, radius, 1.3, 1.5)
     options = SkinOptions(tolerance=1e-3, contact_stiffness=k * E, **TIGHT)
     data = SkinData(SkinModel(skin(vert, elem, held, outer_face=top), Material("linear", E, nu), options))
     geoms = GeomSet(["sphere"], [(R,)])
