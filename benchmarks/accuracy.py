@@ -1,14 +1,19 @@
-"""Accuracy of the skin against stored solutions of another finite-element program (CalculiX) on the same mesh.
+"""Accuracy of the skin against stored solutions of another finite-element program (CalculiX) on the same
+mesh.
 
-    python benchmarks/accuracy.py --cases ../shared/reference --json out/accuracy.json [--skin PATH] [--picture out/accuracy.png]
+    python benchmarks/accuracy.py --cases ../shared/reference --json out/accuracy.json [--skin PATH]
+    [--picture out/accuracy.png]
 
-Every .npz of the folder is one case: held nodes, material, indenter, path, contact stiffness, stick slope and friction are read from it
-(docs/benchmarks.md says what the fields are). The same path is walked with one step per stored increment; nothing is fitted.
+Every .npz of the folder is one case: held nodes, material, indenter, path, contact stiffness, stick slope and
+  friction are read from it
+(docs/benchmarks.md says what the fields are). The same path is walked with one step per stored increment;
+nothing is fitted.
 
 force_error_rel: mean over increments of |F - F_ref|, over the largest |F_ref|.
-displacement_error_rel: mean over increments of the root mean square over all nodes of |u - u_ref|, over the largest |u_ref|;
-displacement_pooled_rel takes the root mean square over nodes and increments together, which gives late increments more weight.
-"""
+displacement_error_rel: mean over increments of the root mean square over all nodes of |u - u_ref|, over the
+  largest |u_ref|;
+displacement_pooled_rel takes the root mean square over nodes and increments together, which gives late
+increments more weight."""
 
 import argparse
 import json
@@ -31,12 +36,15 @@ __all__ = ["BOUNDS", "case_geoms", "main", "solve_case"]
 LAWS = {"NH": "neo_hookean", "SVK": "svk", "LIN": "linear"}
 # (force, displacement); the stored solutions of sliding and core contact are uncertain by 4-5 % themselves
 BOUNDS = {"normal": (0.03, 0.02), "sliding or core": (0.06, 0.04)}
-CORE_REACH = 7e-3  # [m] around the press axis: where the stored solutions let the skin meet the core, if the description is silent
+# [m] around the press axis: where the stored solutions let the skin meet the core, if the description is
+# silent
+CORE_REACH = 7e-3
 MAX_HALVINGS = 5
 
 
 def case_geoms(shape: dict, friction: float) -> tuple[GeomSet, np.ndarray, np.ndarray]:
-    """The indenter of a case as geoms, with their positions (n, 3) [m] and rotations (n, 3, 3) in the indenter's frame (tip at 0, y ahead).
+    """The indenter of a case as geoms, with their positions (n, 3) [m] and rotations (n, 3, 3) in the
+    indenter's frame (tip at 0, y ahead).
 
     Raises:
       ValueError: a shape that is not known.
@@ -53,11 +61,17 @@ def case_geoms(shape: dict, friction: float) -> tuple[GeomSet, np.ndarray, np.nd
     if "cylinder" in kind:
         r, half = _cylinder(shape)
         along_x = np.array([[[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]])  # the geom's z to the indenter's x
-        return GeomSet(["cylinder"], [(r, half)], [friction], rounding=[min(edge, r)]), np.array([[0, -r, 0]]), along_x
+        return (
+            GeomSet(["cylinder"], [(r, half)], [friction], rounding=[min(edge, r)]),
+            np.array([[0, -r, 0]]),
+            along_x,
+        )
     if "annulus" in kind or "ring" in kind:
         grid = bake_distance_grid(*_ring(shape["inner_radius"], shape["outer_radius"], edge))
         return GeomSet(["mesh"], [()], [friction], grids=[grid]), np.zeros((1, 3)), upright
-    raise ValueError(f"unknown indenter shape {shape['shape']!r}: the case must hold a sphere, cube, cylinder or annulus")
+    raise ValueError(
+        f"unknown indenter shape {shape['shape']!r}: the case must hold a sphere, cube, cylinder or annulus"
+    )
 
 
 def _cylinder(shape):
@@ -68,25 +82,32 @@ def _cylinder(shape):
     try:
         radius, known = indenter(pathlib.Path(shape.get("seed_mesh", "?")).stem).size
     except ValueError as error:
-        raise ValueError(f"cylinder of unknown length, fields {sorted(shape)}: give radius and length [m] ({error})") from error
+        raise ValueError(
+            f"cylinder of unknown length, fields {sorted(shape)}: give radius and length [m] ({error})"
+        ) from error
     return shape.get("radius", radius), known if half is None else half
 
 
 def _ring(inner, outer, edge, height=6e-3):
-    """Closed mesh of a ring about y with its flat top at y = 0 and rounded upper rims; within 1 um of the round shape."""
+    """Closed mesh of a ring about y with its flat top at y = 0 and rounded upper rims; within 1 um of the
+    round shape."""
     import trimesh
 
     angle = np.linspace(0, np.pi / 2, 19)
     up = np.stack([outer - edge + edge * np.cos(angle), edge * np.sin(angle) - edge], 1)
     down = np.stack([inner + edge - edge * np.sin(angle), edge * np.cos(angle) - edge], 1)
     profile = np.concatenate([[[outer, -height]], up, down, [[inner, -height], [outer, -height]]])
-    mesh = trimesh.creation.revolve(1e3 * profile, sections=256)  # in millimetres: trimesh drops triangles that are small in metres
+    mesh = trimesh.creation.revolve(
+        1e3 * profile, sections=256
+    )  # in millimetres: trimesh drops triangles that are small in metres
     if mesh.volume < 0:
         mesh.invert()
     return 1e-3 * mesh.vertices[:, [1, 2, 0]], mesh.faces  # its axis z to y, a rotation
 
 
-def solve_case(path: pathlib.Path, geometry: SkinGeometry, samples: int = 3, substeps: int = 1, tolerance: float = 1e-3) -> dict:
+def solve_case(
+    path: pathlib.Path, geometry: SkinGeometry, samples: int = 3, substeps: int = 1, tolerance: float = 1e-3
+) -> dict:
     """Solves one stored case; errors, seconds and the computed forces (n, 3) [N]."""
     case = np.load(path, allow_pickle=False)
     shape, settings, law = (json.loads(str(case[key])) for key in ("indenter", "settings", "material"))
@@ -94,7 +115,8 @@ def solve_case(path: pathlib.Path, geometry: SkinGeometry, samples: int = 3, sub
         raise ValueError(f"unknown material kind {law['kind']!r}: use one of {', '.join(LAWS)}")
     if case["displacement"].shape[1] != geometry.nvert:
         raise ValueError(
-            f"the case has {case['displacement'].shape[1]} nodes, skin {geometry.name!r} {geometry.nvert}: pass its mesh with --skin"
+            f"the case has {case['displacement'].shape[1]} nodes, skin {geometry.name!r} {geometry.nvert}: "
+            "pass its mesh with --skin"
         )
     friction = float(case["friction"])
     model = _model(case, geometry, law, bool(settings.get("core", False)), samples, tolerance)
@@ -114,7 +136,9 @@ def solve_case(path: pathlib.Path, geometry: SkinGeometry, samples: int = 3, sub
     sliding_or_core = friction > 0 or bool(settings.get("core", False))
     return {
         "name": path.stem,
-        "force_error_rel": float(np.linalg.norm(force - wanted, axis=1).mean() / np.linalg.norm(wanted, axis=1).max()),
+        "force_error_rel": float(
+            np.linalg.norm(force - wanted, axis=1).mean() / np.linalg.norm(wanted, axis=1).max()
+        ),
         "displacement_error_rel": float(np.sqrt(square).mean() / largest),
         "displacement_pooled_rel": float(np.sqrt(square.mean()) / largest),
         "seconds": seconds,
@@ -130,15 +154,22 @@ def solve_case(path: pathlib.Path, geometry: SkinGeometry, samples: int = 3, sub
 
 
 def _model(case, geometry, law, core, samples, tolerance):
-    material = Material(LAWS[law["kind"]], law["E"], law["nu"], friction=float(case["friction"]), liquid=False)
+    material = Material(
+        LAWS[law["kind"]], law["E"], law["nu"], friction=float(case["friction"]), liquid=False
+    )
     stiffness = float(case["contact_stiffness_Pa_per_m"])
     stick = float(case["stick_slope_Pa_per_m"]) / stiffness
     options = SkinOptions(
-        core_contact=core, contact_stiffness=stiffness, stick_ratio=stick if stick > 0 else 0.1, samples=samples, tolerance=tolerance
+        core_contact=core,
+        contact_stiffness=stiffness,
+        stick_ratio=stick if stick > 0 else 0.1,
+        samples=samples,
+        tolerance=tolerance,
     )
     if not core:
         return SkinModel(geometry, material, options, fixed=case["fixed_nodes"])
-    # of the inner faces that start clear of the core, the stored solution looked only at those around the press axis
+    # of the inner faces that start clear of the core, the stored solution looked only at those around the
+    # press axis
     clear = {tuple(face) for face in SkinModel(geometry, material, options).core_surface.face_np}
     axis = np.array(json.loads(str(case["indenter"]))["press_axis"])
     said = re.search(r"([\d.]+) mm around the press axis", str(case["description"]))
@@ -196,7 +227,9 @@ def load_geometry(skin: str | None, cases: pathlib.Path) -> SkinGeometry:
     for folder in beside:
         if (folder / "nvlabs_biotac_sim").is_dir():
             return import_mesh(folder / "nvlabs_biotac_sim")
-    raise FileNotFoundError(f"no mesh nvlabs_biotac_sim in {' or '.join(str(b) for b in beside)}: pass its folder with --skin")
+    raise FileNotFoundError(
+        f"no mesh nvlabs_biotac_sim in {' or '.join(str(b) for b in beside)}: pass its folder with --skin"
+    )
 
 
 _HEADER = ("force", "bound", "displ.", "bound", "seconds", "steps", "iter.", "halved", "lost")
@@ -210,7 +243,11 @@ def _report(row):
     if "error" in row:
         return f"{row['name']:<34}  failed: {row['error']}"
     force, displacement = BOUNDS[row["kind"]]
-    good = row["force_error_rel"] <= force and row["displacement_error_rel"] <= displacement and not row["not_converged"]
+    good = (
+        row["force_error_rel"] <= force
+        and row["displacement_error_rel"] <= displacement
+        and not row["not_converged"]
+    )
     cells = [
         f"{row['force_error_rel']:.2%}",
         f"{force:.0%}",
@@ -241,14 +278,23 @@ def draw(rows, path) -> None:
     rows = [row for row in rows if "error" not in row]
     columns = min(4, len(rows))
     lines = -(-len(rows) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(3.4 * columns, 2.6 * lines), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(3.4 * columns, 2.6 * lines), squeeze=False, layout="constrained"
+    )
     for axis in axes.flat[len(rows) :]:
         axis.set_visible(False)
     for axis, row in zip(axes.flat, rows):
         for component, color in zip(range(3), ("tab:red", "tab:green", "tab:blue")):
             increment = np.arange(1, len(row["force"]) + 1)
             axis.plot(increment, np.array(row["force_ref"])[:, component], "o", mfc="none", color=color, ms=4)
-            axis.plot(increment, np.array(row["force"])[:, component], "-", color=color, lw=1, label=f"F{'xyz'[component]}")
+            axis.plot(
+                increment,
+                np.array(row["force"])[:, component],
+                "-",
+                color=color,
+                lw=1,
+                label=f"F{'xyz'[component]}",
+            )
         axis.set_title(f"{row['name']}\n{row['force_error_rel']:.2%} of the peak force", fontsize=8)
         axis.tick_params(labelsize=7)
     axes[0, 0].legend(fontsize=7)
@@ -263,25 +309,42 @@ def draw(rows, path) -> None:
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--cases", type=pathlib.Path, required=True, help="folder of .npz cases, or one of them")
+    parser.add_argument(
+        "--cases", type=pathlib.Path, required=True, help="folder of .npz cases, or one of them"
+    )
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
-    parser.add_argument("--skin", help="mesh folder or file, or a stored skin; else data/nvlabs_biotac_sim beside the folder of cases")
+    parser.add_argument(
+        "--skin",
+        help="mesh folder or file, or a stored skin; else data/nvlabs_biotac_sim beside the folder of cases",
+    )
     parser.add_argument("--picture", type=pathlib.Path, help=".png to draw the forces to")
-    parser.add_argument("--samples", type=int, default=3, help="contact is sampled at samples^2 points per face")
+    parser.add_argument(
+        "--samples", type=int, default=3, help="contact is sampled at samples^2 points per face"
+    )
     parser.add_argument("--substeps", type=int, default=1, help="steps per stored increment")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     files = sorted(options.cases.glob("*.npz")) if options.cases.is_dir() else [options.cases]
     if not files or not files[0].is_file():
         parser.error(f"no .npz cases in {options.cases}: pass the folder that holds them")
-    geometry = load_geometry(options.skin, options.cases.resolve() if options.cases.is_dir() else options.cases.resolve().parent)
+    geometry = load_geometry(
+        options.skin, options.cases.resolve() if options.cases.is_dir() else options.cases.resolve().parent
+    )
     print(_line("case", _HEADER))
     rows = []
     for file in files:
         try:
             rows.append(solve_case(file, geometry, options.samples, options.substeps))
         except (KeyError, ValueError) as error:
-            rows.append({"name": file.stem, "force_error_rel": None, "displacement_error_rel": None, "seconds": None, "error": str(error)})
+            rows.append(
+                {
+                    "name": file.stem,
+                    "force_error_rel": None,
+                    "displacement_error_rel": None,
+                    "seconds": None,
+                    "error": str(error),
+                }
+            )
         print(_report(rows[-1]), flush=True)
     write_json(options.json, {"cases": rows})
     if options.picture:

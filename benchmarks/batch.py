@@ -1,12 +1,15 @@
-"""Speed of the standard press inside mujoco_warp: BioTacs in every world, stepped by `mjw.step` in one captured CUDA graph.
+"""Speed of the standard press inside mujoco_warp: BioTacs in every world, stepped by `mjw.step` in one
+captured CUDA graph.
 
     python benchmarks/batch.py --json out/batch.json [--skins default] [--worlds 1,128,1024] [--increments 60]
 
-The press of `speed.py` (its sphere, path and increments) with the default material and liquid, two-way coupling, films, acquisition and all
-sensors, at MuJoCo's 2 ms. Everything between two steps is on the device; `ms_per_step` is the mean over the press between synchronisations.
-mb_per_world: device memory that grows with the number of worlds (skins and sensors); mb_used: all that the process holds on the device
-beyond what it held before, mujoco_warp, torch and the model's inverse included. largest_nworld: what fits into 80 GB.
-"""
+The press of `speed.py` (its sphere, path and increments) with the default material and liquid, two-way
+coupling, films, acquisition and all sensors, at MuJoCo's 2 ms. Everything between two steps is on the device;
+`ms_per_step` is the mean over the press between synchronisations.
+mb_per_world: device memory that grows with the number of worlds (skins and sensors); mb_used: all that the
+  process holds on the device
+beyond what it held before, mujoco_warp, torch and the model's inverse included. largest_nworld: what fits
+into 80 GB."""
 
 import argparse
 import gc
@@ -116,7 +119,10 @@ def main(arguments=None) -> int:
         for worlds in map(int, options.worlds.split(",")):
             row = time_batch(skin, worlds, options.increments)
             rows.append(row)
-            print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
+            print(
+                "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()),
+                flush=True,
+            )
             gc.collect()
     write_json(options.json, {"rows": rows})
     return 0

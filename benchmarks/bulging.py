@@ -1,4 +1,5 @@
-"""Where the liquid goes: PDC and the electrodes' impedances while a sphere presses at many places, for docs/liquid.md.
+"""Where the liquid goes: PDC and the electrodes' impedances while a sphere presses at many places, for
+docs/liquid.md.
 
 python benchmarks/bulging.py --skin coarse
 """
@@ -23,8 +24,8 @@ def presses(model, locations=LOCATIONS, depths=None):
     """Presses at each location in turn.
 
     Returns:
-      pressure (nlocation, ndepth) above rest [Pa]; change (nlocation, ndepth, 19) of ln Z; distance (nlocation, 19) of the electrodes
-      from where the sphere touches [m].
+      pressure (nlocation, ndepth) above rest [Pa]; change (nlocation, ndepth, 19) of ln Z; distance
+      (nlocation, 19) of the electrodes from where the sphere touches [m].
     """
     depths = np.linspace(0, 2e-3, 21)[1:] if depths is None else depths
     geometry = model.geometry
@@ -58,7 +59,10 @@ def main():
     args = parser.parse_args()
     options = SkinOptions(liquid=not args.no_liquid, rest_pressure=args.rest_pressure)
     pressure, change, distance = presses(SkinModel(load_skin(args.skin), args.material, options))
-    print(f"{args.skin} skin, {args.material}, rest pressure {args.rest_pressure:g} Pa, {'no ' if args.no_liquid else ''}liquid")
+    print(
+        f"{args.skin} skin, {args.material}, rest pressure {args.rest_pressure:g} Pa, "
+        f"{'no ' if args.no_liquid else ''}liquid"
+    )
     print("   x mm  angle  PDC max kPa  monotone to mm  lower Z, all  far half")
     far = distance > np.median(distance, axis=1)[:, None]
     for i, (x, angle) in enumerate(LOCATIONS):
@@ -69,8 +73,12 @@ def main():
         print(f"{1e3 * x:7.0f} {angle:6.1f} {pressure[i].max() / 1e3:12.2f} {until:15.1f} {shares}")
     lower = change < 0
     everywhere = np.broadcast_to(far[:, None], change.shape)
-    print(f"all: Z lower in {lower.mean():.1%} of the samples, in the far half {lower[everywhere].mean():.1%}")
-    pull = np.abs(change) > 3 / 3000 / (1 - 3000 / 4095)  # three counts of noise at 3000: dE / E = -(1 - E / 4095) d ln Z
+    print(
+        f"all: Z lower in {lower.mean():.1%} of the samples, in the far half {lower[everywhere].mean():.1%}"
+    )
+    pull = np.abs(change) > 3 / 3000 / (
+        1 - 3000 / 4095
+    )  # three counts of noise at 3000: dE / E = -(1 - E / 4095) d ln Z
     print(f"beyond the noise: lower {(lower & pull).mean():.1%}, higher {(~lower & pull).mean():.1%}")
 
 

@@ -1,23 +1,30 @@
 """Error and time of the condensed tier against the full FEM by depth, and the fit of its correction.
 
-    python benchmarks/condensed.py --json out/condensed.json [--skins coarse,default] [--materials default,rubber]
+    python benchmarks/condensed.py --json out/condensed.json [--skins coarse,default] [--materials
+    default,rubber]
                                    [--indenters sphere_7mm,cube_14mm] [--markdown]
     python benchmarks/condensed.py --json out/condensed_time.json --time [--indenters sphere_7mm,cube_14mm]
     python benchmarks/condensed.py --json out/condensed_fit.json --fit [--materials default]
 
-The same press is made with both tiers: along the inward normal at the location, to 2.4 mm, without noise of its own in the comparison
-(both tiers draw the same). force: size of the force on the indenter. film: distance from the inner surface to the core at the node
-where the press thins the film most. counts: root mean square over the 19 electrodes of the tiers' difference, beside
-the largest change of any electrode in the full FEM. "beyond": from this depth on the tier says itself that its error was not measured.
+The same press is made with both tiers: along the inward normal at the location, to 2.4 mm, without noise of
+  its own in the comparison
+(both tiers draw the same). force: size of the force on the indenter. film: distance from the inner surface to
+the core at the node
+where the press thins the film most. counts: root mean square over the 19 electrodes of the tiers' difference,
+  beside
+the largest change of any electrode in the full FEM. "beyond": from this depth on the tier says itself that
+its error was not measured.
 ms: median of the processor time of a step of the skin alone (no readings).
 
---fit finds the constants of `skin/condensed_correction.py` for the law of the material: least squares of the logarithms of force and
-(weight 0.3) pressure against the full FEM over all presses, small errors squared and large ones nearly linear.
-"""
+--fit finds the constants of `skin/condensed_correction.py` for the law of the material: least squares of the
+logarithms of force and (weight 0.3) pressure against the full FEM over all presses, small errors squared and
+large ones nearly linear."""
 
 import os
 
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+os.environ.update(
+    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
+)  # before numpy reads them
 
 import argparse
 import dataclasses
@@ -47,8 +54,17 @@ INDENTERS = ("sphere_7mm", "cube_14mm", "cylinder_short_7mm")
 LOCATIONS = ((-12e-3, 0.0), (-8e-3, 0.6))
 
 
-def run(tier: str, skin: str, indenter: str, location, material: str = "default", depth: float = 2.4e-3, timestep: float = 4e-3):
-    """A press with one tier: its record and, of each step after the first, the skin's result and its seconds (wall, processor)."""
+def run(
+    tier: str,
+    skin: str,
+    indenter: str,
+    location,
+    material: str = "default",
+    depth: float = 2.4e-3,
+    timestep: float = 4e-3,
+):
+    """A press with one tier: its record and, of each step after the first, the skin's result and its seconds
+    (wall, processor)."""
     results, seconds = [], []
     stepper = fem.FemStepper
     if tier == "condensed":
@@ -65,7 +81,14 @@ def run(tier: str, skin: str, indenter: str, location, material: str = "default"
     stepper.solve = timed
     try:
         options = PressOptions(
-            indenter=indenter, location=location, depth=depth, skin=skin, tier=tier, material=material, hold=0.0, timestep=timestep
+            indenter=indenter,
+            location=location,
+            depth=depth,
+            skin=skin,
+            tier=tier,
+            material=material,
+            hold=0.0,
+            timestep=timestep,
         )
         record, _ = press(options, progress=False)
     finally:
@@ -108,7 +131,8 @@ def compare(full, condensed) -> list[dict]:
 
 
 def fit(skin: str, material: str, indenters, depth: float):
-    """Constants of the correction for a material's law, by least squares over presses; prints the errors that are left."""
+    """Constants of the correction for a material's law, by least squares over presses; prints the errors that
+    are left."""
     law = PRESETS[material].law
     presses = [(indenter, location) for indenter in indenters for location in LOCATIONS]
     full = [run("full", skin, *press_, material, depth, _FIT_STEP) for press_ in presses]
@@ -123,15 +147,28 @@ def fit(skin: str, material: str, indenters, depth: float):
         for press_, wanted in zip(presses, full, strict=True):
             mine = run("condensed", skin, *press_, material, depth, _FIT_STEP)
             force, wanted_force = (np.linalg.norm(record.force[1:], axis=1) for record, *_ in (mine, wanted))
-            pressure, wanted_pressure = (np.maximum([r.pressure for r in results], 1.0) for _, results, _ in (mine, wanted))
+            pressure, wanted_pressure = (
+                np.maximum([r.pressure for r in results], 1.0) for _, results, _ in (mine, wanted)
+            )
             out += [np.log(force / wanted_force), 0.3 * np.log(pressure / wanted_pressure)]
         out = np.concatenate(out) / np.sqrt(len(full[0][1]))
-        print(", ".join(f"{n} {v:.4g}" for n, v in values.items()), f"rms {np.sqrt((out**2).sum() / len(full)):.4f}", flush=True)
+        print(
+            ", ".join(f"{n} {v:.4g}" for n, v in values.items()),
+            f"rms {np.sqrt((out**2).sum() / len(full)):.4f}",
+            flush=True,
+        )
         return out
 
     x = np.array([getattr(start, n) for n in names]) / _SCALES
     found = scipy.optimize.least_squares(
-        residual, x, bounds=(_LEAST, _MOST), diff_step=0.05, x_scale=np.maximum(x, 0.5), max_nfev=12, loss="soft_l1", f_scale=0.05
+        residual,
+        x,
+        bounds=(_LEAST, _MOST),
+        diff_step=0.05,
+        x_scale=np.maximum(x, 0.5),
+        max_nfev=12,
+        loss="soft_l1",
+        f_scale=0.05,
     )
     return {
         "law": law,
@@ -150,9 +187,16 @@ COLUMNS = ("depth", "force full", "condensed", "error", "film full", "condensed"
 
 
 def _cells(row):
-    return (f"{row['depth_mm']:.1f}", f"{row['force_full_N']:.3f}", f"{row['force_condensed_N']:.3f}", f"{100 * row['force_error']:+.1f} %",
-            f"{row['film_full_um']:.0f}", f"{row['film_condensed_um']:.0f}", f"{row['counts_largest_change']:.0f}",
-            f"{row['counts_rms_error']:.0f}")  # fmt: skip
+    return (
+        f"{row['depth_mm']:.1f}",
+        f"{row['force_full_N']:.3f}",
+        f"{row['force_condensed_N']:.3f}",
+        f"{100 * row['force_error']:+.1f} %",
+        f"{row['film_full_um']:.0f}",
+        f"{row['film_condensed_um']:.0f}",
+        f"{row['counts_largest_change']:.0f}",
+        f"{row['counts_rms_error']:.0f}",
+    )
 
 
 def _curves(cases):
@@ -160,7 +204,10 @@ def _curves(cases):
     for title, cell in (
         ("force error %", lambda r: f"{100 * r['force_error']:+.1f}"),
         ("film error um", lambda r: f"{r['film_condensed_um'] - r['film_full_um']:+.0f}"),
-        ("counts rms error (largest change)", lambda r: f"{r['counts_rms_error']:.0f} ({r['counts_largest_change']:.0f})"),
+        (
+            "counts rms error (largest change)",
+            lambda r: f"{r['counts_rms_error']:.0f} ({r['counts_largest_change']:.0f})",
+        ),
     ):
         print(f"\n| {title} | " + " | ".join(f"{d:.1f}" for d in DEPTHS[1::2]) + " mm | beyond |")
         print("|---" * (len(DEPTHS[1::2]) + 2) + "|")
@@ -173,13 +220,21 @@ def _curves(cases):
 
 
 def time_steps(skin: str, material: str, indenter: str, location, increment: float, again: int = 4) -> dict:
-    """Processor time of the skin's solve in steps of a press [ms]: in the first press, and least of `again` more for each step."""
+    """Processor time of the skin's solve in steps of a press [ms]: in the first press, and least of `again`
+    more for each step."""
     first, *more = (
-        1e3 * run("condensed", skin, indenter, location, material, timestep=increment / 10e-3)[2][:, 1] for _ in range(again + 1)
+        1e3 * run("condensed", skin, indenter, location, material, timestep=increment / 10e-3)[2][:, 1]
+        for _ in range(again + 1)
     )
     least = np.min(more, axis=0)
     shallow = len(least) * 10 // 24
-    numbers = np.median(first), np.median(least), np.median(least[:shallow]), np.median(least[shallow:]), least.max()
+    numbers = (
+        np.median(first),
+        np.median(least),
+        np.median(least[:shallow]),
+        np.median(least[shallow:]),
+        least.max(),
+    )
     names = ("first_press", "again", "to_1mm", "beyond_1mm", "slowest_step")
     return {"skin": skin, "material": material, "indenter": indenter, "increment_mm": 1e3 * increment,
             **{f"{n}_ms": float(v) for n, v in zip(names, numbers, strict=True)}}  # fmt: skip
@@ -194,55 +249,94 @@ def main(arguments=None) -> int:
     parser.add_argument("--depth", type=float, default=2.4, help="of the presses [mm]")
     parser.add_argument("--locations", type=int, default=2, help="how many of the two locations")
     parser.add_argument("--markdown", action="store_true", help="tables for docs/condensed.md")
-    parser.add_argument("--time", action="store_true", help="processor time of steps instead, without the full tier")
-    parser.add_argument("--fit", action="store_true", help="fit the correction of the first skin and each material instead")
+    parser.add_argument(
+        "--time", action="store_true", help="processor time of steps instead, without the full tier"
+    )
+    parser.add_argument(
+        "--fit", action="store_true", help="fit the correction of the first skin and each material instead"
+    )
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    skins, materials, indenters = (getattr(options, n).split(",") for n in ("skins", "materials", "indenters"))
+    skins, materials, indenters = (
+        getattr(options, n).split(",") for n in ("skins", "materials", "indenters")
+    )
     if options.time:
         out = [
             time_steps(skin, material, indenter, LOCATIONS[0], increment)
-            for skin, material, indenter, increment in itertools.product(skins, materials, indenters, (2e-5, 4e-5))
+            for skin, material, indenter, increment in itertools.product(
+                skins, materials, indenters, (2e-5, 4e-5)
+            )
         ]
-        print("| skin | material | indenter | step mm | first press | again | to 1 mm | beyond | slowest |\n" + "|---" * 9 + "|")
+        print(
+            "| skin | material | indenter | step mm | first press | again | to 1 mm | beyond | slowest |\n"
+            + "|---" * 9
+            + "|"
+        )
         for row in out:
             print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else v for v in row.values()) + " |")
         write_json(options.json, {"times": out})
         return 0
     if options.fit:
-        write_json(options.json, {"fits": [fit(skins[0], material, indenters, 1e-3 * options.depth) for material in materials]})
+        write_json(
+            options.json,
+            {"fits": [fit(skins[0], material, indenters, 1e-3 * options.depth) for material in materials]},
+        )
         return 0
     out = []
     presses = itertools.product(skins, materials, indenters, LOCATIONS[: options.locations])
     for skin, material, indenter, location in presses:
         records, times = {}, {}
         for tier in ("full", "condensed"):
-            records[tier], results, times[tier] = run(tier, skin, indenter, location, material, 1e-3 * options.depth)
+            records[tier], results, times[tier] = run(
+                tier, skin, indenter, location, material, 1e-3 * options.depth
+            )
         rows = compare(records["full"], records["condensed"])
         ms = {tier: (1e3 * np.median(t, 0)).tolist() for tier, t in times.items()}
         lost = int(records["condensed"].nonconverged[-1])
         measured = [r.measured for r in results]
         first = None if all(measured) else 1e3 * float(records["condensed"].depth[1:][np.argmin(measured)])
-        print(f"\n{skin}, {material}, {indenter} at x = {1e3 * location[0]:.0f} mm, angle {location[1]:.1f} rad; "
-              f"ms per step: full {ms['full'][0]:.1f} wall, {ms['full'][1]:.1f} cpu; condensed {ms['condensed'][0]:.2f} wall, "
-              f"{ms['condensed'][1]:.2f} cpu; condensed steps that did not converge: {lost}; measured to: "
-              + ("the end" if first is None else f"{first:.2f} mm") + "\n")  # fmt: skip
+        print(
+            f"\n{skin}, {material}, {indenter} at x = {1e3 * location[0]:.0f} mm, angle {location[1]:.1f} "
+            "rad; "
+            f"ms per step: full {ms['full'][0]:.1f} wall, {ms['full'][1]:.1f} cpu; condensed "
+            f"{ms['condensed'][0]:.2f} wall, "
+            f"{ms['condensed'][1]:.2f} cpu; condensed steps that did not converge: {lost}; measured to: "
+            + ("the end" if first is None else f"{first:.2f} mm")
+            + "\n"
+        )
         print("".join(f"{c:>11} " for c in COLUMNS))
         for row in rows:
             print("".join(f"{c:>11} " for c in _cells(row)), flush=True)
-        cost = {"ms_wall_and_cpu": ms, "condensed_ms_p95": (1e3 * np.quantile(times["condensed"], 0.95, axis=0)).tolist()}
-        out.append({"skin": skin, "material": material, "indenter": indenter, "location": location, "rows": rows,
-                    "not_converged": lost, "measured_to_mm": first, **cost})  # fmt: skip
+        cost = {
+            "ms_wall_and_cpu": ms,
+            "condensed_ms_p95": (1e3 * np.quantile(times["condensed"], 0.95, axis=0)).tolist(),
+        }
+        out.append(
+            {
+                "skin": skin,
+                "material": material,
+                "indenter": indenter,
+                "location": location,
+                "rows": rows,
+                "not_converged": lost,
+                "measured_to_mm": first,
+                **cost,
+            }
+        )
     if options.markdown:
         _curves(out)
-    errors = [(abs(r["force_error"]), r["depth_mm"], c["measured_to_mm"] or 1e3) for c in out for r in c["rows"]]
+    errors = [
+        (abs(r["force_error"]), r["depth_mm"], c["measured_to_mm"] or 1e3) for c in out for r in c["rows"]
+    ]
     summary = {
         "force_error_to_1mm": max(e for e, depth, _ in errors if depth <= 1.0),
         "force_error_measured": max(e for e, depth, end in errors if depth < end),
         "force_error": max(e for e, _, _ in errors),
     }
-    print("\nlargest force error to 1 mm {:.1f} %, where the tier says that it is measured {:.1f} %, to the end {:.1f} %".format(
-        *(100 * e for e in summary.values())))  # fmt: skip
+    print(
+        "\nlargest force error to 1 mm {:.1f} %, where the tier says that it is measured {:.1f} %, to the "
+        "end {:.1f} %".format(*(100 * e for e in summary.values()))
+    )
     write_json(options.json, {"cases": out, **summary})
     return 0
 

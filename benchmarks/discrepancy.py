@@ -1,14 +1,17 @@
-"""Blind benchmark of the discrepancy workflow: hidden effects, none, pairs, outside the catalogue, and a mildly wrong base model.
+"""Blind benchmark of the discrepancy workflow: hidden effects, none, pairs, outside the catalogue, and a
+mildly wrong base model.
 
     python benchmarks/discrepancy.py --seeds practice --counts none=2,single=1 --json out/discrepancy.json
-    python benchmarks/discrepancy.py --seeds blind --jobs 8 --counts none=60,single=10,outside=40,pair=40,wrong-base=20
+    python benchmarks/discrepancy.py --seeds blind --jobs 8 --counts
+    none=60,single=10,outside=40,pair=40,wrong-base=20
 
-Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed (a hash of the truth stands in its record); run again, it
-goes on where it stopped. Beside the verdicts stand two baselines: least RMS in sample, and BIC with samples taken as independent.
-Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the catalogue, for calibration.
-Counts are for each effect with single and left-out, else for the kind. Kernels are compiled and fields of the plans solved before the
-work is shared out.
-"""
+Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed (a hash of the truth stands in
+its record); run again, it goes on where it stopped. Beside the verdicts stand two baselines: least RMS in
+sample, and BIC with samples taken as independent.
+Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the
+  catalogue, for calibration.
+Counts are for each effect with single and left-out, else for the kind. Kernels are compiled and fields of the
+plans solved before the work is shared out."""
 
 import argparse
 import hashlib
@@ -26,7 +29,8 @@ KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
 
 
 def cases(counts, seeds, plans=4):
-    """Dicts: kind, case, effects (list of name, size), seed, settings of the generator, plan; kinds mixed, so that a part is a sample."""
+    """Dicts: kind, case, effects (list of name, size), seed, settings of the generator, plan; kinds mixed, so
+    that a part is a sample."""
     out = []
     for kind, count in counts.items():
         if kind not in KINDS:
@@ -37,23 +41,37 @@ def cases(counts, seeds, plans=4):
         else:
             drawn = [(name, i) for i in range(count) for name in names]
         for order, (name, i) in enumerate(drawn):
-            seed = SEEDS[seeds] + int(hashlib.sha256(f"{kind}{name}{i}".encode()).hexdigest()[:8], 16) % 600_000
+            seed = (
+                SEEDS[seeds] + int(hashlib.sha256(f"{kind}{name}{i}".encode()).hexdigest()[:8], 16) % 600_000
+            )
             rng = np.random.default_rng([seed, SEEDS[seeds]])
             settings = {"modulus": float(rng.uniform(0.85, 1.15)), "skin": "coarse", "footprint": 0.0}
             if kind == "wrong-base":
                 settings.update({"skin": "default"} if i % 2 else {"footprint": 0.05})
-            hidden = {"pair": list(rng.choice(list(HIDDEN), 2, replace=False)), "none": [], "wrong-base": []}.get(kind, [name])
+            hidden = {
+                "pair": list(rng.choice(list(HIDDEN), 2, replace=False)),
+                "none": [],
+                "wrong-base": [],
+            }.get(kind, [name])
             sizes = {**HIDDEN, **OUTSIDE}
             effects = [(str(n), float(np.exp(rng.uniform(*np.log(sizes[n]))))) for n in hidden]
             out.append(
-                {"kind": kind, "case": f"{kind}: {name} #{i}", "effects": effects, "seed": seed, "settings": settings,
-                 "plan": (order + i) % plans, "at": (order + 0.5) / len(drawn)}
-            )  # fmt: skip
+                {
+                    "kind": kind,
+                    "case": f"{kind}: {name} #{i}",
+                    "effects": effects,
+                    "seed": seed,
+                    "settings": settings,
+                    "plan": (order + i) % plans,
+                    "at": (order + 0.5) / len(drawn),
+                }
+            )
     return sorted(out, key=lambda c: c["at"])
 
 
 def baselines(comparison, chosen):
-    """Names by least RMS in sample and by BIC with every sample independent, both on the linearised signatures."""
+    """Names by least RMS in sample and by BIC with every sample independent, both on the linearised
+    signatures."""
     from biotac_mj.discrepancy.catalogue import CATALOGUE
     from biotac_mj.discrepancy.fitting import fit_effects
     from biotac_mj.discrepancy.screening import columns, nuisance_space
@@ -79,16 +97,30 @@ def baselines(comparison, chosen):
 
 
 def comparable(name, size) -> dict:
-    """True values of the catalogue's parameters; (value, whether both laws are the same). Cross-talk, saturation and adhesion have none."""
+    """True values of the catalogue's parameters; (value, whether both laws are the same). Cross-talk,
+    saturation and adhesion have none."""
     same = {
-        "asper": {"log_p": np.log(1 + size)}, "latency": {"delay": size}, "radius": {"log_radius": np.log(1 + size)},
-        "mount": {"compliance": size}, "depth0": {"dz": size}, "misalign": {"x": size, "z": 0.6 * size},
-        "gain": {f"e{k + 1}": g for k, g in enumerate(size * np.random.default_rng(int(size * 1e6)).standard_normal(19))},
-    }  # fmt: skip
+        "asper": {"log_p": np.log(1 + size)},
+        "latency": {"delay": size},
+        "radius": {"log_radius": np.log(1 + size)},
+        "mount": {"compliance": size},
+        "depth0": {"dz": size},
+        "misalign": {"x": size, "z": 0.6 * size},
+        "gain": {
+            f"e{k + 1}": g
+            for k, g in enumerate(size * np.random.default_rng(int(size * 1e6)).standard_normal(19))
+        },
+    }
     other = {
-        "relax": {"g": size}, "hyster": {"fraction": size}, "stiffen": {"c2": size}, "mullins": {"softening": size},
-        "fluidloss": {"rate": 36 * size}, "warmup": {"a": -size}, "lowpass": {"tau": size}, "drift": {"rate": size},
-    }  # fmt: skip
+        "relax": {"g": size},
+        "hyster": {"fraction": size},
+        "stiffen": {"c2": size},
+        "mullins": {"softening": size},
+        "fluidloss": {"rate": 36 * size},
+        "warmup": {"a": -size},
+        "lowpass": {"tau": size},
+        "drift": {"rate": size},
+    }
     return {k: (float(v), name in same) for k, v in {**same, **other}.get(name, {}).items()}
 
 
@@ -109,14 +141,29 @@ class Worker:
         from biotac_mj.discrepancy import Trajectory
 
         return [
-            Trajectory(p["id"], p["tool"], p["clock"], p["time"], p["pos"], np.tile(p["turn"], (len(p["time"]), 1, 1)), e, pdc, None, f)
+            Trajectory(
+                p["id"],
+                p["tool"],
+                p["clock"],
+                p["time"],
+                p["pos"],
+                np.tile(p["turn"], (len(p["time"]), 1, 1)),
+                e,
+                pdc,
+                None,
+                f,
+            )
             for p, (e, pdc, f) in zip(self.plans[k], measured)
         ]
 
     def fields_of(self, k):
         if k not in self.fields:
             blank = [
-                (np.full((len(p["time"]), 19), 2000.0), np.full(len(p["time"]), 2000.0), np.zeros((len(p["time"]), 3)))
+                (
+                    np.full((len(p["time"]), 19), 2000.0),
+                    np.full(len(p["time"]), 2000.0),
+                    np.zeros((len(p["time"]), 3)),
+                )
                 for p in self.plans[k]
             ]
             self.fields[k] = self.sim.fields(self.trajectories(k, blank), progress=False)
@@ -136,23 +183,48 @@ class Worker:
         effects, settings = case["effects"], case["settings"]
         generator = self.generator(settings["skin"])
         generator.modulus, generator.footprint = settings["modulus"], settings["footprint"]
-        data = self.trajectories(case["plan"], generator.measure(self.plans[case["plan"]], effects, case["seed"]))
+        data = self.trajectories(
+            case["plan"], generator.measure(self.plans[case["plan"]], effects, case["seed"])
+        )
         catalogue = [e for e in CATALOGUE if case["kind"] != "left-out" or e.id != effects[0][0]]
-        report = diagnose(self.sim, data, effects=catalogue, fields=self.fields_of(case["plan"]), progress=False)
-        least, bic = ("", "") if self.args.no_baselines or case["kind"] == "left-out" else baselines(report.comparison, report.selection)
+        report = diagnose(
+            self.sim, data, effects=catalogue, fields=self.fields_of(case["plan"]), progress=False
+        )
+        least, bic = (
+            ("", "")
+            if self.args.no_baselines or case["kind"] == "left-out"
+            else baselines(report.comparison, report.selection)
+        )
         return {
-            "case": case["case"], "kind": case["kind"], "seeds": self.args.seeds, "tier": self.args.tier, "thresholds": threshold_hash(),
-            "plan": case["plan"], "seed": case["seed"], "settings": settings, "truth": [e for e, _ in effects],
+            "case": case["case"],
+            "kind": case["kind"],
+            "seeds": self.args.seeds,
+            "tier": self.args.tier,
+            "thresholds": threshold_hash(),
+            "plan": case["plan"],
+            "seed": case["seed"],
+            "settings": settings,
+            "truth": [e for e, _ in effects],
             "sizes": [s for _, s in effects],
             "seal": hashlib.sha256(json.dumps([effects, settings, case["seed"]]).encode()).hexdigest()[:12],
-            "verdict": report.verdict, "named": [e["id"] for e in report.effects], "ties": [e["ties"] for e in report.effects],
-            "confidence": [e["confidence"] for e in report.effects], "closed": report.closed,
-            "nats": report.ranking[0][1] if report.ranking else 0.0, "trace": report.trace, "where": len(report.where),
-            "before": report.before, "after": report.after,
-            "parameters": [{p["name"]: [p["value"], *p["interval95"]] for p in e["parameters"]} for e in report.effects],
+            "verdict": report.verdict,
+            "named": [e["id"] for e in report.effects],
+            "ties": [e["ties"] for e in report.effects],
+            "confidence": [e["confidence"] for e in report.effects],
+            "closed": report.closed,
+            "nats": report.ranking[0][1] if report.ranking else 0.0,
+            "trace": report.trace,
+            "where": len(report.where),
+            "before": report.before,
+            "after": report.after,
+            "parameters": [
+                {p["name"]: [p["value"], *p["interval95"]] for p in e["parameters"]} for e in report.effects
+            ],
             "comparable": {e: comparable(e, s) for e, s in effects},
-            "least_rms": least, "bic": bic, "seconds": time.process_time() - began,
-        }  # fmt: skip
+            "least_rms": least,
+            "bic": bic,
+            "seconds": time.process_time() - began,
+        }
 
 
 _worker = None
@@ -203,7 +275,10 @@ def main(argv=None):
     args = args.parse_args(argv)
     if args.table:
         rows = [r for f in args.table for r in json.loads(pathlib.Path(f).read_text())]
-        print(f"thresholds {', '.join(sorted({r['thresholds'] for r in rows}))}; tier {', '.join(sorted({r['tier'] for r in rows}))}")
+        print(
+            f"thresholds {', '.join(sorted({r['thresholds'] for r in rows}))}; tier "
+            f"{', '.join(sorted({r['tier'] for r in rows}))}"
+        )
         print(table(rows))
         if args.figure:
             confusion(rows, args.figure)
@@ -214,7 +289,11 @@ def main(argv=None):
     rows = json.loads(path.read_text()) if path.exists() else []
     done = {(r["case"], r["seeds"], r["tier"], r["thresholds"]) for r in rows}
     i, n = (int(v) for v in args.share.split("/"))
-    todo = [c for c in cases(args.counts, args.seeds, args.plans)[i::n] if (c["case"], args.seeds, args.tier, threshold_hash()) not in done]
+    todo = [
+        c
+        for c in cases(args.counts, args.seeds, args.plans)[i::n]
+        if (c["case"], args.seeds, args.tier, threshold_hash()) not in done
+    ]
     print(f"thresholds {threshold_hash()}, {len(todo)} cases to do", flush=True)
     if todo:
         began = time.time()
@@ -229,7 +308,11 @@ def main(argv=None):
                 _collect(pool.imap_unordered(_one, todo, chunksize=1), rows, path)
         else:
             _collect(map(_one, todo), rows, path)
-    rows = [r for r in rows if (r["seeds"], r["tier"], r["thresholds"]) == (args.seeds, args.tier, threshold_hash())]
+    rows = [
+        r
+        for r in rows
+        if (r["seeds"], r["tier"], r["thresholds"]) == (args.seeds, args.tier, threshold_hash())
+    ]
     print(table(rows))
     if args.figure:
         confusion(rows, args.figure)
@@ -243,7 +326,8 @@ def _collect(results, rows, path):
         rows.append(row)
         _write(path, rows)
         print(
-            f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:100]} | {row['least_rms']}, {row['bic']}",
+            f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:100]} | "
+            f"{row['least_rms']}, {row['bic']}",
             flush=True,
         )
 

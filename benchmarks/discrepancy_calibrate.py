@@ -1,10 +1,12 @@
-"""Sets thresholds and the confidence of `biotac_mj.discrepancy.thresholds` from practice seeds; prints them for the constant table.
+"""Sets thresholds and the confidence of `biotac_mj.discrepancy.thresholds` from practice seeds; prints them
+for the constant table.
 
-    python benchmarks/discrepancy.py --seeds practice --counts none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12 --json p.json
-    python benchmarks/discrepancy_calibrate.py p.json
+    python benchmarks/discrepancy.py --seeds practice --counts
+    none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12 --json p.json python
+    benchmarks/discrepancy_calibrate.py p.json
 
-Left-out cases (the hidden effect is taken out of the catalogue) teach abstention: each name given there is wrong.
-"""
+Left-out cases (the hidden effect is taken out of the catalogue) teach abstention: each name given there is
+wrong."""
 
 import argparse
 import json
@@ -30,8 +32,19 @@ def names(rows):
             if k and c["nats"] <= THRESHOLDS["further"]:
                 continue  # present thresholds refuse it
             x = terms(c["nats"], trace["inside"], trace["left"], c["lead"], len(r["ties"][k]))
-            out.append({"x": x, "inside": trace["inside"], "after": trace["after"], "right": right(r, k), "exact": name in r["truth"],
-                        "row": r, "name": name, "candidate": c, "ties": len(r["ties"][k])})  # fmt: skip
+            out.append(
+                {
+                    "x": x,
+                    "inside": trace["inside"],
+                    "after": trace["after"],
+                    "right": right(r, k),
+                    "exact": name in r["truth"],
+                    "row": r,
+                    "name": name,
+                    "candidate": c,
+                    "ties": len(r["ties"][k]),
+                }
+            )
     return out
 
 
@@ -49,7 +62,9 @@ def logistic(x, y, weight):
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("json", nargs="+")
-    args.add_argument("--write", action="store_true", help="put the weights of the confidence into thresholds.py")
+    args.add_argument(
+        "--write", action="store_true", help="put the weights of the confidence into thresholds.py"
+    )
     args = args.parse_args(argv)
     rows = [r for f in args.json for r in json.loads(pathlib.Path(f).read_text())]
     quiet = [r for r in rows if r["kind"] in ("none", "wrong-base")]
@@ -58,7 +73,10 @@ def main(argv=None):
             v = [r["trace"]["before"][key] for r in quiet if r["kind"] == kind]
             print(f"{key} {kind}: median {np.median(v):.2f}, largest {np.sort(v)[-4:].round(2)}")
     print("candidates where nothing is hidden (nats, p, id):")
-    some = sorted(((c["nats"], c["p"], c["id"], r["case"]) for r in quiet for c in r["trace"]["rounds"][0]), reverse=True)[:12]
+    some = sorted(
+        ((c["nats"], c["p"], c["id"], r["case"]) for r in quiet for c in r["trace"]["rounds"][0]),
+        reverse=True,
+    )[:12]
     print("\n".join(f"  {n:.2f} {p:.3f} {i} {c}" for n, p, i, c in some))
     print("true effects of single cases in the first round (nats), sorted:")
     some = sorted(
@@ -73,7 +91,8 @@ def main(argv=None):
         if k or not e["right"]:
             c = e["candidate"]
             print(
-                f"  {e['row']['case']:<26} {e['name']:<11} {k} nats {c['nats']:6.1f} share {c['share']:7.2f} energy {c['energy']:6.3f} "
+                f"  {e['row']['case']:<26} {e['name']:<11} {k} nats {c['nats']:6.1f} share "
+                f"{c['share']:7.2f} energy {c['energy']:6.3f} "
                 f"inside {e['inside']:.2f} level {e['after']['level']:.2f} peak {e['after']['peak']:.2f} "
                 + ("right" if e["right"] else "WRONG")
             )
@@ -82,7 +101,10 @@ def main(argv=None):
     for s in (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95):
         kept = [e for e in every if e["inside"] >= s]
         shut = [r for r in rows if r["kind"] in ("outside", "left-out")]
-        gone = {k: [r["trace"]["inside"] < s or not r["named"] for r in shut if r["kind"] == k] for k in ("outside", "left-out")}
+        gone = {
+            k: [r["trace"]["inside"] < s or not r["named"] for r in shut if r["kind"] == k]
+            for k in ("outside", "left-out")
+        }
         print(f"  {s}: {len(kept)}/{len(every)} kept, right {np.mean([e['right'] for e in kept]):.3f}, "
               + ", ".join(f"{k} {np.mean(v):.2f}" for k, v in gone.items()))  # fmt: skip
     data = names(rows)
@@ -92,7 +114,10 @@ def main(argv=None):
     print("CONFIDENCE =", weights, "of", len(data), "names,", sum(e["exact"] for e in data), "right")
     if args.write:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/thresholds.py"
-        lines = [f"CONFIDENCE = {weights}" if line.startswith("CONFIDENCE = ") else line for line in path.read_text().splitlines()]
+        lines = [
+            f"CONFIDENCE = {weights}" if line.startswith("CONFIDENCE = ") else line
+            for line in path.read_text().splitlines()
+        ]
         path.write_text("\n".join(lines) + "\n")
 
 

@@ -1,24 +1,42 @@
-"""Measured data with a hidden effect, for the blind benchmark of `biotac_mj.discrepancy` - which nothing here imports.
+"""Measured data with a hidden effect, for the blind benchmark of `biotac_mj.discrepancy` - which nothing here
+imports.
 
-The skin and film are the project's, solved on a mesh of the generator's choice with its own way through the poses; every effect is written
-anew, in another form than the catalogue's (Euler integration instead of closed recursions, two time constants where one is fitted, a
-second-order filter,
-nearest neighbours instead of a kernel, tanh instead of a bent line, Dahl's law instead of a play operator).
-"""
+The skin and film are the project's, solved on a mesh of the generator's choice with its own way through the
+poses; every effect is written anew, in another form than the catalogue's (Euler integration instead of closed
+recursions, two time constants where one is fitted, a second-order filter, nearest neighbours instead of a
+kernel, tanh instead of a bent line, Dahl's law instead of a play operator)."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 __all__ = ["HIDDEN", "OUTSIDE", "Generator", "plan"]
 
-_E_NEAR = {0: (1, 3, 7), 1: (0, 2, 3, 16), 2: (1, 4, 16, 17), 3: (0, 1, 2, 4), 4: (2, 3, 5, 17), 5: (3, 4, 18), 6: (7, 8, 9), 7: (0, 6, 9), 8: (6, 9, 10),  # noqa: E501
-           9: (6, 7, 8, 16), 10: (8, 11, 13), 11: (10, 12, 13, 16), 12: (11, 14, 16, 17), 13: (10, 11, 12, 14), 14: (12, 13, 15, 17), 15: (13, 14, 18),  # noqa: E501
-           16: (1, 9, 11, 17), 17: (4, 14, 16, 18), 18: (5, 15, 17)}  # fmt: skip
+_E_NEAR = {
+    0: (1, 3, 7),
+    1: (0, 2, 3, 16),
+    2: (1, 4, 16, 17),
+    3: (0, 1, 2, 4),
+    4: (2, 3, 5, 17),
+    5: (3, 4, 18),
+    6: (7, 8, 9),
+    7: (0, 6, 9),
+    8: (6, 9, 10),  # noqa: E501
+    9: (6, 7, 8, 16),
+    10: (8, 11, 13),
+    11: (10, 12, 13, 16),
+    12: (11, 14, 16, 17),
+    13: (10, 11, 12, 14),
+    14: (12, 13, 15, 17),
+    15: (13, 14, 18),  # noqa: E501
+    16: (1, 9, 11, 17),
+    17: (4, 14, 16, 18),
+    18: (5, 15, 17),
+}
 
 
 def plan(seed, count, skin="coarse"):
-    """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,); press, hold, sometimes slide,
-    unload."""
+    """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,);
+    press, hold, sometimes slide, unload."""
     from biotac_mj import approach
     from biotac_mj.geometry import load_skin
 
@@ -37,21 +55,32 @@ def plan(seed, count, skin="coarse"):
         for seconds, to, across, rows in legs:
             t0, d0, s0 = t[-1], d[-1], s[-1]
             for k in range(1, rows + 1):
-                t.append(t0 + seconds * k / rows), d.append(d0 + (to - d0) * k / rows), s.append(s0 + (across - s0) * k / rows)
+                (
+                    t.append(t0 + seconds * k / rows),
+                    d.append(d0 + (to - d0) * k / rows),
+                    s.append(s0 + (across - s0) * k / rows),
+                )
         turn = Rotation.align_vectors([heading], [[0.0, 1.0, 0.0]])[0]
         out.append(
             {
-                "id": f"t{i:02d}", "tool": str(rng.choice(["sphere_7mm", "sphere_14mm"])), "clock": clock, "time": np.array(t),
-                "pos": point + np.outer(d, heading) + np.outer(s, side), "turn": turn.as_matrix(), "quat": np.roll(turn.as_quat(), 1),
-                "heading": heading, "depth": np.array(d),
+                "id": f"t{i:02d}",
+                "tool": str(rng.choice(["sphere_7mm", "sphere_14mm"])),
+                "clock": clock,
+                "time": np.array(t),
+                "pos": point + np.outer(d, heading) + np.outer(s, side),
+                "turn": turn.as_matrix(),
+                "quat": np.roll(turn.as_quat(), 1),
+                "heading": heading,
+                "depth": np.array(d),
             }
-        )  # fmt: skip
+        )
         clock += t[-1] + 5
     return out
 
 
 class Generator:
-    """The skin of a mesh under plans; `footprint` widens what the electrodes see of a contact (a mildly wrong base model)."""
+    """The skin of a mesh under plans; `footprint` widens what the electrodes see of a contact (a mildly wrong
+    base model)."""
 
     def __init__(self, skin="coarse", modulus=1.0, footprint=0.0, tier="condensed", device="cpu"):
         from biotac_mj.geometry import load_skin
@@ -61,14 +90,22 @@ class Generator:
 
         self.geometry = load_skin(skin)
         self.film = FilmConduction(self.geometry, sensor="1")
-        self.model = SkinModel(self.geometry, material("default"), SkinOptions(liquid=True), "cpu" if tier == "condensed" else device)
+        self.model = SkinModel(
+            self.geometry,
+            material("default"),
+            SkinOptions(liquid=True),
+            "cpu" if tier == "condensed" else device,
+        )
         self.modulus, self.footprint, self.tier = modulus, footprint, tier
 
     def skin(self, plans, poses, radii) -> list:
-        """Per plan force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]; poses: lists of (n, 3); radii: factors or None."""
+        """Per plan force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]; poses: lists of (n, 3);
+        radii: factors or None."""
         from biotac_mj.data.objects import make_object
 
-        size = [float(make_object(one["tool"]).size[0]) * (radius or 1.0) for one, radius in zip(plans, radii)]
+        size = [
+            float(make_object(one["tool"]).size[0]) * (radius or 1.0) for one, radius in zip(plans, radii)
+        ]
         if self.tier == "condensed":
             return [self._condensed(one, pos, r) for one, pos, r in zip(plans, poses, size)]
         return self._full(plans, poses, size)
@@ -94,12 +131,18 @@ class Generator:
         return np.array(force), np.array(pressure), np.array(impedance)
 
     def _full(self, plans, poses, size):
-        """Full finite elements, every plan a world; spheres of all sizes are in every world, those not used a metre away."""
+        """Full finite elements, every plan a world; spheres of all sizes are in every world, those not used a
+        metre away."""
         from biotac_mj.skin import GeomSet, SkinData, step
 
         kinds = sorted(set(size))
-        geoms = GeomSet(["sphere"] * len(kinds), [(r,) for r in kinds], friction=[self.model.material.friction] * len(kinds),
-                        nworld=len(plans), device=self.model.device)  # fmt: skip
+        geoms = GeomSet(
+            ["sphere"] * len(kinds),
+            [(r,) for r in kinds],
+            friction=[self.model.material.friction] * len(kinds),
+            nworld=len(plans),
+            device=self.model.device,
+        )
         data = SkinData(self.model, len(plans))
         ways = [list(_way(one, pos, r)) for one, pos, r in zip(plans, poses, size)]
         out = [([], [], []) for _ in plans]
@@ -118,7 +161,8 @@ class Generator:
         return [tuple(np.array(part) for part in one) for one in out]
 
     def measure(self, plans, effects, seed, repeatability=0.02e-3):
-        """Per plan: counts (n, 19), pdc (n,), force (n, 3) with noise and rounding; effects: list of (name, size)."""
+        """Per plan: counts (n, 19), pdc (n,), force (n, 3) with noise and rounding; effects: list of (name,
+        size)."""
         rng = np.random.default_rng(seed)
         memory, out = {}, []
         states = [_State(one, self, rng.normal(0, repeatability, 3), memory) for one in plans]
@@ -131,10 +175,14 @@ class Generator:
             for s, solved in zip(states, self.skin(plans, poses, [s.radius for s in states])):
                 s.force, s.pressure, s.impedance = solved
             wanted = [
-                s.one["pos"] + s.offset - s.compliance * np.outer(np.maximum(-s.force @ s.one["heading"], 0), s.one["heading"])
+                s.one["pos"]
+                + s.offset
+                - s.compliance * np.outer(np.maximum(-s.force @ s.one["heading"], 0), s.one["heading"])
                 for s in states
             ]
-            poses = [0.8 * new + 0.2 * old for new, old in zip(wanted, poses)]  # the mount gives way: most of the way to balance each time
+            poses = [
+                0.8 * new + 0.2 * old for new, old in zip(wanted, poses)
+            ]  # the mount gives way: most of the way to balance each time
         for s in states:
             s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
             s.rest = s.impedance[0]
@@ -153,12 +201,19 @@ class Generator:
                 if name in _READ:
                     _READ[name](s, size)
             counts = np.clip(np.rint(s.counts + 3.5 * rng.standard_normal(s.counts.shape)), 0, 4095)
-            out.append((counts, np.rint(s.pdc + rng.standard_normal(len(s.pdc))), s.force + 0.006 * rng.standard_normal(s.force.shape)))
+            out.append(
+                (
+                    counts,
+                    np.rint(s.pdc + rng.standard_normal(len(s.pdc))),
+                    s.force + 0.006 * rng.standard_normal(s.force.shape),
+                )
+            )
         return out
 
 
 def _way(one, pos, r):
-    """Centres of the sphere on the way through poses, finer than the fitter's; and whether a pose is reached."""
+    """Centres of the sphere on the way through poses, finer than the fitter's; and whether a pose is
+    reached."""
     before = pos[0]
     for p in pos:
         parts = max(1, int(np.ceil(np.linalg.norm(p - before) / 0.6e-4)))
@@ -217,7 +272,9 @@ def _mullins(s, size):
 
 def _adhesion(s, size):
     leaving = np.gradient(s.depth) < 0
-    s.force = s.force + np.outer(size * (0.3 + 0.7 * leaving) * (s.depth > 0) * np.sqrt(s.depth / 1e-3), s.one["heading"])
+    s.force = s.force + np.outer(
+        size * (0.3 + 0.7 * leaving) * (s.depth > 0) * np.sqrt(s.depth / 1e-3), s.one["heading"]
+    )
 
 
 def _fluidloss(s, size):
@@ -225,7 +282,10 @@ def _fluidloss(s, size):
 
 
 def _warmup(s, size):
-    s.impedance = s.impedance * np.exp(-size * (0.8 * (1 - np.exp(-s.clock / 60)) + 0.2 * (1 - np.exp(-s.clock / 15))))[:, None]
+    s.impedance = (
+        s.impedance
+        * np.exp(-size * (0.8 * (1 - np.exp(-s.clock / 60)) + 0.2 * (1 - np.exp(-s.clock / 15))))[:, None]
+    )
 
 
 def _asper(s, size):
@@ -282,7 +342,8 @@ def _ripple(s, size):
 
 
 def _leak(s, size):
-    """Outside: electrodes read the pressure through a damaged seal, each with its own sign, and keep part of it."""
+    """Outside: electrodes read the pressure through a damaged seal, each with its own sign, and keep part of
+    it."""
     seen = np.maximum.accumulate(np.maximum(s.pressure, 0)) / 5000
     s.counts = s.counts + size * np.outer(0.5 * s.pressure / 5000 + 0.5 * seen, np.sin(2.1 * np.arange(19)))
 
@@ -297,15 +358,53 @@ def _squeeze(s, size):
     s.pdc = s.pdc + size * np.tanh(np.gradient(s.depth, s.t) / 2e-3)
 
 
-_BEFORE = {"radius": _set("radius"), "mount": _set("compliance"), "depth0": _set("depth0"), "misalign": _set("misalign")}
-_LOAD = {"relax": _relax, "hyster": _hyster, "stiffen": _stiffen, "mullins": _mullins, "adhesion": _adhesion, "fluidloss": _fluidloss,
-         "warmup": _warmup, "asper": _asper}  # fmt: skip
-_READ = {"gain": _gain, "crosstalk": _crosstalk, "saturate": _saturate, "lowpass": _lowpass, "latency": _latency, "drift": _drift, "ripple": _ripple,  # noqa: E501
-         "leak": _leak, "ring": _ring, "squeeze": _squeeze}  # fmt: skip
+_BEFORE = {
+    "radius": _set("radius"),
+    "mount": _set("compliance"),
+    "depth0": _set("depth0"),
+    "misalign": _set("misalign"),
+}
+_LOAD = {
+    "relax": _relax,
+    "hyster": _hyster,
+    "stiffen": _stiffen,
+    "mullins": _mullins,
+    "adhesion": _adhesion,
+    "fluidloss": _fluidloss,
+    "warmup": _warmup,
+    "asper": _asper,
+}
+_READ = {
+    "gain": _gain,
+    "crosstalk": _crosstalk,
+    "saturate": _saturate,
+    "lowpass": _lowpass,
+    "latency": _latency,
+    "drift": _drift,
+    "ripple": _ripple,  # noqa: E501
+    "leak": _leak,
+    "ring": _ring,
+    "squeeze": _squeeze,
+}
 # Smallest and largest size of each hidden effect.
 HIDDEN = {
-    "relax": (0.15, 0.4), "hyster": (0.08, 0.25), "stiffen": (0.2, 0.5), "mullins": (0.2, 0.4), "adhesion": (0.06, 0.15), "fluidloss": (0.03, 0.1),  # noqa: E501
-    "warmup": (0.06, 0.25), "asper": (0.15, 0.4), "gain": (0.1, 0.25), "crosstalk": (0.06, 0.15), "saturate": (150, 400), "lowpass": (0.04, 0.15),  # noqa: E501
-    "latency": (0.03, 0.1), "drift": (4, 15), "radius": (0.12, 0.25), "mount": (4e-5, 12e-5), "depth0": (6e-5, 15e-5), "misalign": (1.5e-4, 4e-4),  # noqa: E501
-}  # fmt: skip
+    "relax": (0.15, 0.4),
+    "hyster": (0.08, 0.25),
+    "stiffen": (0.2, 0.5),
+    "mullins": (0.2, 0.4),
+    "adhesion": (0.06, 0.15),
+    "fluidloss": (0.03, 0.1),  # noqa: E501
+    "warmup": (0.06, 0.25),
+    "asper": (0.15, 0.4),
+    "gain": (0.1, 0.25),
+    "crosstalk": (0.06, 0.15),
+    "saturate": (150, 400),
+    "lowpass": (0.04, 0.15),  # noqa: E501
+    "latency": (0.03, 0.1),
+    "drift": (4, 15),
+    "radius": (0.12, 0.25),
+    "mount": (4e-5, 12e-5),
+    "depth0": (6e-5, 15e-5),
+    "misalign": (1.5e-4, 4e-4),  # noqa: E501
+}
 OUTSIDE = {"ripple": (20, 60), "leak": (40, 120), "ring": (0.1, 0.3), "squeeze": (10, 40)}

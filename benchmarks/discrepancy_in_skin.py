@@ -1,11 +1,11 @@
-"""What the reduced forms of constitutive effects miss: one press, with the effect on the forces and inside the finite elements.
+"""What the reduced forms of constitutive effects miss: one press, with the effect on the forces and inside
+the finite elements.
 
     python benchmarks/discrepancy_in_skin.py --json out/in_skin.json
 
-A sphere of 7 mm is pressed 1.2 mm into the pad, held, drawn back to half, held, pressed again and taken away. Printed are the largest
-change that the effect makes inside the skin while touched and what the reduced form misses of it (RMS over those rows); then the same after
-the release, at the most.
-"""
+A sphere of 7 mm is pressed 1.2 mm into the pad, held, drawn back to half, held, pressed again and taken away.
+Printed are the largest change that the effect makes inside the skin while touched and what the reduced form
+misses of it (RMS over those rows); then the same after the release, at the most."""
 
 import argparse
 import json
@@ -28,7 +28,8 @@ CASES = (
 
 
 def press(depth=1.2e-3, rows=8):
-    """A Trajectory: in 1 s, held for 2 s, half way out in 0.5 s, held for 1.5 s, in again to the same depth and out."""
+    """A Trajectory: in 1 s, held for 2 s, half way out in 0.5 s, held for 1.5 s, in again to the same depth
+    and out."""
     from biotac_mj.discrepancy.trajectories import Trajectory
     from biotac_mj.geometry import load_skin
 
@@ -39,11 +40,14 @@ def press(depth=1.2e-3, rows=8):
     depths = np.array([-0.1e-3, depth, depth, depth / 2, depth / 2, depth, -0.1e-3])
     t = np.unique(np.concatenate([np.linspace(a, b, rows + 1) for a, b in zip(knots[:-1], knots[1:])]))
     pos = np.column_stack([np.full(len(t), -12e-3), surface + np.interp(t, knots, depths), np.zeros(len(t))])
-    return Trajectory("press", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+    return Trajectory(
+        "press", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0)
+    )
 
 
 def compare(effect, theta, trajectory, sim, plain):
-    """Row of the table: largest change and what the reduced form misses, touched and released [N, Pa, counts]; processor time [s]."""
+    """Row of the table: largest change and what the reduced form misses, touched and released [N, Pa,
+    counts]; processor time [s]."""
     from biotac_mj.discrepancy.catalogue import by_id
 
     effects = [(by_id(effect), theta)]
@@ -54,11 +58,19 @@ def compare(effect, theta, trajectory, sim, plain):
     out = {"effect": effect, **theta, "seconds": ended - began}
     touching = inside.normal_force > 1e-3
     gone = np.arange(len(touching)) > np.flatnonzero(touching)[-1]
-    for name, value in (("force", lambda r: r.normal_force), ("pressure", lambda r: r.pressure), ("counts", lambda r: r.counts)):
+    for name, value in (
+        ("force", lambda r: r.normal_force),
+        ("pressure", lambda r: r.pressure),
+        ("counts", lambda r: r.counts),
+    ):
         a, b, c = value(plain), value(inside), value(reduced)
         change, miss = np.abs(b - a), np.abs(c - b)
-        out |= {f"{name}_changes": float(change[touching].max()), f"{name}_missed": float(np.sqrt((miss[touching] ** 2).mean())),
-                f"{name}_after": float(change[gone].max()), f"{name}_after_missed": float(miss[gone].max())}  # fmt: skip
+        out |= {
+            f"{name}_changes": float(change[touching].max()),
+            f"{name}_missed": float(np.sqrt((miss[touching] ** 2).mean())),
+            f"{name}_after": float(change[gone].max()),
+            f"{name}_after_missed": float(miss[gone].max()),
+        }
     return out
 
 
@@ -84,7 +96,11 @@ def main(argv=None):
     began = time.process_time()
     plain = sim.run([trajectory], effects=[])[0]
     print(f"elastic skin: {time.process_time() - began:.0f} s of processor time", flush=True)
-    rows = [compare(effect, theta, trajectory, sim, plain) for effect, theta in CASES if args.only in (None, effect)]
+    rows = [
+        compare(effect, theta, trajectory, sim, plain)
+        for effect, theta in CASES
+        if args.only in (None, effect)
+    ]
     names = ("force", "N"), ("pressure", "Pa"), ("counts", "")
     print(
         f"{'':<26}"
@@ -92,7 +108,9 @@ def main(argv=None):
         + f"{'released: Pa':>14}{'missed':>8}{'counts':>8}{'s':>5}"
     )  # noqa: E501
     for r in rows:
-        label = f"{r['effect']} " + ", ".join(f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening", "c2", "along", "fraction") if k in r)
+        label = f"{r['effect']} " + ", ".join(
+            f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening", "c2", "along", "fraction") if k in r
+        )
         label += f", {1e3 * r['width']:g} mm" if r["effect"] == "hyster" else ""
         cells = "".join(f"{r[f'{n}_changes']:>20.3g}{r[f'{n}_missed']:>8.2g}" for n, _ in names)
         print(

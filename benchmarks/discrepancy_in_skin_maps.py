@@ -1,13 +1,18 @@
-"""What the parameters of stiffen and hyster are as constants of the rubber, measured on presses; the tables of `discrepancy/in_skin.py`.
+"""What the parameters of stiffen and hyster are as constants of the rubber, measured on presses; the tables
+of `discrepancy/in_skin.py`.
 
     python benchmarks/discrepancy_in_skin_maps.py --json out/in_skin_maps.json
 
-- stiffen: the skin is pressed with the coefficient s = c2 / c1 in its elements; printed is the c2 of the reduced form that gives the same
-  force (least squares up to 1.2 mm), and at how much of the force it misses; then for other tools, places and beyond touching the core.
-- hyster: twice in to 1.2 mm and out with a friction branch of every strain; for each width of the reduced form the strain and the branch's
-  modulus over its fraction that come nearest, and how much of the effect stays (RMS).
-- inhomog: presses at several places with a modulus that varies along and across, against the factor of the reduced form.
-- lost: steps that found no balance in presses of 2 mm, through the contact with the core, and out, and their processor time.
+- stiffen: the skin is pressed with the coefficient s = c2 / c1 in its elements; printed is the c2 of the
+  reduced form that gives the same force (least squares up to 1.2 mm), and at how much of the force it misses;
+  then for other tools, places and beyond touching the core.
+- hyster: twice in to 1.2 mm and out with a friction branch of every strain; for each width of the reduced
+  form the strain and the branch's modulus over its fraction that come nearest, and how much of the effect
+  stays (RMS).
+- inhomog: presses at several places with a modulus that varies along and across, against the factor of the
+  reduced form.
+- lost: steps that found no balance in presses of 2 mm, through the contact with the core, and out, and their
+  processor time.
 """
 
 import argparse
@@ -24,13 +29,15 @@ PLACE = (-12e-3, 0.0)
 
 
 def press(depths, skin="coarse", tool="sphere_7mm", place=PLACE, modulus=None, **constants):
-    """Force along the press [N] and pressure [Pa] at each depth [m] below where the tool meets the surface, NaN where a step was lost, and
-    the processor time of each step [s]."""
+    """Force along the press [N] and pressure [Pa] at each depth [m] below where the tool meets the surface,
+    NaN where a step was lost, and the processor time of each step [s]."""
     from biotac_mj.data.simulate import Scene
     from biotac_mj.geometry import load_skin
     from biotac_mj.skin import Material, SkinData, SkinModel, SkinOptions, step
 
-    model = SkinModel(load_skin(skin), Material(**constants), SkinOptions(liquid=True, tolerance=3e-4), modulus=modulus)
+    model = SkinModel(
+        load_skin(skin), Material(**constants), SkinOptions(liquid=True, tolerance=3e-4), modulus=modulus
+    )
     data, scene = SkinData(model), Scene([tool], "cpu", model.material.friction)
     model.factor  # noqa: B018 - made here, the steps' time is without it
     vert = model.geometry.vert
@@ -75,9 +82,20 @@ def stiffening():
         plain, force = (press(depths, skin, tool, place, stiffening=s)[0] for s in (0.0, 12.0))
         good = np.isfinite(plain + force)
         c2, miss = same_force(depths[good], plain[good], force[good])
-        rows.append({"s": 12, "tool": tool, "place": place, "deepest": deepest, "skin": skin, "c2": c2, "missed": miss})
+        rows.append(
+            {
+                "s": 12,
+                "tool": tool,
+                "place": place,
+                "deepest": deepest,
+                "skin": skin,
+                "c2": c2,
+                "missed": miss,
+            }
+        )
         print(
-            f"{tool:<12}{1e3 * place[0]:>5.0f}{1e3 * place[1]:>4.0f} mm, {1e3 * deepest:.1f} mm deep, {skin:<8}{c2:>9.4f} {miss:>6.0%}",
+            f"{tool:<12}{1e3 * place[0]:>5.0f}{1e3 * place[1]:>4.0f} mm, {1e3 * deepest:.1f} mm deep, "
+            f"{skin:<8}{c2:>9.4f} {miss:>6.0%}",
             flush=True,
         )
     return rows
@@ -89,7 +107,9 @@ def hysteresis():
     plain, g = press(depths)[0], 0.3
     response = np.array([(press(depths, hysteresis=((g, e),))[0] - plain) / g for e in STRAINS])
     strains = np.geomspace(STRAINS[0], STRAINS[-1], 400)
-    fine = np.array([np.interp(np.log(strains), np.log(STRAINS), response[:, k]) for k in range(len(depths))]).T
+    fine = np.array(
+        [np.interp(np.log(strains), np.log(STRAINS), response[:, k]) for k in range(len(depths))]
+    ).T
     rows = []
     print("hyster: width mm, strain, g / fraction, missed")
     for width in WIDTHS:
@@ -117,24 +137,49 @@ def places():
             change = press(depths, place=place, modulus=modulus_of(theta))[0][-1] / plain - 1
             wanted = float(modulus_of(theta)(np.array([[place[0], 0.0, place[1]]]))[0] - 1)
             rows.append({**theta, "place": place, "change": change, "reduced": wanted})
-            print(f"{along:>5} {across:>5} {1e3 * place[0]:>5.0f}{1e3 * place[1]:>4.0f} {change:>8.3f} {wanted:>8.3f}", flush=True)
+            print(
+                f"{along:>5} {across:>5} {1e3 * place[0]:>5.0f}{1e3 * place[1]:>4.0f} {change:>8.3f} "
+                f"{wanted:>8.3f}",
+                flush=True,
+            )
     return rows
 
 
 def lost():
     depths, rows = np.concatenate([np.linspace(0, 2e-3, 21), np.linspace(1.8e-3, 0, 10)]), []
-    laws = {"corotational": {}, "svk": {"law": "svk"}, "corotational, four nodes": {"element": "linear"},
-            "neo_hookean": {"law": "neo_hookean", "youngs_modulus": 2.8e5, "poissons_ratio": 0.45, "friction": 0.186}}  # fmt: skip
-    options = [{}, {"stiffening": 1.0}, {"stiffening": 12.0}, {"stiffening": 120.0}, {"stiffening": -12.0}, {"hysteresis": ((0.5, 0.003),)},
-               {"hysteresis": ((4.0, 0.001),)}, {"modulus": lambda at: np.maximum(1 + 100 * (at[:, 0] + 8e-3), 0.1)},
-               {"hysteresis": ((0.5, 0.003),), "stiffening": 12.0}]  # fmt: skip
+    laws = {
+        "corotational": {},
+        "svk": {"law": "svk"},
+        "corotational, four nodes": {"element": "linear"},
+        "neo_hookean": {
+            "law": "neo_hookean",
+            "youngs_modulus": 2.8e5,
+            "poissons_ratio": 0.45,
+            "friction": 0.186,
+        },
+    }
+    options = [
+        {},
+        {"stiffening": 1.0},
+        {"stiffening": 12.0},
+        {"stiffening": 120.0},
+        {"stiffening": -12.0},
+        {"hysteresis": ((0.5, 0.003),)},
+        {"hysteresis": ((4.0, 0.001),)},
+        {"modulus": lambda at: np.maximum(1 + 100 * (at[:, 0] + 8e-3), 0.1)},
+        {"hysteresis": ((0.5, 0.003),), "stiffening": 12.0},
+    ]
     print("lost: steps of", len(depths), "and processor time")
     for law, base in laws.items():
         for extra in options:
             force, _, seconds = press(depths, **base, **extra)
             named = {k: "along" if k == "modulus" else v for k, v in extra.items()}
             rows.append({"law": law, **named, "lost": int(np.isnan(force).sum()), "seconds": seconds.sum()})
-            print(f"{law:<26}{str(named):<58}{rows[-1]['lost']:>4} {rows[-1]['seconds']:>5.1f} s {np.nanmax(force):>6.2f} N", flush=True)
+            print(
+                f"{law:<26}{str(named):<58}{rows[-1]['lost']:>4} {rows[-1]['seconds']:>5.1f} s "
+                f"{np.nanmax(force):>6.2f} N",
+                flush=True,
+            )
     return rows
 
 

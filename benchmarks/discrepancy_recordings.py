@@ -1,6 +1,8 @@
-"""Plain recordings with a hidden effect: what `biotac diagnose --electrodes` names, over many recordings of our own making.
+"""Plain recordings with a hidden effect: what `biotac diagnose --electrodes` names, over many recordings of
+our own making.
 
-    python benchmarks/discrepancy_recordings.py --count 2 --null 10 --seeds practice --json out/recordings.json
+    python benchmarks/discrepancy_recordings.py --count 2 --null 10 --seeds practice --json
+    out/recordings.json
 
 The recordings are made by `discrepancy_recordings_generator.py`. A run goes on where its JSON ends.
 """
@@ -36,10 +38,16 @@ def score(verdict, truth):
     ok = [e for e in verdict["effects"] if right(e, truth)]
     extra = [i for i in named if i not in natural and i not in wanted]
     if truth["effect"] == "none":
-        return (not extra and (bool(natural) or verdict["verdict"] == "no significant disagreement")), extra, True
+        return (
+            (not extra and (bool(natural) or verdict["verdict"] == "no significant disagreement")),
+            extra,
+            True,
+        )
     if truth["effect"] in OUTSIDE:
         return "unknown" in verdict["verdict"], extra, True
-    shrunk = any(e["gap"] and e["gap"].get("before") is not None and e["gap"]["after"] < e["gap"]["before"] for e in ok)
+    shrunk = any(
+        e["gap"] and e["gap"].get("before") is not None and e["gap"]["after"] < e["gap"]["before"] for e in ok
+    )
     return bool(ok), extra, shrunk
 
 
@@ -66,7 +74,11 @@ def main(argv=None):
             r = rows[-1]
             if args.verbose or not r["hit"] or r["extra"]:
                 mark = "ok  " if r["hit"] else "MISS"
-                print(f"{mark} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: {r['verdict'][:230]}", flush=True)
+                print(
+                    f"{mark} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: "
+                    f"{r['verdict'][:230]}",
+                    flush=True,
+                )
             if path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 part = path.with_suffix(".part")
@@ -86,22 +98,46 @@ def diagnose(make, folder):
     if force is not None:
         np.savetxt(paths[1], force, fmt="%.5f")
     began = time.process_time()
-    verdict = verdict_dict(diagnose_recording(read_recording(paths[0], None if force is None else paths[1], None, rate)))
+    verdict = verdict_dict(
+        diagnose_recording(read_recording(paths[0], None if force is None else paths[1], None, rate))
+    )
     hit, extra, shrunk = score(verdict, truth)
     natural = NATURAL.get(truth["base"], set())
     named = [
-        {"id": f["id"], "nats": f["nats"], "ties": f["ties"], "confirmed": f["confirmed"], "confidence": f["confidence"],
-         "natural": f["id"] in natural and f["id"] != truth["effect"], "right": right(f, truth)} for f in verdict["effects"]
-    ]  # fmt: skip
+        {
+            "id": f["id"],
+            "nats": f["nats"],
+            "ties": f["ties"],
+            "confirmed": f["confirmed"],
+            "confidence": f["confidence"],
+            "natural": f["id"] in natural and f["id"] != truth["effect"],
+            "right": right(f, truth),
+        }
+        for f in verdict["effects"]
+    ]
     views = {k: (v["before"], v["after"]) for k, v in verdict["gap"].items()}
-    return {**truth, "force": force is not None, "rate": rate, "rows": len(e), "seconds": time.process_time() - began, "hit": bool(hit),
-            "extra": extra, "shrunk": bool(shrunk), "verdict": verdict["verdict"], "named": named, "views": views}  # fmt: skip
+    return {
+        **truth,
+        "force": force is not None,
+        "rate": rate,
+        "rows": len(e),
+        "seconds": time.process_time() - began,
+        "hit": bool(hit),
+        "extra": extra,
+        "shrunk": bool(shrunk),
+        "verdict": verdict["verdict"],
+        "named": named,
+        "views": views,
+    }
 
 
 def code_hash():
     """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
     folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    names = "drifts electrode_drifts faults hum load_search loads noises plain recorded_effect recorded_gap recorded_rest"
+    names = (
+        "drifts electrode_drifts faults hum load_search loads noises plain recorded_effect recorded_gap "
+        "recorded_rest"
+    )
     names += " recorded_views recording shapes timeline"
     return hashlib.sha256(b"".join((folder / f"{n}.py").read_bytes() for n in names.split())).hexdigest()[:12]
 
@@ -127,17 +163,30 @@ def table(rows):
         outside = [r for r in members if r["effect"] in OUTSIDE]
         inside = [r for r in members if r["effect"] != "none" and r["effect"] not in OUTSIDE]
         worse = sum(any(after > 1.02 * before for before, after in r["views"].values()) for r in members)
-        counts = (len(none), sum(bool(r["extra"]) for r in none), len(inside), sum(r["hit"] for r in inside),
-                  sum(bool(r["extra"]) for r in inside), len(outside), sum(r["hit"] for r in outside), worse)  # fmt: skip
+        counts = (
+            len(none),
+            sum(bool(r["extra"]) for r in none),
+            len(inside),
+            sum(r["hit"] for r in inside),
+            sum(bool(r["extra"]) for r in inside),
+            len(outside),
+            sum(r["hit"] for r in outside),
+            worse,
+        )
         lines.append(f"{base:<30}" + "".join(f"{value:>{width}}" for value, (_, width) in zip(counts, heads)))
     lines.append("")
     for effect in dict.fromkeys(r["effect"] for r in rows):
         mine = [r for r in rows if r["effect"] == effect]
         wrong = collections.Counter(i for r in mine for i in r["extra"])
-        lines.append(f"{effect:<14}{sum(r['hit'] for r in mine):>4} of {len(mine):<4}{', '.join(f'{k} {v}' for k, v in wrong.items())}")
+        lines.append(
+            f"{effect:<14}{sum(r['hit'] for r in mine):>4} of "
+            f"{len(mine):<4}{', '.join(f'{k} {v}' for k, v in wrong.items())}"
+        )
     lines += ["", f"{'confidence':<14}names, right"]
     for value in sorted({round(f["confidence"], 3) for r in rows for f in r["named"]}):
-        told = [f["right"] or f["natural"] for r in rows for f in r["named"] if round(f["confidence"], 3) == value]
+        told = [
+            f["right"] or f["natural"] for r in rows for f in r["named"] if round(f["confidence"], 3) == value
+        ]
         lines.append(f"{value:<14}{len(told):>4}{sum(told):>7}")
     return "\n".join(lines)
 

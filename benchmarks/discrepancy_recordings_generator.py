@@ -1,8 +1,8 @@
 """Plain recordings with a hidden effect: base signals and effects, in numpy alone.
 
-Base signals are synthetic (unloaded or pressed by a simulated hand) and, where `../shared/data/epfl_flat_press` exists, pieces of real
-recordings of 40 s or more. Nothing here shares code, or the form of a formula, with the effects that are fitted.
-"""
+Base signals are synthetic (unloaded or pressed by a simulated hand) and, where
+`../shared/data/epfl_flat_press` exists, pieces of real recordings of 40 s or more. Nothing here shares code,
+or the form of a formula, with the effects that are fitted."""
 
 import functools
 import pathlib
@@ -12,14 +12,41 @@ import numpy as np
 __all__ = ["ALSO", "EFFECTS", "NATURAL", "OUTSIDE", "SEEDS", "bases", "hash_of", "hide", "make_case"]
 
 REAL = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
-SEEDS = {"development": 0, "practice": 100_000, "blind": 900_000, "second blind": 1_700_000, "third blind": 2_600_000}
+SEEDS = {
+    "development": 0,
+    "practice": 100_000,
+    "blind": 900_000,
+    "second blind": 1_700_000,
+    "third blind": 2_600_000,
+}
 NATURAL = {"loaded, real": {"warmup", "lowpass", "latency", "relax", "hyster"}, "unloaded, real": {"warmup"}}
-PLACES = np.array([[-14.5, 71], [-9.6, 44], [-6.1, 44], [-4.3, 71], [-1.8, 44], [1.1, 71], [-17, 0], [-15.3, 30], [-15.3, -30], [-13.6, 0],
-                   [-14.5, -71], [-9.6, -44], [-6.1, -44], [-4.3, -71], [-1.8, -44], [1.1, -71], [-9.5, 0], [-2.5, 0], [1.3, 0]])  # fmt: skip  # noqa: E501
+PLACES = np.array(
+    [
+        [-14.5, 71],
+        [-9.6, 44],
+        [-6.1, 44],
+        [-4.3, 71],
+        [-1.8, 44],
+        [1.1, 71],
+        [-17, 0],
+        [-15.3, 30],
+        [-15.3, -30],
+        [-13.6, 0],
+        [-14.5, -71],
+        [-9.6, -44],
+        [-6.1, -44],
+        [-4.3, -71],
+        [-1.8, -44],
+        [1.1, -71],
+        [-9.5, 0],
+        [-2.5, 0],
+        [1.3, 0],
+    ]
+)  # noqa: E501
 XY = np.column_stack([PLACES[:, 0], 5.3 * np.radians(PLACES[:, 1])])  # unrolled [mm]
 
 
-# --- base signals --------------------------------------------------------------------------------------------------------------------
+# --- base signals  ---
 
 
 def unloaded(rng, rate, seconds):
@@ -29,7 +56,8 @@ def unloaded(rng, rate, seconds):
 
 
 def hand(rng, rate, seconds):
-    """Counts and force of a finger pressed by hand: holds with ramps between, the place of the contact wanders."""
+    """Counts and force of a finger pressed by hand: holds with ramps between, the place of the contact
+    wanders."""
     n = int(rate * seconds)
     t = np.arange(n) / rate
 
@@ -43,7 +71,11 @@ def hand(rng, rate, seconds):
             values += [last, now]
         x = np.interp(t, knots, values)
         width = max(3, int(0.08 * rate))
-        return np.convolve(np.pad(x, width, mode="edge"), np.hanning(2 * width + 1) / np.hanning(2 * width + 1).sum(), "valid")[:n]
+        return np.convolve(
+            np.pad(x, width, mode="edge"),
+            np.hanning(2 * width + 1) / np.hanning(2 * width + 1).sum(),
+            "valid",
+        )[:n]
 
     normal, shear_x, shear_y = holds(0.4, 6, 2.5), holds(-1.2, 1.2, 3), holds(-1.5, 1.5, 3)
     px, py = holds(-14, -3, 6) + 0.3 * shear_y, holds(-2, 2, 6) + 0.3 * shear_x
@@ -149,7 +181,10 @@ def hum(e, force, rng, rate):
     t = np.arange(len(e)) / rate
     on = (t > rng.choice([0, 0.4]) * t[-1]) & (t <= 1.0 * t[-1])
     return (
-        e + rng.uniform(3, 12) * (on * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)))[:, None] * rng.uniform(0.6, 1.2, 19),
+        e
+        + rng.uniform(3, 12)
+        * (on * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)))[:, None]
+        * rng.uniform(0.6, 1.2, 19),
         force,
         range(19),
     )
@@ -207,9 +242,12 @@ def relax(e, force, rng, rate):
 def hyster(e, force, rng, rate):
     out, width = force.copy(), 0.5 * force.std(0)
     z, half = np.zeros(3), max(2, int(0.1 * rate))
-    # of the movement, not of the force sensor's noise: going to and fro by a hundredth of a newton wears a loop off within a second
+    # of the movement, not of the force sensor's noise: going to and fro by a hundredth of a newton wears a
+    # loop off within a second
     kernel = np.hanning(2 * half + 3)[1:-1]
-    smooth = np.stack([np.convolve(np.pad(x, half, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1)
+    smooth = np.stack(
+        [np.convolve(np.pad(x, half, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1
+    )
     for i in range(1, len(force)):
         step = smooth[i] - smooth[i - 1]
         z = z + step * (1 - np.sign(step) * z / width)  # Dahl's law, not the play operator that is fitted
@@ -237,15 +275,33 @@ def telegraph(e, force, rng, rate):
 U, L, B = ("unloaded",), ("loaded",), ("unloaded", "loaded")
 EFFECTS = {
     "none": (lambda e, f, rng, rate: (e, f, []), "before", B),
-    "warmup": (warmup, "before", B), "count_offset": (offset, "before", U), "drift": (drift, "before", B), "jump": (jump, "before", B),
-    "gain": (gain, "before", L), "swap": (swap, "after", B), "lowpass": (lowpass, "after", B), "crosstalk": (crosstalk, "after", B),
-    "hum": (hum, "before", B), "stuck": (stuck, "after", B), "saturate": (saturate, "after", L), "quantise": (quantise, "after", B),
-    "spikes": (spikes, "after", B), "noise": (noise, "before", B), "latency": (latency, "before", ("loaded+force",)),
-    "relax": (relax, "before", ("loaded+force",)), "hyster": (hyster, "before", ("loaded+force",)),
-    "wander": (wander, "before", U), "telegraph": (telegraph, "before", U),
-}  # fmt: skip
+    "warmup": (warmup, "before", B),
+    "count_offset": (offset, "before", U),
+    "drift": (drift, "before", B),
+    "jump": (jump, "before", B),
+    "gain": (gain, "before", L),
+    "swap": (swap, "after", B),
+    "lowpass": (lowpass, "after", B),
+    "crosstalk": (crosstalk, "after", B),
+    "hum": (hum, "before", B),
+    "stuck": (stuck, "after", B),
+    "saturate": (saturate, "after", L),
+    "quantise": (quantise, "after", B),
+    "spikes": (spikes, "after", B),
+    "noise": (noise, "before", B),
+    "latency": (latency, "before", ("loaded+force",)),
+    "relax": (relax, "before", ("loaded+force",)),
+    "hyster": (hyster, "before", ("loaded+force",)),
+    "wander": (wander, "before", U),
+    "telegraph": (telegraph, "before", U),
+}
 OUTSIDE = {"wander", "telegraph"}
-ALSO = {"jump": {"drift", "gain"}, "gain": {"gain", "drift"}, "count_offset": {"count_offset", "count_gain"}, "drift": {"drift"}}
+ALSO = {
+    "jump": {"drift", "gain"},
+    "gain": {"gain", "drift"},
+    "count_offset": {"count_offset", "count_gain"},
+    "drift": {"drift"},
+}
 
 
 def make_case(effect, base, seed, with_force):
@@ -265,7 +321,14 @@ def make_case(effect, base, seed, with_force):
 
     def add_noise(x):
         # a straight line in counts, not the law of the sensor model
-        return x + level * np.interp(x, [500, 2000, 3400, 4000], [5.5, 6.5, 2.8, 1.0]) * rng.standard_normal(x.shape) if synthetic else x
+        return (
+            x
+            + level
+            * np.interp(x, [500, 2000, 3400, 4000], [5.5, 6.5, 2.8, 1.0])
+            * rng.standard_normal(x.shape)
+            if synthetic
+            else x
+        )
 
     if when == "after":
         e = np.rint(add_noise(e))
@@ -273,11 +336,17 @@ def make_case(effect, base, seed, with_force):
     if when == "before":
         e = add_noise(e)
     e = np.clip(np.rint(e), 0, 4095)
-    return e, force if with_force else None, rate, {"effect": effect, "channels": [int(k) for k in channels], "base": base}
+    return (
+        e,
+        force if with_force else None,
+        rate,
+        {"effect": effect, "channels": [int(k) for k in channels], "base": base},
+    )
 
 
 def hide(count, seeds, only=None, on=None, null=None):
-    """Yields (name, function that makes electrodes, force, rate, truth); null: how many without effect on each base, None: count."""
+    """Yields (name, function that makes electrodes, force, rate, truth); null: how many without effect on
+    each base, None: count."""
     for effect, (_, _, where) in EFFECTS.items():
         if only and effect not in only:
             continue

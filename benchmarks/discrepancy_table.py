@@ -12,7 +12,8 @@ _DETECTABLE = 10.0  # [nats per trajectory]
 
 
 def answer(row) -> str:
-    """The verdict in one word: the first name, "unknown" (also where names explain too little), or "no disagreement"."""
+    """The verdict in one word: the first name, "unknown" (also where names explain too little), or "no
+    disagreement"."""
     if row["verdict"].startswith("no significant"):
         return "no disagreement"
     return "unknown" if "unknown" in row["verdict"] or not row["named"] else row["named"][0]
@@ -38,36 +39,62 @@ def table(rows) -> str:
     for r in rows:
         by[r["kind"]].append(r)
     judged = [r for r in rows if r["kind"] != "left-out"]
-    given = [(r, k) for r in judged if answer(r) not in ("unknown", "no disagreement") for k in range(len(r["named"]))]
-    lines.append(f"a given name is right (ties count): {_share(sum(right(r, k) for r, k in given), len(given))}")
-    lines.append(f"  the name itself: {_share(sum(r['named'][k] in r['truth'] for r, k in given), len(given))}")
+    given = [
+        (r, k)
+        for r in judged
+        if answer(r) not in ("unknown", "no disagreement")
+        for k in range(len(r["named"]))
+    ]
+    lines.append(
+        f"a given name is right (ties count): {_share(sum(right(r, k) for r, k in given), len(given))}"
+    )
+    lines.append(
+        f"  the name itself: {_share(sum(r['named'][k] in r['truth'] for r, k in given), len(given))}"
+    )
     single = by["single"]
-    for what, some in (("all", single), ("10 nats per trajectory", [r for r in single if r["nats"] >= _DETECTABLE])):
-        lines.append(f"single, {what}: top-1 {_share(sum(r['named'][:1] == r['truth'] for r in some), len(some))}")
+    for what, some in (
+        ("all", single),
+        ("10 nats per trajectory", [r for r in single if r["nats"] >= _DETECTABLE]),
+    ):
+        lines.append(
+            f"single, {what}: top-1 {_share(sum(r['named'][:1] == r['truth'] for r in some), len(some))}"
+        )
         lines.append(f"  with ties {_share(sum(bool(r['named']) and right(r, 0) for r in some), len(some))}, "
                      f"exactly it {_share(sum(r['named'] == r['truth'] for r in some), len(some))}, "
                      f"abstained {_share(sum(answer(r) == 'unknown' for r in some), len(some))}")  # fmt: skip
         for name in ("least_rms", "bic"):
-            lines.append(f"  baseline {name}: {_share(sum([r[name]] == r['truth'] for r in some), len(some))}")
+            lines.append(
+                f"  baseline {name}: {_share(sum([r[name]] == r['truth'] for r in some), len(some))}"
+            )
     for kind in ("none", "wrong-base"):
         some = by[kind]
         named = [r for r in some if answer(r) not in ("unknown", "no disagreement")]
-        lines.append(f"{kind}: named something {_share(len(named), len(some))}, "
-                     f"unhedged {_share(sum(any(not t for t in r['ties']) for r in named), len(some))}, "
-                     f"unknown {_share(sum(answer(r) == 'unknown' for r in some), len(some))}; "
-                     f"BIC names {_share(sum(r['bic'] not in ('none', '') for r in some), len(some))}")  # fmt: skip
+        lines.append(
+            f"{kind}: named something {_share(len(named), len(some))}, "
+            f"unhedged {_share(sum(any(not t for t in r['ties']) for r in named), len(some))}, "
+            f"unknown {_share(sum(answer(r) == 'unknown' for r in some), len(some))}; "
+            f"BIC names {_share(sum(r['bic'] not in ('none', '') for r in some), len(some))}"
+        )
     for kind in ("outside", "left-out"):
         some = by[kind]
-        lines.append(f"{kind}: abstained {_share(sum(answer(r) == 'unknown' for r in some), len(some))}, "
-                     f"nothing seen {_share(sum(answer(r) == 'no disagreement' for r in some), len(some))}")  # fmt: skip
+        lines.append(
+            f"{kind}: abstained {_share(sum(answer(r) == 'unknown' for r in some), len(some))}, "
+            f"nothing seen {_share(sum(answer(r) == 'no disagreement' for r in some), len(some))}"
+        )
     pair = by["pair"]
-    lines.append(f"pairs: both {_share(sum(set(r['truth']) <= set(r['named']) for r in pair), len(pair))}, "
-                 f"exactly {_share(sum(set(r['truth']) == set(r['named']) for r in pair), len(pair))}, "
-                 f"at least one {_share(sum(bool(set(r['truth']) & set(r['named'])) for r in pair), len(pair))}")  # fmt: skip
+    lines.append(
+        f"pairs: both {_share(sum(set(r['truth']) <= set(r['named']) for r in pair), len(pair))}, "
+        f"exactly {_share(sum(set(r['truth']) == set(r['named']) for r in pair), len(pair))}, "
+        "at least one "
+        f"{_share(sum(bool(set(r['truth']) & set(r['named'])) for r in pair), len(pair))}"
+    )
     closed = [r["closed"] for r in single + pair if answer(r) not in ("unknown", "no disagreement")]
     if closed:
-        lines.append(f"gap closed on trajectories kept aside: median {np.median(closed):.0%}, quartiles {np.quantile(closed, 0.25):.0%} .. "
-                     f"{np.quantile(closed, 0.75):.0%}, of {len(closed)} cases with a name")  # fmt: skip
+        lines.append(
+            f"gap closed on trajectories kept aside: median {np.median(closed):.0%}, quartiles "
+            f"{np.quantile(closed, 0.25):.0%} .. "
+            f"{np.quantile(closed, 0.75):.0%}, of {len(closed)} cases with a name"
+        )
     for law, same in (("same law", True), ("another law", False)):
         inside = _covered(single, same)
         lines.append(f"95 % intervals, {law}: {_share(sum(inside), len(inside))}")
@@ -86,7 +113,8 @@ def _covered(rows, same):
 
 
 def reliability(rows) -> str:
-    """Brier score and expected calibration error of the stated confidence that a name is right, over names given."""
+    """Brier score and expected calibration error of the stated confidence that a name is right, over names
+    given."""
     pairs = [
         (c, r["named"][k] in r["truth"])
         for r in rows
@@ -97,11 +125,20 @@ def reliability(rows) -> str:
         return "confidence: no names"
     c, hit = np.array(pairs, float).T
     bins = np.clip((c * 5).astype(int), 0, 4)
-    error = sum(abs(c[bins == b].mean() - hit[bins == b].mean()) * (bins == b).mean() for b in range(5) if (bins == b).any())
-    shown = ", ".join(
-        f"{c[bins == b].mean():.2f} -> {hit[bins == b].mean():.2f} ({(bins == b).sum()})" for b in range(5) if (bins == b).any()
+    error = sum(
+        abs(c[bins == b].mean() - hit[bins == b].mean()) * (bins == b).mean()
+        for b in range(5)
+        if (bins == b).any()
     )
-    return f"confidence -> share right: {shown}; Brier {np.mean((c - hit) ** 2):.3f}, calibration error {error:.3f}"
+    shown = ", ".join(
+        f"{c[bins == b].mean():.2f} -> {hit[bins == b].mean():.2f} ({(bins == b).sum()})"
+        for b in range(5)
+        if (bins == b).any()
+    )
+    return (
+        f"confidence -> share right: {shown}; Brier {np.mean((c - hit) ** 2):.3f}, calibration error "
+        f"{error:.3f}"
+    )
 
 
 def confusion(rows, path):
@@ -110,7 +147,12 @@ def confusion(rows, path):
 
     truths = [*HIDDEN, *OUTSIDE, "none", "wrong-base"]
     shown = [r for r in rows if r["kind"] not in ("pair", "left-out")]
-    names = [*HIDDEN, *sorted({answer(r) for r in shown} - set(HIDDEN) - {"unknown", "no disagreement"}), "unknown", "no disagreement"]
+    names = [
+        *HIDDEN,
+        *sorted({answer(r) for r in shown} - set(HIDDEN) - {"unknown", "no disagreement"}),
+        "unknown",
+        "no disagreement",
+    ]
     matrix = np.zeros((len(truths), len(names)), int)
     for r in shown:
         matrix[truths.index(r["truth"][0] if r["truth"] else r["kind"]), names.index(answer(r))] += 1
@@ -126,6 +168,8 @@ def confusion(rows, path):
     ax.set_xlabel("first name given, or abstention")
     ax.set_ylabel("hidden (synthetic data)")
     tiers, seeds = ({r[k] for r in shown} for k in ("tier", "seeds"))
-    ax.set_title(f"{len(shown)} cases without pairs; seeds {', '.join(seeds)}; tier {', '.join(tiers)}", fontsize=9)
+    ax.set_title(
+        f"{len(shown)} cases without pairs; seeds {', '.join(seeds)}; tier {', '.join(tiers)}", fontsize=9
+    )
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

@@ -1,15 +1,18 @@
-"""Time per step of a Shadow Hand with 1 to 5 BioTacs, of which none, some or all touch something, for both tiers.
+"""Time per step of a Shadow Hand with 1 to 5 BioTacs, of which none, some or all touch something, for both
+tiers.
 
     MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands.json [--tiers condensed,full] [--steps 40]
 
-A ball of 10 mm radius that does not move is pushed 0.6 mm into the pad of each finger that touches; the hand is held by its servos, with
-no gravity. Milliseconds of processor time of the thread per mj_step of 4 ms, median and mean over the steps: the film of the electrodes is
-solved once per 10 ms, so in two of five steps. Beside it the hand alone.
-"""
+A ball of 10 mm radius that does not move is pushed 0.6 mm into the pad of each finger that touches; the hand
+is held by its servos, with no gravity. Milliseconds of processor time of the thread per mj_step of 4 ms,
+median and mean over the steps: the film of the electrodes is solved once per 10 ms, so in two of five steps.
+Beside it the hand alone."""
 
 import os
 
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+os.environ.update(
+    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
+)  # before numpy reads them
 
 import argparse
 import pathlib
@@ -66,8 +69,14 @@ def measure(hand, count, touching, tier, skin="coarse", steps=40) -> dict:
         seconds.append(time.thread_time() - begin)
     plugin.check()
     loaded = sum(np.linalg.norm(h.read(data, "contact_force")[:3]) > 0.01 for h in handles.values())
-    return {"sensors": count, "touching": int(loaded), "tier": tier if count else "none", "skin": skin,
-            "ms_median": 1e3 * float(np.median(seconds)), "ms_mean": 1e3 * float(np.mean(seconds))}  # fmt: skip
+    return {
+        "sensors": count,
+        "touching": int(loaded),
+        "tier": tier if count else "none",
+        "skin": skin,
+        "ms_median": 1e3 * float(np.median(seconds)),
+        "ms_mean": 1e3 * float(np.mean(seconds)),
+    }
 
 
 def main(arguments=None) -> int:
@@ -80,19 +89,26 @@ def main(arguments=None) -> int:
     options = parser.parse_args(arguments)
     root = os.environ.get("MENAGERIE_ROOT")
     if not root or not (pathlib.Path(root) / "shadow_hand").is_dir():
-        raise FileNotFoundError(f"no shadow_hand in MENAGERIE_ROOT={root}: set it to a clone of MuJoCo Menagerie")
+        raise FileNotFoundError(
+            f"no shadow_hand in MENAGERIE_ROOT={root}: set it to a clone of MuJoCo Menagerie"
+        )
     hand = pathlib.Path(root) / "shadow_hand" / "right_hand.xml"
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     print("| tier | sensors | touching | ms per step, median | mean |\n|---|---|---|---|---|")
     cases = [("condensed", 0, 0)]
     for tier in options.tiers.split(","):
-        cases += [(tier, n, 0) for n in range(1, options.most + 1)] + [(tier, options.most, k) for k in range(1, options.most + 1)]
+        cases += [(tier, n, 0) for n in range(1, options.most + 1)] + [
+            (tier, options.most, k) for k in range(1, options.most + 1)
+        ]
         cases += [(tier, n, n) for n in range(1, options.most)]
     for tier, count, touching in cases:
         rows.append(measure(hand, count, touching, tier, options.skin, options.steps))
         r = rows[-1]
-        print(f"| {r['tier']} | {r['sensors']} | {r['touching']} | {r['ms_median']:.2f} | {r['ms_mean']:.2f} |", flush=True)
+        print(
+            f"| {r['tier']} | {r['sensors']} | {r['touching']} | {r['ms_median']:.2f} | {r['ms_mean']:.2f} |",
+            flush=True,
+        )
         write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
     return 0
 

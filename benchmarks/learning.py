@@ -2,9 +2,8 @@
 
     python benchmarks/learning.py --weights forward-trajectory.safetensors [--device cuda] [--json FILE]
 
-On the CPU one thread and one sensor; processor time is given too, since a wall clock means little on a busy machine. On a GPU batches. The
-paper's network is timed with random weights: they do not change its time.
-"""
+On the CPU one thread and one sensor; processor time is given too, since a wall clock means little on a busy
+machine. On a GPU batches. The paper's network is timed with random weights: they do not change its time."""
 
 import argparse
 import functools
@@ -59,7 +58,11 @@ def main(argv=None):
     torch.set_num_threads(1)
     geometry, config = load_skin(args.skin), LearningConfig()
     model = load_forward(args.weights or shipped("forward"), geometry).to(args.device)
-    networks = {f"default ({model.meta['model']}, {model.meta['members']} members)": lambda u, a: model.log_change(u, a, 0.01)}
+    networks = {
+        f"default ({model.meta['model']}, {model.meta['members']} members)": lambda u, a: model.log_change(
+            u, a, 0.01
+        )
+    }
     if args.paper:
         levels = build_hierarchy(geometry.vert, geometry.tets, config.mesh_factors)
         paper = LatentProjection(MeshVAE(levels), ElectrodeVAE(), config).eval().to(args.device)
@@ -71,8 +74,17 @@ def main(argv=None):
             u = 0.05 * torch.randn(n, geometry.nvert, 3, device=args.device)
             average = torch.zeros(n, *model.memory, device=args.device) if model.window else None
             parts = 256 if name.startswith("paper") else n  # what fits beside its activations
-            wall, cpu = measure(functools.partial(in_parts, work, u, average, parts), args.device, 50 if n == 1 else 20)
-            rows.append({"network": name, "sensors": n, "us_per_sensor": 1e6 * wall / n, "processor_us_per_sensor": 1e6 * cpu / n})
+            wall, cpu = measure(
+                functools.partial(in_parts, work, u, average, parts), args.device, 50 if n == 1 else 20
+            )
+            rows.append(
+                {
+                    "network": name,
+                    "sensors": n,
+                    "us_per_sensor": 1e6 * wall / n,
+                    "processor_us_per_sensor": 1e6 * cpu / n,
+                }
+            )
             print(f"{name:<44}{n:>8}{1e6 * wall / n:>15.1f}{1e6 * cpu / n:>14.1f}")
     if args.json:
         about = {

@@ -1,14 +1,17 @@
-"""Locking of the skin's elements: linear and quadratic tetrahedra on the skins, Cook's membrane and an inflated thick sphere.
+"""Locking of the skin's elements: linear and quadratic tetrahedra on the skins, Cook's membrane and an
+inflated thick sphere.
 
-    python benchmarks/locking.py --json out/locking.json [--skins coarse,default,fine] [--press coarse] [--depth 1.0]
+    python benchmarks/locking.py --json out/locking.json [--skins coarse,default,fine] [--press coarse]
+    [--depth 1.0]
 
-Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y) that moves the patch by
-0.1 mm on the load's average, small strain, for each resolution and element: "quadratic" is the package's, "gauss" the same integrated at
-Gauss's points (C3D10), "nodal" linear tetrahedra with averaged nodal pressure. "reference" is "gauss" on the same body, refined once.
-Factor and solve seconds are those of the package's own factor (`skin.supernodal`): the price of a step is a few tens of solves.
---press adds real presses of a sphere.
-Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of scikit-fem. Sphere: Lame's closed form.
-"""
+Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y)
+  that moves the patch by
+0.1 mm on the load's average, small strain, for each resolution and element: "quadratic" is the package's,
+"gauss" the same integrated at Gauss's points (C3D10), "nodal" linear tetrahedra with averaged nodal pressure.
+"reference" is "gauss" on the same body, refined once. Factor and solve seconds are those of the package's own
+factor (`skin.supernodal`): the price of a step is a few tens of solves. --press adds real presses of a
+sphere. Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of
+scikit-fem. Sphere: Lame's closed form."""
 
 import argparse
 import dataclasses
@@ -51,43 +54,60 @@ def discretise(geometry, element, material, project=None):
         return geometry, nodal_pressure(geometry, material)
     geometry = with_edge_nodes(geometry, project) if geometry.element == "linear" else geometry
     points = {"contraction": 1.0} if element == "gauss" else {}
-    formulation = QuadraticTetrahedra(geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu"), **points)
+    formulation = QuadraticTetrahedra(
+        geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu"), **points
+    )
     return geometry, formulation.rest_stiffness(material.mu, material.lame)
 
 
 def refined(geometry):
-    """The same body, curved edges and held surface and all: each ten-node tetrahedron cut into eight, edge nodes where its map has them."""
+    """The same body, curved edges and held surface and all: each ten-node tetrahedron cut into eight, edge
+    nodes where its map has them."""
     barycentric = np.vstack([np.eye(4), np.eye(4)[EDGES].mean(1)])
     middle = barycentric[PARTS][:, EDGES].mean(2)  # (8 parts, 6 edges, 4)
-    shape = np.concatenate([middle * (2 * middle - 1), 4 * middle[..., EDGES[:, 0]] * middle[..., EDGES[:, 1]]], axis=2)
+    shape = np.concatenate(
+        [middle * (2 * middle - 1), 4 * middle[..., EDGES[:, 0]] * middle[..., EDGES[:, 1]]], axis=2
+    )
     fine = with_edge_nodes(dataclasses.replace(geometry, elem=geometry.tets))
     vert = fine.vert.copy()
-    vert[fine.elem.reshape(-1, 8, 10)[:, :, 4:]] = np.einsum("pmn,enk->epmk", shape, geometry.vert[geometry.elem])
+    vert[fine.elem.reshape(-1, 8, 10)[:, :, 4:]] = np.einsum(
+        "pmn,enk->epmk", shape, geometry.vert[geometry.elem]
+    )
     return dataclasses.replace(fine, vert=vert)
 
 
 def nodal_pressure(geometry, material):
-    """Stiffness at rest of linear tetrahedra whose dilatation is averaged at the nodes (Bonet and Burton 1998)."""
+    """Stiffness at rest of linear tetrahedra whose dilatation is averaged at the nodes (Bonet and Burton
+    1998)."""
     elem, (inverse, volume) = geometry.tets, rest_shape(geometry.vert, geometry.tets)
     gradient = np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
     size, cells = 3 * geometry.nvert, np.arange(len(elem))
     dof = (3 * elem[:, :, None] + np.arange(3)).ravel()
-    growth = sp.csr_matrix(((volume[:, None, None] * gradient).ravel(), (np.repeat(cells, 12), dof)), (len(elem), size))  # of each volume
-    share = sp.csr_matrix((np.full(elem.size, 0.25), (elem.ravel(), np.repeat(cells, 4))), (geometry.nvert, len(elem)))
+    growth = sp.csr_matrix(
+        ((volume[:, None, None] * gradient).ravel(), (np.repeat(cells, 12), dof)), (len(elem), size)
+    )  # of each volume
+    share = sp.csr_matrix(
+        (np.full(elem.size, 0.25), (elem.ravel(), np.repeat(cells, 4))), (geometry.nvert, len(elem))
+    )
     at_nodes = share @ growth
     pressures = material.bulk * at_nodes.T @ sp.diags(1 / (share @ volume)) @ at_nodes
-    return (rest_stiffness(geometry.nvert, elem, inverse, volume, material.mu, -2 / 3 * material.mu) + pressures).tocsc()
+    return (
+        rest_stiffness(geometry.nvert, elem, inverse, volume, material.mu, -2 / 3 * material.mu) + pressures
+    ).tocsc()
 
 
 def solve(stiffness, load, free, prescribed=None):
-    """Displacements (3 nvert,) under nodal loads with the coordinates outside `free` held at `prescribed`, by CHOLMOD."""
+    """Displacements (3 nvert,) under nodal loads with the coordinates outside `free` held at `prescribed`, by
+    CHOLMOD."""
     from cholespy import CholeskySolverD, MatrixType
 
     u = np.zeros(len(load)) if prescribed is None else prescribed.copy()
     u[free] = 0
     b = (load - stiffness @ u)[free]
     a = stiffness[free][:, free].tocoo()
-    factor = CholeskySolverD(a.shape[0], a.row.astype(np.int32), a.col.astype(np.int32), a.data, MatrixType.COO)
+    factor = CholeskySolverD(
+        a.shape[0], a.row.astype(np.int32), a.col.astype(np.int32), a.data, MatrixType.COO
+    )
     x = np.empty_like(b)
     factor.solve(b, x)
     u[free] = x
@@ -95,9 +115,11 @@ def solve(stiffness, load, free, prescribed=None):
 
 
 def solve_nodes(stiffness, load, vert, free):
-    """Displacements (nvert, 3) under nodal loads (nvert, 3), all but the nodes `free` held; seconds of the factor and of one solve.
+    """Displacements (nvert, 3) under nodal loads (nvert, 3), all but the nodes `free` held; seconds of the
+    factor and of one solve.
 
-    The factor is rounded: conjugate gradients, which it preconditions, go on until the residual is 1e-9 of the load.
+    The factor is rounded: conjugate gradients, which it preconditions, go on until the residual is 1e-9 of
+      the load.
     """
     dof = (3 * free[:, None] + np.arange(3)).ravel()
     a, b = stiffness[dof][:, dof], np.zeros_like(load)
@@ -118,11 +140,14 @@ def solve_nodes(stiffness, load, vert, free):
         r[free] -= alpha * q
         if np.linalg.norm(r) < 1e-9 * np.linalg.norm(b):
             return x, np.diff(times)
-    raise RuntimeError(f"the residual is still {np.linalg.norm(r) / np.linalg.norm(b):.1e} of the load after 50 iterations")
+    raise RuntimeError(
+        f"the residual is still {np.linalg.norm(r) / np.linalg.norm(b):.1e} of the load after 50 iterations"
+    )
 
 
 def patch_force(geometry, element, material):
-    """Force of the patch load that moves it by 0.1 mm on the load's average [N]; free coordinates; seconds of factor and solve."""
+    """Force of the patch load that moves it by 0.1 mm on the load's average [N]; free coordinates; seconds of
+    factor and solve."""
     geometry, stiffness = discretise(geometry, element, material)
     tri = geometry.vert[geometry.outer_face]
     area = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])[:, 1] / 2
@@ -139,12 +164,15 @@ def patch_force(geometry, element, material):
 
 
 def cook_tip(cells, element, nu):
-    """Cook's membrane as a plane strain slab of cells x cells x 1: how far the corner (48, 60) moves up under a load of 1, E 1."""
+    """Cook's membrane as a plane strain slab of cells x cells x 1: how far the corner (48, 60) moves up under
+    a load of 1, E 1."""
     thickness = 48 / cells
     vert, elem = box([np.linspace(0, 1, cells + 1)] * 2 + [[0, thickness]])
     flat = vert[:, 0].copy()
     vert[:, 0], vert[:, 1] = 48 * flat, 44 * flat + vert[:, 1] * (44 - 28 * flat)
-    geometry, stiffness = discretise(skin(vert, elem, [0], boundary(elem)), element, Material("linear", 1.0, nu))
+    geometry, stiffness = discretise(
+        skin(vert, elem, [0], boundary(elem)), element, Material("linear", 1.0, nu)
+    )
     load = np.zeros((geometry.nvert, 3))
     load[:, 1] = nodal_areas(geometry.vert, faces_on(geometry.vert, geometry.outer_face, 0, 48)) / 16
     moves = np.repeat(geometry.vert[:, :1] > 1e-9, 3, axis=1)
@@ -155,7 +183,8 @@ def cook_tip(cells, element, nu):
 
 
 def cook_reference(nu, cells=48):
-    """The same by Taylor-Hood triangles (quadratic displacement, continuous linear pressure) of scikit-fem, which do not lock."""
+    """The same by Taylor-Hood triangles (quadratic displacement, continuous linear pressure) of scikit-fem,
+    which do not lock."""
     import skfem
     from scipy.sparse import bmat
     from skfem.helpers import ddot, div, sym_grad
@@ -172,28 +201,40 @@ def cook_reference(nu, cells=48):
     right = skfem.FacetBasis(mesh, basis.elem, facets=mesh.facets_satisfying(lambda x: abs(x[0] - 48) < 1e-9))
     load = skfem.LinearForm(lambda v, w: v[1] / 16).assemble(right)
     held = basis.get_dofs(lambda x: abs(x[0]) < 1e-9).all()
-    solution = skfem.solve(*skfem.condense(bmat([[a, b.T], [b, c]], "csr"), np.concatenate([load, np.zeros(pressure.N)]), D=held))
+    solution = skfem.solve(
+        *skfem.condense(bmat([[a, b.T], [b, c]], "csr"), np.concatenate([load, np.zeros(pressure.N)]), D=held)
+    )
     corner = np.flatnonzero(np.linalg.norm(basis.doflocs.T - [48, 60], axis=1) < 1e-9)
     return solution[corner[1]]
 
 
 def sphere_growth(nu, element, subdivisions, layers, inner=6e-3, outer=10e-3, pressure=1e3, E=1e6):
-    """Relative errors of a thick sphere's growth under pressure at its inner and outer radius (Lame; Timoshenko and Goodier, 136)."""
+    """Relative errors of a thick sphere's growth under pressure at its inner and outer radius (Lame;
+    Timoshenko and Goodier, 136)."""
 
     def exact(r):
-        return pressure * inner**3 / (E * (outer**3 - inner**3)) * ((1 - 2 * nu) * r + (1 + nu) * outer**3 / (2 * r**2))
+        return (
+            pressure
+            * inner**3
+            / (E * (outer**3 - inner**3))
+            * ((1 - 2 * nu) * r + (1 + nu) * outer**3 / (2 * r**2))
+        )
 
     def onto(point, name):
         return point * (outer if name == "outer" else inner) / np.linalg.norm(point, axis=1, keepdims=True)
 
     vert, elem, face = shell(outer, inner, subdivisions, layers)
-    geometry, stiffness = discretise(skin(vert, elem, [0], inner_face=face), element, Material("linear", E, nu), onto)
+    geometry, stiffness = discretise(
+        skin(vert, elem, [0], inner_face=face), element, Material("linear", E, nu), onto
+    )
     vert, face = geometry.vert, geometry.inner_face
     edge = vert[face[:, 1:]] - vert[face[:, :1]]
     load = np.zeros_like(vert)
     np.add.at(load, face.ravel(), np.repeat(-pressure * np.cross(edge[:, 0], edge[:, 1]) / 6, 3, axis=0))
     radius = np.linalg.norm(vert, axis=1)
-    held = [np.linalg.norm(vert - outer * axis, axis=1).argmin() for axis in np.eye(3)]  # they go where they belong: no other force
+    held = [
+        np.linalg.norm(vert - outer * axis, axis=1).argmin() for axis in np.eye(3)
+    ]  # they go where they belong: no other force
     prescribed = (vert / radius[:, None] * exact(radius)[:, None]).ravel()
     free = (3 * np.setdiff1d(np.arange(len(vert)), held)[:, None] + np.arange(3)).ravel()
     u = solve(stiffness, load.ravel(), free, prescribed)
@@ -202,11 +243,14 @@ def sphere_growth(nu, element, subdivisions, layers, inner=6e-3, outer=10e-3, pr
 
 
 def press(name, element, preset, depth, steps=10, radius=3.5e-3):
-    """Presses a sphere of 3.5 mm radius along +y onto the pad at x = -10 mm: force [N], seconds, Newton iterations, steps that failed."""
+    """Presses a sphere of 3.5 mm radius along +y onto the pad at x = -10 mm: force [N], seconds, Newton
+    iterations, steps that failed."""
     model = SkinModel(load_skin(name), preset, SkinOptions(element=element))
     model.factor  # noqa: B018  made here, so that `seconds` is of the steps
     data, geoms = SkinData(model), GeomSet(["sphere"], [(radius,)], [model.material.friction])
-    point = np.einsum("sk,fkd->fsd", face_samples(8), model.geometry.vert[model.geometry.outer_face]).reshape(-1, 3)
+    point = np.einsum("sk,fkd->fsd", face_samples(8), model.geometry.vert[model.geometry.outer_face]).reshape(
+        -1, 3
+    )
     square = (point[:, 0] - PATCH_CENTER) ** 2 + point[:, 2] ** 2
     under = (point[:, 1] < 0) & (square < radius**2)
     first = (point[under, 1] - np.sqrt(radius**2 - square[under])).min()
@@ -219,9 +263,13 @@ def press(name, element, preset, depth, steps=10, radius=3.5e-3):
 
 
 def main(arguments=None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", default="out/locking.json")
-    parser.add_argument("--skins", default="coarse,default,fine", help="which; the reference of fine has 220 000 unknowns")
+    parser.add_argument(
+        "--skins", default="coarse,default,fine", help="which; the reference of fine has 220 000 unknowns"
+    )
     parser.add_argument("--press", default="", help="skins for real presses, comma separated")
     parser.add_argument("--depth", type=float, default=1.0, help="of the presses [mm]")
     options = parser.parse_args(arguments)
@@ -233,19 +281,36 @@ def main(arguments=None) -> int:
 
 def _skins(skins):
     rows = []
-    print(f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}{'solve ms':>10}{'force N':>10}{'error':>9}")
+    print(
+        f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}{'solve ms':>10}{'force N':>10}{'error':>9}"
+    )
     for label, (E, nu) in MATERIALS.items():
         for name in skins:
             wanted = None
             for element in ("reference", "linear", "nodal", "gauss", "quadratic"):
                 if (name, element) == ("fine", "nodal"):
                     continue
-                skin, kind = (refined(load_skin(name)), "gauss") if element == "reference" else (load_skin(name), element)
+                skin, kind = (
+                    (refined(load_skin(name)), "gauss")
+                    if element == "reference"
+                    else (load_skin(name), element)
+                )
                 force, unknowns, factor, once = patch_force(skin, kind, Material("neo_hookean", E, nu))
                 wanted = wanted or force
-                row = dict(material=label, nu=nu, skin=name, element=element, unknowns=unknowns, factor_s=factor, solve_s=once, force=force)
+                row = dict(
+                    material=label,
+                    nu=nu,
+                    skin=name,
+                    element=element,
+                    unknowns=unknowns,
+                    factor_s=factor,
+                    solve_s=once,
+                    force=force,
+                )
                 rows.append(row | {"error": force / wanted - 1})
-                cells = f"{unknowns:>9}{factor:>10.2f}{1e3 * once:>10.1f}{force:>10.5f}{force / wanted - 1:>9.1%}"
+                cells = (
+                    f"{unknowns:>9}{factor:>10.2f}{1e3 * once:>10.1f}{force:>10.5f}{force / wanted - 1:>9.1%}"
+                )
                 print(f"{label:<10}{name:<10}{element:<11}" + cells, flush=True)
     return rows
 
@@ -256,15 +321,27 @@ def _cook(nu=0.4999):
     for cells in (4, 8, 16):
         tips = {element: cook_tip(cells, element, nu) for element in ("linear", "quadratic")}
         rows.append(dict(cells=cells, reference=wanted, **tips))
-        print(f"{cells:>3} cells  " + "  ".join(f"{e} {tip:.3f} ({tip / wanted - 1:+.1%})" for e, tip in tips.items()), flush=True)
+        print(
+            f"{cells:>3} cells  "
+            + "  ".join(f"{e} {tip:.3f} ({tip / wanted - 1:+.1%})" for e, tip in tips.items()),
+            flush=True,
+        )
     return rows
 
 
 def _spheres():
     rows = []
-    print("\nThick sphere (radii 6 and 10 mm) under internal pressure, growth against Lame, at inner and outer radius")
+    print(
+        "\nThick sphere (radii 6 and 10 mm) under internal pressure, growth against Lame, at inner and "
+        "outer radius"
+    )
     for nu in (0.3, 0.4999):
-        for element, mesh in (("linear", (2, 2)), ("linear", (3, 4)), ("quadratic", (1, 1)), ("quadratic", (2, 2))):
+        for element, mesh in (
+            ("linear", (2, 2)),
+            ("linear", (3, 4)),
+            ("quadratic", (1, 1)),
+            ("quadratic", (2, 2)),
+        ):
             errors = sphere_growth(nu, element, *mesh)
             rows.append(dict(nu=nu, element=element, mesh=mesh, errors=errors.tolist()))
             text = f"nu {nu:<7}{element:<10}{20 * 4 ** mesh[0]:>5} facets x {mesh[1]} layers: "
@@ -278,7 +355,9 @@ def _presses(skins, depth):
         for preset in ("paper", "ansys"):
             for element in ("linear", "quadratic"):
                 force, seconds, iterations, lost = press(name, element, preset, 1e-3 * depth)
-                row = dict(skin=name, preset=preset, element=element, depth=depth, force=force, seconds=seconds)
+                row = dict(
+                    skin=name, preset=preset, element=element, depth=depth, force=force, seconds=seconds
+                )
                 rows.append(row | {"iterations": iterations, "not_converged": lost})
                 cells = f"{force:.4f} N  {seconds:.1f} s  {iterations} iterations  {lost} steps failed"
                 print(f"press {depth} mm  {name:<9}{preset:<7}{element:<10} " + cells, flush=True)

@@ -1,8 +1,8 @@
 """The peer: MuJoCo's own deformable, a flex on the same tetrahedra, pressed by a driven sphere in 2 ms steps.
 
-The settings are those with which it comes to quasi-static agreement: the "discrete" integrator, the CG solver, contact as stiff as
-it goes (direct solref, refsafe off). Its elasticity is Saint Venant-Kirchhoff's; it has neither liquid nor core contact here.
-"""
+The settings are those with which it comes to quasi-static agreement: the "discrete" integrator, the CG
+solver, contact as stiff as it goes (direct solref, refsafe off). Its elasticity is Saint Venant-Kirchhoff's;
+it has neither liquid nor core contact here."""
 
 import time
 
@@ -29,7 +29,8 @@ def press(geometry: SkinGeometry, material, radius: float, path: np.ndarray, dir
       direction: (3,) unit direction of the press.
 
     Returns:
-      ms_per_step, cpu_ms_per_step: wall and processor time of a step while the sphere moves; setup_s: of compiling the model;
+      ms_per_step, cpu_ms_per_step: wall and processor time of a step while the sphere moves; setup_s: of
+        compiling the model;
       steps: how many moved;
       force: (3,) of the skin on the sphere at the end [N].
     """
@@ -58,7 +59,11 @@ def model_xml(geometry, material, radius, center):
     def text(array):
         return " ".join(f"{v:.9g}" for v in np.ravel(array))
 
-    mass = material.density * np.linalg.det(geometry.vert[geometry.tets[:, 1:]] - geometry.vert[geometry.tets[:, :1]]).sum() / 6
+    mass = (
+        material.density
+        * np.linalg.det(geometry.vert[geometry.tets[:, 1:]] - geometry.vert[geometry.tets[:, :1]]).sum()
+        / 6
+    )
     friction = f'friction="{material.friction} 0 0"'
     return f"""
 <mujoco>

@@ -1,11 +1,12 @@
-"""A peer on the GPU: Newton's VBD soft body (vertex block descent) on the same linear tetrahedra, pressed by a driven sphere in 2 ms steps.
+"""A peer on the GPU: Newton's VBD soft body (vertex block descent) on the same linear tetrahedra, pressed by
+a driven sphere in 2 ms steps.
 
     python benchmarks/peer_newton.py [--device cuda:0] [--iterations 10,100,1000] [--worlds 1] [--json OUT]
 
-Its elasticity is stable Neo-Hooke with our Lame constants; contact is a penalty at the nodes, of `CONTACT` N/m each; it has neither liquid
-nor core contact here. Worlds are copies of the skin and its sphere in one model, far apart. The sphere is driven 1 mm, then held until the
-skin rests. `force` is the sum of the penalties, without friction. Newton is no requirement of this package: without it `VERSION` is None.
-"""
+Its elasticity is stable Neo-Hooke with our Lame constants; contact is a penalty at the nodes, of `CONTACT`
+N/m each; it has neither liquid nor core contact here. Worlds are copies of the skin and its sphere in one
+model, far apart. The sphere is driven 1 mm, then held until the skin rests. `force` is the sum of the
+penalties, without friction. Newton is no requirement of this package: without it `VERSION` is None."""
 
 import argparse
 import pathlib
@@ -32,7 +33,12 @@ APART = 0.1  # [m]
 
 
 @wp.kernel
-def drive(path: wp.array(dtype=wp.vec3), offset: wp.array(dtype=wp.vec3), count: wp.array(dtype=int), body_q: wp.array(dtype=wp.transform)):
+def drive(
+    path: wp.array(dtype=wp.vec3),
+    offset: wp.array(dtype=wp.vec3),
+    count: wp.array(dtype=int),
+    body_q: wp.array(dtype=wp.transform),
+):
     b = wp.tid()
     body_q[b] = wp.transform(path[wp.min(count[0], path.shape[0] - 1)] + offset[b], wp.quat_identity())
 
@@ -43,11 +49,14 @@ def advance(count: wp.array(dtype=int)):
 
 
 def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0") -> dict:
-    """Drives the sphere along path (n + 1, 3) [m], the first at first touch, one step for each point, then holds it.
+    """Drives the sphere along path (n + 1, 3) [m], the first at first touch, one step for each point, then
+    holds it.
 
     Returns:
-      ms_per_step: wall time of a step while the spheres move, of all worlds; steps: how many moved; setup_s: with compilation;
-      forces (n, worlds, 3) of the skin on the sphere in each step [N]; force: (3,) of the first world at the end [N].
+      ms_per_step: wall time of a step while the spheres move, of all worlds; steps: how many moved; setup_s:
+        with compilation;
+      forces (n, worlds, 3) of the skin on the sphere in each step [N]; force: (3,) of the first world at the
+      end [N].
     """
     begin = time.perf_counter()
     size = 1e-9  # of a node [m]
@@ -57,23 +66,38 @@ def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0
         for w in range(worlds):
             first = builder.particle_count
             builder.add_soft_mesh(
-                pos=wp.vec3(*offset[w]), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(0.0, 0.0, 0.0),
-                vertices=[wp.vec3(*v) for v in geometry.vert], indices=geometry.tets.ravel().tolist(), density=material.density,
-                k_mu=material.mu, k_lambda=material.lame, k_damp=0.0, particle_radius=size,
-            )  # fmt: skip
+                pos=wp.vec3(*offset[w]),
+                rot=wp.quat_identity(),
+                scale=1.0,
+                vel=wp.vec3(0.0, 0.0, 0.0),
+                vertices=[wp.vec3(*v) for v in geometry.vert],
+                indices=geometry.tets.ravel().tolist(),
+                density=material.density,
+                k_mu=material.mu,
+                k_lambda=material.lame,
+                k_damp=0.0,
+                particle_radius=size,
+            )
             for i in geometry.fixed:
                 builder.particle_mass[first + i] = 0.0
-            body = builder.add_body(xform=wp.transform(wp.vec3(*(path[0] + offset[w])), wp.quat_identity()), is_kinematic=True)
+            body = builder.add_body(
+                xform=wp.transform(wp.vec3(*(path[0] + offset[w])), wp.quat_identity()), is_kinematic=True
+            )
             config = newton.ModelBuilder.ShapeConfig(ke=CONTACT, kd=0.0, mu=material.friction)
             builder.add_shape_sphere(body, radius=radius, cfg=config)
         builder.color()
         model = builder.finalize()
         model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = CONTACT, 0.0, material.friction
-        solver = newton.solvers.SolverVBD(model, iterations=iterations, integrate_with_external_rigid_solver=True)
+        solver = newton.solvers.SolverVBD(
+            model, iterations=iterations, integrate_with_external_rigid_solver=True
+        )
         pipeline = newton.CollisionPipeline(model)
         contacts, control = pipeline.contacts(), model.control()
         now, then = model.state(), model.state()
-        points, shift = wp.array(path.astype(np.float32), dtype=wp.vec3), wp.array(offset.astype(np.float32), dtype=wp.vec3)
+        points, shift = (
+            wp.array(path.astype(np.float32), dtype=wp.vec3),
+            wp.array(offset.astype(np.float32), dtype=wp.vec3),
+        )
         count = wp.ones(1, dtype=int)
 
         def once(a, b):
@@ -122,11 +146,12 @@ def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0
 
 
 def time_newton(ours: dict, iterations: int, converged=None) -> dict:
-    """Newton's VBD on the mesh and path of one of our rows of linear elements, to where the core would be met; its row.
+    """Newton's VBD on the mesh and path of one of our rows of linear elements, to where the core would be
+    met; its row.
 
-    `force_error_rel` is against our force, to which its law and contact add; `force_error_own` against `converged`, its own press of
-    many iterations, (increments, 3) [N]: what stopping early costs, as our rows' error is.
-    """
+    `force_error_rel` is against our force, to which its law and contact add; `force_error_own` against
+    `converged`, its own press of many iterations, (increments, 3) [N]: what stopping early costs, as our
+    rows' error is."""
     from speed import INCREMENT, PEER_TRAVEL, RADIUS, standard_path
 
     from biotac_mj.geometry import load_skin
@@ -134,7 +159,9 @@ def time_newton(ours: dict, iterations: int, converged=None) -> dict:
 
     increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
     path, _ = standard_path(load_skin(ours["skin"]), increments)
-    result = press(load_skin(ours["skin"]), PRESETS["paper"], RADIUS, path, iterations, ours["worlds"], ours["device"])
+    result = press(
+        load_skin(ours["skin"]), PRESETS["paper"], RADIUS, path, iterations, ours["worlds"], ours["device"]
+    )
     wanted = np.array(ours["force"][:increments])
     force = result["forces"][:, 0]
 
@@ -183,7 +210,9 @@ def main():
     wp.config.log_level = wp.LOG_WARNING
     geometry = load_skin(options.skin)
     path, _ = standard_path(geometry, options.increments)
-    model = SkinModel(geometry, PRESETS["paper"], SkinOptions(element="linear", liquid=False, tolerance=1e-6, max_newton=60))
+    model = SkinModel(
+        geometry, PRESETS["paper"], SkinOptions(element="linear", liquid=False, tolerance=1e-6, max_newton=60)
+    )
     data, geoms = SkinData(model), GeomSet(["sphere"], [(RADIUS,)], [model.material.friction])
     geoms.set_pose(path[:1])
     ours = []
@@ -214,7 +243,12 @@ def main():
                     "force_ours_N": float(size),
                 }
             )
-            print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+            print(
+                "  ".join(
+                    f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()
+                ),
+                flush=True,
+            )
     if options.json:
         write_json(options.json, {"rows": rows})
 

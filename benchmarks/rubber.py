@@ -1,14 +1,18 @@
-"""Presses of the nearly incompressible preset to 2.4 mm with the full FEM: does every step find balance, and what does it cost?
+"""Presses of the nearly incompressible preset to 2.4 mm with the full FEM: does every step find balance, and
+what does it cost?
 
-    python benchmarks/rubber.py --json out/rubber.json [--skins coarse,default] [--indenters sphere_7mm,cube_14mm] [--material ansys]
+    python benchmarks/rubber.py --json out/rubber.json [--skins coarse,default] [--indenters
+    sphere_7mm,cube_14mm] [--material ansys]
 
-At x = -12 mm on the pad's midline, along the inward normal, steps of 0.1 mm. iterations: of Newton, all steps. seconds: processor time of
-the skin's steps alone. least det F: at the integration points, over all steps. in core: the deepest corner of an inner face.
-"""
+At x = -12 mm on the pad's midline, along the inward normal, steps of 0.1 mm. iterations: of Newton, all
+steps. seconds: processor time of the skin's steps alone. least det F: at the integration points, over all
+steps. in core: the deepest corner of an inner face."""
 
 import os
 
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+os.environ.update(
+    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
+)  # before numpy reads them
 
 import argparse
 import functools
@@ -32,17 +36,25 @@ LOCATION, STEP = (-12e-3, 0.0), 10e-3  # [m, rad]; [s], at 10 mm/s
 
 
 def shape(model, data, vert_xpos) -> tuple[float, float]:
-    """Least det F at the integration points of a skin at vert_xpos (nvert, 3), and how deep its inner faces are in the core [m]."""
+    """Least det F at the integration points of a skin at vert_xpos (nvert, 3), and how deep its inner faces
+    are in the core [m]."""
     view(data.x)[:, 0] = vert_xpos
     model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
     face = model.core_surface.face
     depth = wp.zeros((len(face), 1), dtype=wp.float64, device=model.device)
-    wp.launch(clearance.deepest_corner, dim=depth.shape, inputs=[face, model.core(1).struct, data.x], outputs=[depth])
+    wp.launch(
+        clearance.deepest_corner,
+        dim=depth.shape,
+        inputs=[face, model.core(1).struct, data.x],
+        outputs=[depth],
+    )
     return float(model.elasticity.smallest_jacobian(data.elastic)[0]), float(depth.numpy().max())
 
 
 @functools.cache
-def press(skin: str, indenter: str, material: str = "ansys", depth: float = 2.4e-3, timestep: float = STEP) -> dict:
+def press(
+    skin: str, indenter: str, material: str = "ansys", depth: float = 2.4e-3, timestep: float = STEP
+) -> dict:
     """Force [N] and pressure [Pa] by step, what the steps cost, and the worst shape of the skin."""
     record, results, seconds = run("full", skin, indenter, LOCATION, material, depth, timestep)
     model = SkinModel(record.geometry, PRESETS[material])
@@ -65,7 +77,9 @@ def press(skin: str, indenter: str, material: str = "ansys", depth: float = 2.4e
 
 
 def main(arguments=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", required=True, help="file to write")
     parser.add_argument("--skins", default="coarse,default")
     parser.add_argument("--indenters", default="sphere_7mm,cube_14mm")
@@ -74,15 +88,18 @@ def main(arguments=None) -> None:
     wp.config.quiet = True
     rows = []
     print(
-        "| skin | indenter | force N | iterations | not converged | seconds | slowest step s | least det F | in core um |\n|" + 9 * "---|"
+        "| skin | indenter | force N | iterations | not converged | seconds | slowest step s | least det F "
+        "| in core um |\n|" + 9 * "---|"
     )
     for skin in options.skins.split(","):
         for indenter in options.indenters.split(","):
             r = press(skin, indenter, options.material)
             rows.append(r)
             print(
-                f"| {skin} | {indenter} | {r['force_N'][-1]:.2f} | {r['iterations']} | {r['not_converged']} of {r['steps']} "
-                f"| {r['seconds']:.1f} | {r['slowest_step_s']:.1f} | {r['least_jacobian']:.2f} | {r['deepest_in_core_um']:.0f} |",
+                f"| {skin} | {indenter} | {r['force_N'][-1]:.2f} | {r['iterations']} | {r['not_converged']} "
+                f"of {r['steps']} "
+                f"| {r['seconds']:.1f} | {r['slowest_step_s']:.1f} | {r['least_jacobian']:.2f} | "
+                f"{r['deepest_in_core_um']:.0f} |",
                 flush=True,
             )
             write_json(options.json, rows)

@@ -1,23 +1,31 @@
 """Speed of the standard press, and MuJoCo's own flex on the same mesh and press beside it.
 
     python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine] [--no-peer]
-    python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine --worlds 1,16,128,1024,4096
+    python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine --worlds
+    1,16,128,1024,4096
 
-The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of the outer surface
-there, the paper's constants, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the core; with liquid and
-without. A CPU run is held to one core. Kernels are compiled and the factor is made before the clock starts (`setup_s` is the
-model and its factor); what is timed is the first press of a fresh skin, with every cost that a user's press has. `cpu_ms_per_press`
+The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of
+  the outer surface
+there, the paper's constants, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the
+core; with liquid and without. A CPU run is held to one core. Kernels are compiled and the factor is made
+before the clock starts (`setup_s` is the model and its factor); what is timed is the first press of a fresh
+skin, with every cost that a user's press has. `cpu_ms_per_press`
 is the processor time of the same press: where it is well below the wall time, other programs shared the core.
 
-force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press solved on the CPU in double
-precision to a tolerance of 1e-6: what stopping early and, on a GPU, single precision cost, not what the mesh costs.
-mb_per_world: device memory that a world of the batch takes; what the model takes once is `mb_model`. A row that does not fit says so.
+force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press
+  solved on the CPU in double
+precision to a tolerance of 1e-6: what stopping early and, on a GPU, single precision cost, not what the mesh
+costs.
+mb_per_world: device memory that a world of the batch takes; what the model takes once is `mb_model`. A row
+  that does not fit says so.
 For the condensed tier F_tight is the full tier's press of the row above (docs/condensed.md says more).
 """
 
 import os
 
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+os.environ.update(
+    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
+)  # before numpy reads them
 
 import argparse
 import functools
@@ -71,7 +79,8 @@ COLUMNS = (
 
 
 def standard_path(geometry: SkinGeometry, increments: int = INCREMENTS) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of the sphere (increments + 1, 3) [m], the first at first touch, and the unit direction (3,) of the press."""
+    """Centres of the sphere (increments + 1, 3) [m], the first at first touch, and the unit direction (3,) of
+    the press."""
     point, normal = surface_point(geometry, PLACE, 0.0)
     center = point + (RADIUS + 1e-3) * normal
     for _ in range(200):  # the gap is never more than the way left
@@ -90,10 +99,13 @@ def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarr
     """One press in all worlds.
 
     Returns:
-      forces (increments, worlds, 3) [N], wall and processor seconds (increments, 2), number of steps that did not converge.
+      forces (increments, worlds, 3) [N], wall and processor seconds (increments, 2), number of steps that did
+      not converge.
     """
     data = SkinData(model, worlds)
-    geoms = GeomSet(["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device))
+    geoms = GeomSet(
+        ["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device)
+    )
     geoms.set_pose(path[:1])
     force, seconds = [], []
     for center in path[1:]:
@@ -130,7 +142,8 @@ def _model(skin, element, liquid, device, tolerance):
 
 @functools.cache
 def _tight(skin, element, liquid, increments, folder=None):
-    """Forces (increments, 1, 3) of the same press solved tightly in double precision on the CPU, and steps that did not converge.
+    """Forces (increments, 1, 3) of the same press solved tightly in double precision on the CPU, and steps
+    that did not converge.
 
     Where a folder is named they are kept there for the next run.
     """
@@ -138,7 +151,9 @@ def _tight(skin, element, liquid, increments, folder=None):
     if file and file.exists():
         with np.load(file) as kept:
             return kept["force"], int(kept["lost"])
-    force, _, lost = press(_model(skin, element, liquid, "cpu", TIGHT)[0], standard_path(load_skin(skin), increments)[0])
+    force, _, lost = press(
+        _model(skin, element, liquid, "cpu", TIGHT)[0], standard_path(load_skin(skin), increments)[0]
+    )
     if file:
         file.parent.mkdir(parents=True, exist_ok=True)
         partial = file.with_suffix(".part.npz")
@@ -153,7 +168,9 @@ def _used(device) -> int:
         return 0
     import torch
 
-    return wp.get_mempool_used_mem_current(device) + torch.cuda.memory_allocated(wp.device_to_torch(wp.get_device(device)))
+    return wp.get_mempool_used_mem_current(device) + torch.cuda.memory_allocated(
+        wp.device_to_torch(wp.get_device(device))
+    )
 
 
 def _per_world(model, worlds) -> float:
@@ -164,7 +181,9 @@ def _per_world(model, worlds) -> float:
 
     before = _used(str(model.device))
     data = SkinData(model, worlds)
-    geoms = GeomSet(["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device))
+    geoms = GeomSet(
+        ["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device)
+    )
     prepare_device(model, data, geoms)
     return (_used(str(model.device)) - before) / worlds
 
@@ -225,7 +244,8 @@ def time_skin(
 
 
 def time_condensed(ours: dict) -> dict:
-    """The condensed tier on the press of one of our rows; its row, with errors against the forces of that row."""
+    """The condensed tier on the press of one of our rows; its row, with errors against the forces of that
+    row."""
     geometry = load_skin(ours["skin"])
     path, _ = standard_path(geometry, ours["increments"])
     model = SkinModel(geometry, PRESETS["paper"], SkinOptions(element=ours["element"], liquid=ours["liquid"]))
@@ -244,7 +264,9 @@ def time_condensed(ours: dict) -> dict:
     def make():
         return CondensedSkin(model, GeomSet(["sphere"], [(RADIUS,)], [model.material.friction]))
 
-    make().solve(Memory.rest(1), path[1:2], mat)  # compiles, and computes the compliance where it is not yet on disk
+    make().solve(
+        Memory.rest(1), path[1:2], mat
+    )  # compiles, and computes the compliance where it is not yet on disk
     begin = time.perf_counter()
     skin = make()
     setup = time.perf_counter() - begin
@@ -333,12 +355,26 @@ def main(arguments=None) -> int:
     parser.add_argument("--device", default="cpu", help="cpu, or a CUDA device of Warp such as cuda:0")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
     parser.add_argument("--skins", default="default", help=f"comma-separated: {', '.join(SKINS)}")
-    parser.add_argument("--elements", default="quadratic,linear", help="comma-separated: quadratic (the default), linear (the paper's)")
+    parser.add_argument(
+        "--elements",
+        default="quadratic,linear",
+        help="comma-separated: quadratic (the default), linear (the paper's)",
+    )
     parser.add_argument("--worlds", default="1", help="comma-separated numbers of skins solved together")
-    parser.add_argument("--tolerances", default=str(SkinOptions.tolerance), help="comma-separated tolerances of the solver")
+    parser.add_argument(
+        "--tolerances", default=str(SkinOptions.tolerance), help="comma-separated tolerances of the solver"
+    )
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
-    parser.add_argument("--references", type=pathlib.Path, help="folder that keeps the tight presses that errors are measured against")
-    parser.add_argument("--no-peer", action="store_true", help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out")
+    parser.add_argument(
+        "--references",
+        type=pathlib.Path,
+        help="folder that keeps the tight presses that errors are measured against",
+    )
+    parser.add_argument(
+        "--no-peer",
+        action="store_true",
+        help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out",
+    )
     options = parser.parse_args(arguments)
     skins = options.skins.split(",")
     if unknown := [skin for skin in skins if skin not in SKINS]:
@@ -359,31 +395,54 @@ def main(arguments=None) -> int:
         for element, liquid in itertools.product(options.elements.split(","), (False, True)):
             for tolerance in map(float, options.tolerances.split(",")):
                 for worlds in map(int, options.worlds.split(",")):
-                    row = time_skin(skin, element, liquid, options.device, worlds, options.increments, tolerance, options.references)
+                    row = time_skin(
+                        skin,
+                        element,
+                        liquid,
+                        options.device,
+                        worlds,
+                        options.increments,
+                        tolerance,
+                        options.references,
+                    )
                     rows.append({**row, "machine": machine})
                     _print_row(rows[-1])
                 if "largest_nworld" in rows[-1]:
-                    print(f"  model {rows[-1]['mb_model']:.0f} MB; the largest nworld here: {rows[-1]['largest_nworld']}", flush=True)
+                    print(
+                        f"  model {rows[-1]['mb_model']:.0f} MB; the largest nworld here: "
+                        f"{rows[-1]['largest_nworld']}",
+                        flush=True,
+                    )
             _model.cache_clear()
     if options.device == "cpu":
         for ours in [row for row in rows if row["worlds"] == 1]:
             rows.append({**time_condensed(ours), "machine": machine})
             _print_row(rows[-1])
     if not options.no_peer and options.device == "cpu":
-        for ours in [row for row in rows if (row["element"], row["liquid"], row["worlds"], row["tier"]) == ("linear", False, 1, "full")]:
+        for ours in [
+            row
+            for row in rows
+            if (row["element"], row["liquid"], row["worlds"], row["tier"]) == ("linear", False, 1, "full")
+        ]:
             peer = {**time_peer(ours), "machine": machine}
             mine = np.mean(ours["wall_and_cpu_ms_of_steps"][: peer["steps"]], axis=0)  # over the same travel
             peer["ratio_ms_per_step"] = peer["ms_per_step"] / mine[0]
             peer["ratio_cpu"] = peer["cpu_ms_per_press"] / peer["increments"] / mine[1]
             _print_row(peer)
             print(
-                f"  flex after {1e3 * peer['travel_m']:.2f} mm, held until it rests: {peer['force_N']:.3f} N, "
+                f"  flex after {1e3 * peer['travel_m']:.2f} mm, held until it rests: {peer['force_N']:.3f} "
+                "N, "
                 f"ours {peer['force_ours_N']:.3f} N (its force_error_rel is against ours)\n"
-                f"  flex / ours over this travel: {peer['ratio_ms_per_step']:.1f} in wall time, {peer['ratio_cpu']:.1f} in processor time"
+                f"  flex / ours over this travel: {peer['ratio_ms_per_step']:.1f} in wall time, "
+                f"{peer['ratio_cpu']:.1f} in processor time"
             )
             rows.append(peer)
     if not options.no_peer and options.device != "cpu":
-        mine = [row for row in rows if (row["element"], row["liquid"], row["worlds"]) == ("linear", False, 1) and "force" in row]
+        mine = [
+            row
+            for row in rows
+            if (row["element"], row["liquid"], row["worlds"]) == ("linear", False, 1) and "force" in row
+        ]
         if peer_newton.VERSION is None:
             print("Newton is not installed: its peer is left out")
             mine = []

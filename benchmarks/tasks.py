@@ -1,15 +1,17 @@
 """Scores of the tasks: their scripted controllers, which act on touch alone, and a random policy, over seeds.
 
-    python benchmarks/tasks.py --json out/tasks.json [--tasks press,lift] [--policies scripted,random] [--seeds 20]
-    python benchmarks/tasks.py --markdown out/tasks.json [out/more.json ...]
+    python benchmarks/tasks.py --json out/tasks.json [--tasks press,lift] [--policies scripted,random]
+    [--seeds 20] python benchmarks/tasks.py --markdown out/tasks.json [out/more.json ...]
 
-The score of an episode is its mean reward per step (0 to 1); solved: the mean over its last second is at least 0.8. Episodes that the JSON
-file already holds are not run again, so an interrupted run goes on where it was. Seconds are processor time of the thread per episode.
-"""
+The score of an episode is its mean reward per step (0 to 1); solved: the mean over its last second is at
+least 0.8. Episodes that the JSON file already holds are not run again, so an interrupted run goes on where it
+was. Seconds are processor time of the thread per episode."""
 
 import os
 
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads them
+os.environ.update(
+    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
+)  # before numpy reads them
 
 import argparse
 import json
@@ -53,7 +55,10 @@ def episode(env, controller, seed) -> dict:
 
 def table(rows) -> str:
     """Markdown: one line per task."""
-    lines = ["| task | scripted: score | solved | random: score | solved | seeds | processor s | not converged |", "|" + "---|" * 8]
+    lines = [
+        "| task | scripted: score | solved | random: score | solved | seeds | processor s | not converged |",
+        "|" + "---|" * 8,
+    ]
     for domain, task in suite.tasks():
         cells, counts, seconds, failed = [], [], [], 0
         for policy in ("scripted", "random"):
@@ -67,7 +72,10 @@ def table(rows) -> str:
             seconds.append(f"{np.mean([r['seconds'] for r in found]):.1f}")
             failed += sum(r["failed_steps"] for r in found)
             cells += [f"{np.mean(score):.2f} +- {np.std(score):.2f}", f"{100 * solved:.0f} %"]
-        lines.append(f"| {domain}/{task} | {' | '.join(cells)} | {', '.join(counts)} | {', '.join(seconds)} | {failed} |")
+        lines.append(
+            f"| {domain}/{task} | {' | '.join(cells)} | {', '.join(counts)} | {', '.join(seconds)} | "
+            f"{failed} |"
+        )
     return "\n".join(lines)
 
 
@@ -84,9 +92,14 @@ def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, help="file to write, and to go on from")
     parser.add_argument(
-        "--markdown", type=pathlib.Path, nargs="+", help="print the table of these files and stop; of a task in two, the last counts"
+        "--markdown",
+        type=pathlib.Path,
+        nargs="+",
+        help="print the table of these files and stop; of a task in two, the last counts",
     )
-    parser.add_argument("--tasks", default=",".join(task for _, task in suite.tasks()), help="comma-separated")
+    parser.add_argument(
+        "--tasks", default=",".join(task for _, task in suite.tasks()), help="comma-separated"
+    )
     parser.add_argument("--policies", default="scripted,random", help="comma-separated")
     parser.add_argument("--seeds", type=int, default=20)
     options = parser.parse_args(arguments)
@@ -101,13 +114,28 @@ def main(arguments=None) -> int:
     for task in options.tasks.split(","):
         if task not in known:
             raise ValueError(f"no task {task!r}: choose from {', '.join(known)}")
-        todo = [(p, s) for s in range(options.seeds) for p in options.policies.split(",") if (task, p, s) not in done]
+        todo = [
+            (p, s)
+            for s in range(options.seeds)
+            for p in options.policies.split(",")
+            if (task, p, s) not in done
+        ]
         if not todo:
             continue
         env = suite.load(known[task], task)
         for policy, seed in tqdm(todo, desc=task):
-            controller = make_controller(task, env) if policy == "scripted" else Random(env.action_spec(), seed)
-            rows.append({"domain": known[task], "task": task, "policy": policy, "seed": seed, **episode(env, controller, seed)})
+            controller = (
+                make_controller(task, env) if policy == "scripted" else Random(env.action_spec(), seed)
+            )
+            rows.append(
+                {
+                    "domain": known[task],
+                    "task": task,
+                    "policy": policy,
+                    "seed": seed,
+                    **episode(env, controller, seed),
+                }
+            )
             write_json(options.json, {"rows": rows})
         env.close()
     print(table(rows))

@@ -1,10 +1,11 @@
-"""A SynTouch BioTac fingertip in MuJoCo: a finite-element skin stepped inside `mj_step`, and its 19 electrodes by physics.
+"""A SynTouch BioTac fingertip in MuJoCo: a finite-element skin stepped inside `mj_step`, and its 19
+electrodes by physics.
 
     spec = mujoco.MjSpec.from_file("scene.xml")
     handle = biotac_mj.attach(spec, ...)
 
-Importing registers the MuJoCo engine plugin and nothing heavy: the names below load their modules when they are first used.
-"""
+Importing registers the MuJoCo engine plugin and nothing heavy: the names below load their modules when they
+are first used."""
 
 import importlib
 import os
@@ -13,10 +14,15 @@ import warnings
 try:
     import mujoco as _mujoco  # noqa: F401
 except (AttributeError, ImportError, OSError, RuntimeError) as error:
-    # MuJoCo loads the GL library that MUJOCO_GL names while it is imported. A missing one must not stop the physics.
+    # MuJoCo loads the GL library that MUJOCO_GL names while it is imported. A missing one must not stop the
+    # physics.
     if not os.environ.get("MUJOCO_GL") or isinstance(error, ModuleNotFoundError):
         raise
-    warnings.warn(f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({error}): going on without MuJoCo's renderer", stacklevel=2)
+    warnings.warn(
+        f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({error}): going on without MuJoCo's "
+        "renderer",
+        stacklevel=2,
+    )
     os.environ["MUJOCO_GL"] = "disable"
     import mujoco as _mujoco  # noqa: F401
 

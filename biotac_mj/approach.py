@@ -1,4 +1,5 @@
-"""Where an indenter meets the resting skin: points and normals of its surface, and the way to first touch by casting rays."""
+"""Where an indenter meets the resting skin: points and normals of its surface, and the way to first touch by
+casting rays."""
 
 import mujoco
 import numpy as np
@@ -7,12 +8,14 @@ from .geometry.skin_geometry import SkinGeometry
 
 __all__ = ["first_touch", "nearest_point", "surface_point"]
 
-# radius over which a normal is averaged [m]: about two edges of the default skin, so that it is the finger's and not one triangle's
+# radius over which a normal is averaged [m]: about two edges of the default skin, so that it is the finger's
+# and not one triangle's
 _PATCH = 1.5e-3
 
 
 def _hits(tri, origin, direction):
-    """Distances (m,) along a ray to the triangles tri (m, 3, 3), inf where it misses (Moeller and Trumbore, 1997)."""
+    """Distances (m,) along a ray to the triangles tri (m, 3, 3), inf where it misses (Moeller and Trumbore,
+    1997)."""
     a, ab, ac = tri[:, 0], tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]
     p = np.cross(direction, ac)
     det = np.einsum("ij,ij->i", ab, p)
@@ -27,7 +30,8 @@ def _hits(tri, origin, direction):
 
 
 def _closest(tri, point):
-    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: the foot on the plane if inside, else the best of the three edges."""
+    """Closest points (m, 3) of triangles tri (m, 3, 3) to a point: the foot on the plane if inside, else the
+    best of the three edges."""
     a, b, c = tri[:, 0], tri[:, 1], tri[:, 2]
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -73,13 +77,16 @@ def surface_point(geometry: SkinGeometry, x: float, angle: float):
     distance = _hits(tri, np.array([x, 0.0, 0.0]) + reach * outward, -outward).min()
     if distance >= reach:
         low, high = 1e3 * tri[..., 0].min(), 1e3 * tri[..., 0].max()
-        raise ValueError(f"no skin at x = {1e3 * x:g} mm: it reaches from {low:.1f} to {high:.1f} mm; choose x inside")
+        raise ValueError(
+            f"no skin at x = {1e3 * x:g} mm: it reaches from {low:.1f} to {high:.1f} mm; choose x inside"
+        )
     point = np.array([x, 0.0, 0.0]) + (reach - distance) * outward
     return point, _normal_at(tri, point)
 
 
 def nearest_point(geometry: SkinGeometry, position):
-    """The point of the outer surface that is nearest to position (3,) [m], and its unit outward normal (3,)."""
+    """The point of the outer surface that is nearest to position (3,) [m], and its unit outward normal
+    (3,)."""
     tri = geometry.vert[geometry.outer_face]
     candidates = _closest(tri, np.asarray(position, float))
     point = candidates[np.linalg.norm(candidates - position, axis=1).argmin()]
@@ -94,18 +101,24 @@ def _split(tri):
 
 
 def first_touch(
-    geometry: SkinGeometry, model: mujoco.MjModel, data: mujoco.MjData, direction, resolution: float = 2e-5, keep: int = 48
+    geometry: SkinGeometry,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    direction,
+    resolution: float = 2e-5,
+    keep: int = 48,
 ) -> float:
     """How far the geoms of a model travel along a direction until they first touch the resting skin.
 
-    Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split again and again, so that the
-    touch is found inside faces too.
+    Rays go from the skin's faces against the direction to the geoms; the faces nearest to a geom are split
+    again and again, so that the touch is found inside faces too.
 
     Args:
       geometry: the skin, in the world frame of the model.
       model, data: hold the indenter's geoms and nothing else, placed before the skin, `mj_forward` done.
       direction: of travel (3,).
-      resolution: the nearest faces are split down to this edge [m]; on a sphere of radius r the touch is found to resolution^2 / r.
+      resolution: the nearest faces are split down to this edge [m]; on a sphere of radius r the touch is
+        found to resolution^2 / r.
       keep: how many of them are split each time.
 
     Returns:
@@ -134,5 +147,7 @@ def first_touch(
             break
         tri = _split(tri)
     if not np.isfinite(best):
-        raise ValueError("the indenter passes the skin without touching it: change the location or the direction")
+        raise ValueError(
+            "the indenter passes the skin without touching it: change the location or the direction"
+        )
     return float(best)

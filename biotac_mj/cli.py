@@ -1,4 +1,5 @@
-"""The `biotac` command: one verb per job. The work of a verb lives beside this file and is loaded when the verb is used."""
+"""The `biotac` command: one verb per job. The work of a verb lives beside this file and is loaded when the
+verb is used."""
 
 import argparse
 import sys
@@ -6,7 +7,10 @@ import sys
 __all__ = ["main", "parser"]
 
 # Names that the help shows without loading what defines them (tests hold them together).
-INDENTERS = "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm cube_14mm ring_7mm".split()
+INDENTERS = (
+    "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm "
+    "cube_14mm ring_7mm"
+).split()
 TIERS = ("full", "condensed")
 MATERIALS = ("default", "paper", "rubber", "ansys")
 SKINS = ("coarse", "default", "fine")
@@ -24,11 +28,13 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
 
 
 _INDENTER_HELP = (
-    f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's sphere, capsule, cylinder, "
+    f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's "
+    "sphere, capsule, cylinder, "
     "ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres"
 )
 _LOCATION_HELP = (
-    "where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X Y Z, moved to the nearest point "
+    "where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X "
+    "Y Z, moved to the nearest point "
     "of the skin. BioTac frame: tip at -x, pad at -y, nail at +y"
 )
 
@@ -59,39 +65,88 @@ def _verb(verbs, name, run, text):
 
 
 def _add_skin(verb, seed="of the sensor's noise"):
-    verb.add_argument("--skin", default="default", help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`")
-    verb.add_argument("--tier", default="full", choices=TIERS, help="full finite elements, or the condensed skin for real time on one core")
+    verb.add_argument(
+        "--skin",
+        default="default",
+        help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`",
+    )
+    verb.add_argument(
+        "--tier",
+        default="full",
+        choices=TIERS,
+        help="full finite elements, or the condensed skin for real time on one core",
+    )
     verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
     verb.add_argument(
-        "--liquid", action=argparse.BooleanOptionalAction, default=None, help="liquid under the skin (default: the material's choice)"
+        "--liquid",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="liquid under the skin (default: the material's choice)",
     )
     verb.add_argument("--seed", type=int, default=0, help=seed)
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
 
 
 def _add_press(verbs):
-    verb = _verb(verbs, "press", _press, "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.")
+    verb = _verb(
+        verbs,
+        "press",
+        _press,
+        "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.",
+    )
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=_INDENTER_HELP)
     verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM", help=_LOCATION_HELP)
     verb.add_argument(
-        "--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="of the press (default: inward normal of the skin there)"
+        "--direction",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="of the press (default: inward normal of the skin there)",
     )
     verb.add_argument("--depth", type=float, default=2.4, metavar="MM", help="travel from first touch")
-    verb.add_argument("--slide", type=float, default=0.0, metavar="MM", help="travel along the skin after the press")
-    verb.add_argument("--slide-direction", type=float, nargs=3, default=[1.0, 0.0, 0.0], metavar=("X", "Y", "Z"), help="of the slide")
+    verb.add_argument(
+        "--slide", type=float, default=0.0, metavar="MM", help="travel along the skin after the press"
+    )
+    verb.add_argument(
+        "--slide-direction",
+        type=float,
+        nargs=3,
+        default=[1.0, 0.0, 0.0],
+        metavar=("X", "Y", "Z"),
+        help="of the slide",
+    )
     verb.add_argument("--speed", type=float, default=10.0, metavar="MM/S", help="of press and slide")
-    verb.add_argument("--hold", type=float, default=20.0, metavar="MS", help="rest at the end of press and slide")
+    verb.add_argument(
+        "--hold", type=float, default=20.0, metavar="MS", help="rest at the end of press and slide"
+    )
     verb.add_argument("--timestep", type=float, default=4.0, metavar="MS", help="of MuJoCo")
     ways = verb.add_mutually_exclusive_group()
-    ways.add_argument("--one-way", dest="two_way", action="store_false", default=False, help="the indenter's path is prescribed (default)")
     ways.add_argument(
-        "--two-way", dest="two_way", action="store_true", default=False, help="a servo with mass pushes the indenter and gives way"
+        "--one-way",
+        dest="two_way",
+        action="store_false",
+        default=False,
+        help="the indenter's path is prescribed (default)",
     )
-    verb.add_argument("--mu", type=float, default=None, help="friction between skin and indenter (default: the material's)")
+    ways.add_argument(
+        "--two-way",
+        dest="two_way",
+        action="store_true",
+        default=False,
+        help="a servo with mass pushes the indenter and gives way",
+    )
+    verb.add_argument(
+        "--mu", type=float, default=None, help="friction between skin and indenter (default: the material's)"
+    )
     _add_skin(verb)
     verb.add_argument("--out", default="out/press", metavar="DIR", help="folder of the results")
-    verb.add_argument("--render", action=argparse.BooleanOptionalAction, default=True,
-                      help="MuJoCo's render in press.png; without it, or without a GL library, matplotlib draws the surfaces")  # fmt: skip
+    verb.add_argument(
+        "--render",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="MuJoCo's render in press.png; without it, or without a GL library, matplotlib "
+        "draws the surfaces",
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -125,14 +180,19 @@ def _press(args):
         device=args.device,
     )
     _calm_warp()
-    record, picture = press.press(options, render=press.render if args.render else None, progress=not args.quiet)
+    record, picture = press.press(
+        options, render=press.render if args.render else None, progress=not args.quiet
+    )
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
     write_readings(record, files[0])
     write_skin(record, files[1])
     press_report.write_picture(record, files[2], picture)
     if args.render and picture is None:
-        print("no GL library works here: press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)")
+        print(
+            "no GL library works here: press.png shows the surfaces drawn by matplotlib (libosmesa6 or "
+            "libegl1 would do)"
+        )
     print(press_report.table(record, files))
 
 
@@ -141,14 +201,29 @@ def _add_view(verbs):
         verbs,
         "view",
         _view,
-        "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag with ctrl and right button.",
+        "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag "
+        "with ctrl and right button.",
     )
     _add_skin(verb)
-    verb.add_argument("--render", metavar="FILE", help="write a picture of the ball lying on the pad instead of opening a window")
+    verb.add_argument(
+        "--render",
+        metavar="FILE",
+        help="write a picture of the ball lying on the pad instead of opening a window",
+    )
     verb.add_argument("--seconds", type=float, default=0.3, help="how long to simulate before --render")
-    verb.add_argument("--hand", metavar="FILE", help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead")
-    verb.add_argument("--web", action="store_true", help="a page in the browser with skin, electrodes and traces (extra web)")
-    verb.add_argument("--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation")
+    verb.add_argument(
+        "--hand",
+        metavar="FILE",
+        help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead",
+    )
+    verb.add_argument(
+        "--web",
+        action="store_true",
+        help="a page in the browser with skin, electrodes and traces (extra web)",
+    )
+    verb.add_argument(
+        "--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation"
+    )
     verb.add_argument("--port", type=int, default=8080, help="of the page")
 
 
@@ -173,9 +248,15 @@ def _view(args):
 
 
 def _add_import_mesh(verbs):
-    verb = _verb(verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin.")
+    verb = _verb(
+        verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
+    )
     verb.add_argument("path", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file")
-    verb.add_argument("--out", metavar="FILE.npz", help="where to store it (default: PATH's name with .npz, in the current folder)")
+    verb.add_argument(
+        "--out",
+        metavar="FILE.npz",
+        help="where to store it (default: PATH's name with .npz, in the current folder)",
+    )
 
 
 def _import_mesh(args):
@@ -204,24 +285,88 @@ def _import_mesh(args):
 
 
 def _add_calibrate(verbs):
-    verb = _verb(verbs, "calibrate", _calibrate, "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.")
-    verb.add_argument("data", nargs="?", metavar="DATA", help="CSV of the indentation (docs/calibration.md), or skin.h5 of a press")
-    verb.add_argument("--synthetic", action="store_true", help="instead of DATA: our own skin of --truth pressed and slid, with --noise")
-    verb.add_argument("--truth", default="rubber", help="material of the synthetic skin; a preset, its liquid with it")
-    verb.add_argument("--truth-skin", default="default", help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight")
-    verb.add_argument("--truth-liquid", action=argparse.BooleanOptionalAction, default=None, help="(default: as the preset --truth has it)")
-    verb.add_argument("--noise", type=float, default=0.01, metavar="N", help="of each synthetic force component, standard deviation")
+    verb = _verb(
+        verbs,
+        "calibrate",
+        _calibrate,
+        "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.",
+    )
+    verb.add_argument(
+        "data",
+        nargs="?",
+        metavar="DATA",
+        help="CSV of the indentation (docs/calibration.md), or skin.h5 of a press",
+    )
+    verb.add_argument(
+        "--synthetic",
+        action="store_true",
+        help="instead of DATA: our own skin of --truth pressed and slid, with --noise",
+    )
+    verb.add_argument(
+        "--truth", default="rubber", help="material of the synthetic skin; a preset, its liquid with it"
+    )
+    verb.add_argument(
+        "--truth-skin",
+        default="default",
+        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight",
+    )
+    verb.add_argument(
+        "--truth-liquid",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="(default: as the preset --truth has it)",
+    )
+    verb.add_argument(
+        "--noise",
+        type=float,
+        default=0.01,
+        metavar="N",
+        help="of each synthetic force component, standard deviation",
+    )
     verb.add_argument("--seed", type=int, default=0, help="of that noise")
-    verb.add_argument("--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {_INDENTER_HELP}")
-    verb.add_argument("--direction", type=float, nargs=3, metavar=("X", "Y", "Z"), help="the indenter's tip points there (default: +y)")
-    verb.add_argument("--configuration", default="shell_with_core", choices=CONFIGURATIONS, help="what is fitted")
-    verb.add_argument("--skin", default="coarse", help=f"its mesh: {', '.join(SKINS)}, or a file; solids come as coarse")
-    verb.add_argument("--correct", action="store_true", help="correct the fit by the mesh refined: the material, not the mesh's stiffness")
-    verb.add_argument("--material", default="paper", help=f"law and starting values: {', '.join(MATERIALS)}, or a calibration's JSON")
-    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid under the skin; matters for E and nu")
-    verb.add_argument("--fit", nargs="+", default=["E", "nu", "mu"], metavar="NAME[:LOW:HIGH]", help="parameters, with bounds if you like")
+    verb.add_argument(
+        "--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {_INDENTER_HELP}"
+    )
+    verb.add_argument(
+        "--direction",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="the indenter's tip points there (default: +y)",
+    )
+    verb.add_argument(
+        "--configuration", default="shell_with_core", choices=CONFIGURATIONS, help="what is fitted"
+    )
+    verb.add_argument(
+        "--skin", default="coarse", help=f"its mesh: {', '.join(SKINS)}, or a file; solids come as coarse"
+    )
+    verb.add_argument(
+        "--correct",
+        action="store_true",
+        help="correct the fit by the mesh refined: the material, not the mesh's stiffness",
+    )
+    verb.add_argument(
+        "--material",
+        default="paper",
+        help=f"law and starting values: {', '.join(MATERIALS)}, or a calibration's JSON",
+    )
+    verb.add_argument(
+        "--liquid",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="liquid under the skin; matters for E and nu",
+    )
+    verb.add_argument(
+        "--fit",
+        nargs="+",
+        default=["E", "nu", "mu"],
+        metavar="NAME[:LOW:HIGH]",
+        help="parameters, with bounds if you like",
+    )
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
-    verb.add_argument("--out", default="out/calibrate", metavar="DIR", help="folder of calibration.json and calibration.png")
+    verb.add_argument(
+        "--out", default="out/calibrate", metavar="DIR", help="folder of calibration.json and calibration.png"
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -233,18 +378,50 @@ def _calibrate(args):
 
 
 def _add_compare(verbs):
-    verb = _verb(verbs, "compare", _compare, "Compare the paper's four configurations with a reference over many indentations.")
-    verb.add_argument("--configurations", nargs="+", default=list(CONFIGURATIONS), choices=CONFIGURATIONS, metavar="NAME", help="which")
-    verb.add_argument("--data", nargs="+", metavar="INDENTER=FILE", help="measured indentations, not our stand-in; the first calibrates")
-    verb.add_argument("--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which")
+    verb = _verb(
+        verbs,
+        "compare",
+        _compare,
+        "Compare the paper's four configurations with a reference over many indentations.",
+    )
+    verb.add_argument(
+        "--configurations",
+        nargs="+",
+        default=list(CONFIGURATIONS),
+        choices=CONFIGURATIONS,
+        metavar="NAME",
+        help="which",
+    )
+    verb.add_argument(
+        "--data",
+        nargs="+",
+        metavar="INDENTER=FILE",
+        help="measured indentations, not our stand-in; the first calibrates",
+    )
+    verb.add_argument(
+        "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which"
+    )
     verb.add_argument("--count", type=int, default=1, help="random indentations for each indenter")
     verb.add_argument("--seed", type=int, default=0, help="of the indentations")
-    verb.add_argument("--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it")
+    verb.add_argument(
+        "--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it"
+    )
     verb.add_argument("--reference-skin", default="coarse", help="mesh of the stand-in")
-    verb.add_argument("--reference-element", default="quadratic", choices=("linear", "quadratic"), help="elements of the stand-in")
+    verb.add_argument(
+        "--reference-element",
+        default="quadratic",
+        choices=("linear", "quadratic"),
+        help="elements of the stand-in",
+    )
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
-    verb.add_argument("--material", help="given to all configurations, preset or a calibration's JSON (default: each is calibrated first)")
-    verb.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells")
+    verb.add_argument(
+        "--material",
+        help="given to all configurations, preset or a calibration's JSON (default: each is calibrated "
+        "first)",
+    )
+    verb.add_argument(
+        "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
+    )
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
     verb.add_argument("--out", default="out/compare", metavar="DIR", help="folder of compare.json")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -264,20 +441,59 @@ def _add_learning(verbs):
 
 
 def _add_generate(verbs):
-    verb = _verb(verbs, "generate", _generate, "Make a synthetic data set of random interactions; goes on where it was interrupted.")
+    verb = _verb(
+        verbs,
+        "generate",
+        _generate,
+        "Make a synthetic data set of random interactions; goes on where it was interrupted.",
+    )
     verb.add_argument("--count", type=int, default=2600, help="interactions")
     verb.add_argument("--steps", type=int, default=20, help="time steps of each")
     verb.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="of the time steps")
-    verb.add_argument("--labelled", type=int, help="of them, how many get the synthetic measured sensor's counts too (default: 359)")
-    verb.add_argument("--recordings", type=int, default=0, help="further interactions of which only the synthetic sensor's counts are kept")
-    verb.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches")
-    verb.add_argument("--kinds", nargs="+", default=list(INTERACTIONS), choices=INTERACTIONS, metavar="KIND", help="how it moves")
-    verb.add_argument("--element", choices=("linear", "quadratic"), help="of the skin (default: the material's, or the mesh's)")
-    verb.add_argument("--batch", type=int, default=160, help="worlds at most that are solved together; a shard holds one batch")
-    verb.add_argument("--measured-batch", type=int, default=90, help="the same where the synthetic measured sensor takes part")
+    verb.add_argument(
+        "--labelled",
+        type=int,
+        help="of them, how many get the synthetic measured sensor's counts too (default: 359)",
+    )
+    verb.add_argument(
+        "--recordings",
+        type=int,
+        default=0,
+        help="further interactions of which only the synthetic sensor's counts are kept",
+    )
+    verb.add_argument(
+        "--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches"
+    )
+    verb.add_argument(
+        "--kinds",
+        nargs="+",
+        default=list(INTERACTIONS),
+        choices=INTERACTIONS,
+        metavar="KIND",
+        help="how it moves",
+    )
+    verb.add_argument(
+        "--element",
+        choices=("linear", "quadratic"),
+        help="of the skin (default: the material's, or the mesh's)",
+    )
+    verb.add_argument(
+        "--batch",
+        type=int,
+        default=160,
+        help="worlds at most that are solved together; a shard holds one batch",
+    )
+    verb.add_argument(
+        "--measured-batch",
+        type=int,
+        default=90,
+        help="the same where the synthetic measured sensor takes part",
+    )
     verb.add_argument("--measured-seed", type=int, default=0, help="number of the synthetic measured sensor")
     verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
-    verb.add_argument("--workers", type=int, help="processes that compute electrode readings (default: one per core)")
+    verb.add_argument(
+        "--workers", type=int, help="processes that compute electrode readings (default: one per core)"
+    )
     _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
     verb.add_argument("--out", default="out/set", metavar="DIR", help="folder of the set")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -291,22 +507,50 @@ def _generate(args):
 
 
 def _add_diagnose(verbs):
-    verb = _verb(verbs, "diagnose", _diagnose, "Name what the simulation misses in measured data; writes report.html and verdict.json.")
-    verb.add_argument("data", nargs="?", metavar="DATA", help="HDF5 of measured trajectories (docs/discrepancy.md)")
-    verb.add_argument("--sensor", metavar="FILE.yaml", help="the simulator that is compared with DATA (default: our own sensor)")
-    verb.add_argument("--electrodes", metavar="FILE", help="plain recording instead: text, 19 columns of raw counts, one row per sample")
-    verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
-    verb.add_argument("--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row")
-    verb.add_argument(
-        "--rate", type=float, default=None, metavar="HZ", help="rows per second (default: guessed from repeated rows, else 100)"
+    verb = _verb(
+        verbs,
+        "diagnose",
+        _diagnose,
+        "Name what the simulation misses in measured data; writes report.html and verdict.json.",
     )
-    kept = "of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
+    verb.add_argument(
+        "data", nargs="?", metavar="DATA", help="HDF5 of measured trajectories (docs/discrepancy.md)"
+    )
+    verb.add_argument(
+        "--sensor",
+        metavar="FILE.yaml",
+        help="the simulator that is compared with DATA (default: our own sensor)",
+    )
+    verb.add_argument(
+        "--electrodes",
+        metavar="FILE",
+        help="plain recording instead: text, 19 columns of raw counts, one row per sample",
+    )
+    verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
+    verb.add_argument(
+        "--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row"
+    )
+    verb.add_argument(
+        "--rate",
+        type=float,
+        default=None,
+        metavar="HZ",
+        help="rows per second (default: guessed from repeated rows, else 100)",
+    )
+    kept = (
+        "of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of "
+        "the trajectories)"
+    )
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
     verb.add_argument(
-        "--in-skin", action="store_true", help="constitutive effects inside the finite elements (full tier) in the proof"
+        "--in-skin",
+        action="store_true",
+        help="constitutive effects inside the finite elements (full tier) in the proof",
     )
-    verb.add_argument("--device", default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0")
+    verb.add_argument(
+        "--device", default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
+    )
     verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -319,19 +563,38 @@ def _diagnose(args):
 
 
 def _add_data(verbs):
-    verb = _verb(verbs, "import-data", _import_data, "Read recordings of real sensors into a set: NVIDIA's HDF5, Ruppel's CSV, plain text.")
+    verb = _verb(
+        verbs,
+        "import-data",
+        _import_data,
+        "Read recordings of real sensors into a set: NVIDIA's HDF5, Ruppel's CSV, plain text.",
+    )
     verb.add_argument("files", nargs="+", metavar="FILE", help="of one format")
-    verb.add_argument("--format", choices=("nvidia", "ruppel", "text"), help="(default: by the ending: .hdf5, .csv, others text)")
+    verb.add_argument(
+        "--format",
+        choices=("nvidia", "ruppel", "text"),
+        help="(default: by the ending: .hdf5, .csv, others text)",
+    )
     verb.add_argument("--force", metavar="FILE", help="text: forces beside it, 3 columns [N]")
     verb.add_argument("--rate", type=float, metavar="HZ", help="nvidia, text: of the samples (default: 100)")
-    verb.add_argument("--block", type=float, metavar="S", help="text: cut the log into interactions of this length")
+    verb.add_argument(
+        "--block", type=float, metavar="S", help="text: cut the log into interactions of this length"
+    )
     verb.add_argument("--object", metavar="NAME", help="ruppel, text: what touched")
-    verb.add_argument("--objects", nargs="+", metavar="NAME", help="nvidia: names of indenter types 0, 1, ...")
+    verb.add_argument(
+        "--objects", nargs="+", metavar="NAME", help="nvidia: names of indenter types 0, 1, ..."
+    )
     verb.add_argument("--seed", type=int, default=0, help="of the split by interaction")
     verb.add_argument("--out", required=True, metavar="DIR", help="folder of the set")
-    verb = _verb(verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0.")
+    verb = _verb(
+        verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
+    )
     verb.add_argument("set", metavar="SET", help="folder of shards")
-    verb.add_argument("--measured", action="store_true", help="measured counts, of interactions that have them, not simulated ones")
+    verb.add_argument(
+        "--measured",
+        action="store_true",
+        help="measured counts, of interactions that have them, not simulated ones",
+    )
     verb.add_argument("--out", required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 

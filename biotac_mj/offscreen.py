@@ -1,8 +1,8 @@
 """Pictures without a window: MuJoCo's renderer on whichever GL library works here.
 
-`mujoco.Renderer` is bound to the library that MUJOCO_GL named when mujoco was imported. Here the library is looked for when it is
-needed, and tried in a process of its own first, because a broken one may take the process with it.
-"""
+`mujoco.Renderer` is bound to the library that MUJOCO_GL named when mujoco was imported. Here the library is
+looked for when it is needed, and tried in a process of its own first, because a broken one may take the
+process with it."""
 
 import contextlib
 import functools
@@ -31,7 +31,12 @@ context.free()
 def _works(gl):
     environ = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     try:
-        return subprocess.run([sys.executable, "-c", _PROBE, gl], env=environ, capture_output=True, timeout=60).returncode == 0
+        return (
+            subprocess.run(
+                [sys.executable, "-c", _PROBE, gl], env=environ, capture_output=True, timeout=60
+            ).returncode
+            == 0
+        )
     except (OSError, subprocess.TimeoutExpired):
         return False
 
@@ -39,12 +44,14 @@ def _works(gl):
 def find_gl() -> str | None:
     """The GL library to render with: "egl", "osmesa" or "cgl"; None where there is none.
 
-    MUJOCO_GL=egl and MUJOCO_GL=osmesa allow only that one, MUJOCO_GL=disable none, all else tries what the system may have.
-    """
+    MUJOCO_GL=egl and MUJOCO_GL=osmesa allow only that one, MUJOCO_GL=disable none, all else tries what the
+    system may have."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     if asked in ("disable", "disabled", "off", "false", "0"):
         return None
-    candidates = [asked] if asked in ("egl", "osmesa") else ["cgl"] if sys.platform == "darwin" else ["egl", "osmesa"]
+    candidates = (
+        [asked] if asked in ("egl", "osmesa") else ["cgl"] if sys.platform == "darwin" else ["egl", "osmesa"]
+    )
     return next((gl for gl in candidates if _works(gl)), None)
 
 
@@ -52,7 +59,8 @@ class Offscreen:
     """A GL context and a scene of one model; a context manager.
 
     Args:
-      model: whose `vis.global_.offwidth` and `offheight` bound the picture; raised here if they are too small.
+      model: whose `vis.global_.offwidth` and `offheight` bound the picture; raised here if they are too
+        small.
       width, height: of the picture [pixel].
       gl: what `find_gl` answered.
 
@@ -62,7 +70,9 @@ class Offscreen:
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, gl: str | None):
         if gl is None:
-            raise ValueError("no GL library to render with: install libosmesa6 or libegl1, or unset MUJOCO_GL")
+            raise ValueError(
+                "no GL library to render with: install libosmesa6 or libegl1, or unset MUJOCO_GL"
+            )
         model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(height, model.vis.global_.offheight)
         self.model, self.rect = model, mujoco.MjrRect(0, 0, width, height)
@@ -83,11 +93,15 @@ class Offscreen:
     def __exit__(self, *exc_info):
         self._stack.close()
 
-    def render(self, data: mujoco.MjData, camera: mujoco.MjvCamera, option: mujoco.MjvOption | None = None) -> np.ndarray:
+    def render(
+        self, data: mujoco.MjData, camera: mujoco.MjvCamera, option: mujoco.MjvOption | None = None
+    ) -> np.ndarray:
         """Draws the model as it is in data, with what its plugins show; returns (height, width, 3) uint8."""
         self._context.make_current()
         option = option or mujoco.MjvOption()
-        mujoco.mjv_updateScene(self.model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        mujoco.mjv_updateScene(
+            self.model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
         mujoco.mjr_render(self.rect, self._scene, self._mjr)
         pixels = np.empty((self.rect.height, self.rect.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self.rect, self._mjr)

@@ -19,7 +19,8 @@ __all__ = ["Path", "PressOptions", "build_scene", "plan_path", "press", "render"
 
 _LEAD = 5e-6  # the indenter starts this far before first touch [m]
 _PREFIX = "biotac_"
-# The servo of a two-way press: 50 kN/m gives way by 0.02 mm per newton; with this mass it moves at 200 rad/s, slow against a 4 ms step.
+# The servo of a two-way press: 50 kN/m gives way by 0.02 mm per newton; with this mass it moves at 200 rad/s,
+# slow against a 4 ms step.
 _SERVO_STIFFNESS, _SERVO_MASS = 5e4, 1.25
 
 
@@ -29,7 +30,8 @@ class PressOptions:
 
     Attributes:
       indenter: see `press_indenter.make_indenter`.
-      location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the skin.
+      location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the
+        skin.
       direction: of the press (3,); None is the inward normal of the skin at the location.
       depth: travel from first touch [m].
       slide: travel along slide_direction after the press [m].
@@ -71,7 +73,10 @@ class PressOptions:
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
         if len(self.location) not in (2, 3):
-            raise ValueError(f"location {self.location} has {len(self.location)} numbers: give x and an angle, or x, y and z")
+            raise ValueError(
+                f"location {self.location} has {len(self.location)} numbers: give x and an angle, or x, y "
+                "and z"
+            )
         for name in ("location", "direction", "slide_direction"):
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
@@ -112,10 +117,12 @@ def _rotation_from_y(direction):
 
 
 def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options: PressOptions) -> Path:
-    """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the depth, then along the skin.
+    """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the
+    depth, then along the skin.
 
     Raises:
-      ValueError: no skin at the location, an indenter that passes it, a direction out of the skin, or a slide along the direction.
+      ValueError: no skin at the location, an indenter that passes it, a direction out of the skin, or a slide
+        along the direction.
     """
     if len(options.location) == 2:
         point, normal = approach.surface_point(geometry, *options.location)
@@ -125,7 +132,8 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
     direction = direction / np.linalg.norm(direction)
     if direction @ normal >= 0:
         raise ValueError(
-            f"direction {direction.round(3).tolist()} leaves the skin at {(1e3 * point).round(2).tolist()} mm: it must point into it"
+            f"direction {direction.round(3).tolist()} leaves the skin at {(1e3 * point).round(2).tolist()} "
+            "mm: it must point into it"
         )
     across = np.asarray(options.slide_direction, float)
     across = across - (across @ direction) * direction
@@ -136,7 +144,9 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
     quat = _rotation_from_y(direction)
     spec = mujoco.MjSpec()
     back = 0.05 + np.abs(indenter.vert).max()  # clear of the finger
-    press_indenter.add_indenter(spec, spec.worldbody.add_body(pos=point - back * direction, quat=quat), indenter, exact=False)
+    press_indenter.add_indenter(
+        spec, spec.worldbody.add_body(pos=point - back * direction, quat=quat), indenter, exact=False
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -152,14 +162,21 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
     rest = np.zeros(int(round(options.hold / options.timestep)))
     down, along = ramp(options.depth), ramp(options.slide)
     depth = np.concatenate(
-        [[-_LEAD], down, rest + options.depth, 0 * along + options.depth, (rest if options.slide else rest[:0]) + options.depth]
+        [
+            [-_LEAD],
+            down,
+            rest + options.depth,
+            0 * along + options.depth,
+            (rest if options.slide else rest[:0]) + options.depth,
+        ]
     )
     slid = np.concatenate([[0], 0 * down, rest, along, (rest if options.slide else rest[:0]) + options.slide])
     return Path(start, quat, direction, across, depth, slid)
 
 
 def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOptions):
-    """The BioTac on a fixed body, the indenter on a mocap body or, two-way, on slide joints with servos; a camera named "press".
+    """The BioTac on a fixed body, the indenter on a mocap body or, two-way, on slide joints with servos; a
+    camera named "press".
 
     Returns:
       spec, and the handle of `biotac_mj.attach`.
@@ -179,15 +196,22 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
     _stage(spec)
     spec.worldbody.add_body(name="finger")
 
-    body = spec.worldbody.add_body(name="indenter", pos=path.position(-_LEAD), quat=path.quat, mocap=not options.two_way)
+    body = spec.worldbody.add_body(
+        name="indenter", pos=path.position(-_LEAD), quat=path.quat, mocap=not options.two_way
+    )
     look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 0.35])
     if options.two_way:
         if indenter.type == "plane":
-            raise ValueError("a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: press it one-way, or use a flat geom:box")
+            raise ValueError(
+                "a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: press it one-way, or use a "
+                "flat geom:box"
+            )
         body.mass, body.inertia, body.explicitinertial = _SERVO_MASS, [1e-3] * 3, True
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, path.quat)
-        for name, axis in (("press", path.direction), ("slide", path.slide_direction))[: 2 if options.slide else 1]:
+        for name, axis in (("press", path.direction), ("slide", path.slide_direction))[
+            : 2 if options.slide else 1
+        ]:
             body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=rotation.reshape(3, 3).T @ axis)
             servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             servo.set_to_position(kp=_SERVO_STIFFNESS, dampratio=1.0)
@@ -212,7 +236,8 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
 
 
 def see_through(spec, handle):
-    """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are seen."""
+    """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are
+    seen."""
     spec.skin(handle.prefix + "skin").rgba[3] = 0.45
     for i in range(1, 20):
         spec.site(f"{handle.prefix}e{i}").size[0] = 7e-4
@@ -227,11 +252,25 @@ def _stage(spec):
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
     spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
-    spec.worldbody.add_light(pos=[-0.1, -0.3, -0.1], dir=[0.6, 0.9, -0.1], diffuse=[0.5] * 3, specular=[0.1] * 3,
-                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)  # fmt: skip
-    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = 0.35, 0.35, 0.05
+    spec.worldbody.add_light(
+        pos=[-0.1, -0.3, -0.1],
+        dir=[0.6, 0.9, -0.1],
+        diffuse=[0.5] * 3,
+        specular=[0.1] * 3,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False,
+    )
+    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = (
+        0.35,
+        0.35,
+        0.05,
+    )
     sky = spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, width=8, height=48
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        width=8,
+        height=48,
     )
     sky.rgb1, sky.rgb2 = [1.0] * 3, [1.0] * 3
 
@@ -284,14 +323,26 @@ def press(options: PressOptions = PressOptions(), render=None, progress: bool = 
             data.mocap_pos[0] = path.position(*travel)
             mujoco.mj_step(model, data)
         plugin.check()
-        rows.append((data.time, travel[0], path.position(*travel), handle.vert_xpos(model, data), *_read(handle, data)))
+        rows.append(
+            (
+                data.time,
+                travel[0],
+                path.position(*travel),
+                handle.vert_xpos(model, data),
+                *_read(handle, data),
+            )
+        )
     seconds = time.perf_counter() - begin
     if render is not None:
         picture = render(model, data)
     times, depth, position, xpos, force, counts, nonconverged = (np.array(column) for column in zip(*rows))
     record = PressRecord(
         geometry=geometry,
-        parameters={**dataclasses.asdict(options), "direction": path.direction.tolist(), "start": path.start.tolist()},
+        parameters={
+            **dataclasses.asdict(options),
+            "direction": path.direction.tolist(),
+            "start": path.start.tolist(),
+        },
         time=times,
         depth=depth,
         force=force,

@@ -29,7 +29,8 @@ class Indenter:
       size: MuJoCo's sizes [m]; empty for a mesh.
       rounding: fillet radius of the edges of a box or cylinder [m].
       pos, quat: pose of the geom in the indenter's frame, (3,) [m] and (4,).
-      vert, face: (n, 3) [m], (m, 3), its surface in the indenter's frame: of a mesh exactly, else for pictures and rays.
+      vert, face: (n, 3) [m], (m, 3), its surface in the indenter's frame: of a mesh exactly, else for
+        pictures and rays.
     """
 
     name: str
@@ -63,12 +64,16 @@ def _surface(kind, size):
 def _from_geom(text):
     kind, _, sizes = text.partition(":")
     if kind not in _SIZES:
-        raise ValueError(f"unknown geom type {kind!r} in 'geom:{text}': use geom:TYPE:SIZE[,SIZE...] with TYPE one of {', '.join(_SIZES)}")
+        raise ValueError(
+            f"unknown geom type {kind!r} in 'geom:{text}': use geom:TYPE:SIZE[,SIZE...] with TYPE one of "
+            f"{', '.join(_SIZES)}"
+        )
     try:
         size = tuple(float(s) for s in sizes.split(",") if s)
     except ValueError:
         raise ValueError(
-            f"sizes {sizes!r} of 'geom:{text}' are not numbers: give half-sizes in metres, as in geom:capsule:0.003,0.005"
+            f"sizes {sizes!r} of 'geom:{text}' are not numbers: give half-sizes in metres, as in "
+            "geom:capsule:0.003,0.005"
         ) from None
     if kind == "plane":
         size = size or (0.02, 0.02, 0.001)
@@ -77,7 +82,8 @@ def _from_geom(text):
         needed = _SIZES[kind]
     if len(size) != needed or not all(np.isfinite(s) and s > 0 for s in size):
         raise ValueError(
-            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: as in geom:capsule:0.003,0.005"
+            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: as in "
+            "geom:capsule:0.003,0.005"
         )
     vert, face = _surface(kind, size)
     return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), _Z_TO_Y, vert @ _matrix(_Z_TO_Y).T, face)
@@ -86,18 +92,37 @@ def _from_geom(text):
 def _from_file(path):
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no indenter mesh at {path}: give mesh:FILE of a closed surface (obj, stl, ply) in metres")
+        raise FileNotFoundError(
+            f"no indenter mesh at {path}: give mesh:FILE of a closed surface (obj, stl, ply) in metres"
+        )
     try:
         mesh = trimesh.load(path, force="mesh")
     except Exception as error:  # readers raise what they like
-        raise ValueError(f"cannot read the indenter mesh {path} ({error}): give an obj, stl or ply file") from error
+        raise ValueError(
+            f"cannot read the indenter mesh {path} ({error}): give an obj, stl or ply file"
+        ) from error
     if not len(getattr(mesh, "faces", ())) or not np.isfinite(mesh.vertices).all():
-        raise ValueError(f"the indenter mesh {path} has no faces or vertices that are not finite: give a closed surface in metres")
+        raise ValueError(
+            f"the indenter mesh {path} has no faces or vertices that are not finite: give a closed surface "
+            "in metres"
+        )
     if mesh.extents.max() > 0.5:
-        raise ValueError(f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; scale it from millimetres")
+        raise ValueError(
+            f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; scale it "
+            "from millimetres"
+        )
     if not mesh.is_watertight:
         raise ValueError(f"the indenter mesh {path} is open: its inside is not defined; close its holes")
-    return Indenter(f"mesh:{path}", "mesh", (), 0.0, np.zeros(3), _UPRIGHT, np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Indenter(
+        f"mesh:{path}",
+        "mesh",
+        (),
+        0.0,
+        np.zeros(3),
+        _UPRIGHT,
+        np.asarray(mesh.vertices),
+        np.asarray(mesh.faces),
+    )
 
 
 def _matrix(quat):
@@ -109,11 +134,13 @@ def _matrix(quat):
 def make_indenter(text: str) -> Indenter:
     """The indenter that a text asks for.
 
-    A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in metres. The z axis of a geom goes
+    A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in
+    metres. The z axis of a geom goes
     ahead: a capsule presses with its cap, a cylinder with its end, a plane with its front.
 
     Raises:
-      ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in metres.
+      ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in
+        metres.
       FileNotFoundError: no such mesh.
     """
     kind, _, rest = text.partition(":")
@@ -122,10 +149,19 @@ def make_indenter(text: str) -> Indenter:
     if kind == "mesh":
         return _from_file(rest)
     if text not in INDENTERS:
-        raise ValueError(f"unknown indenter {text!r}: choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE")
+        raise ValueError(
+            f"unknown indenter {text!r}: choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], "
+            "or mesh:FILE"
+        )
     shape = indenter(text)
     return Indenter(
-        text, shape.geom_type, shape.size, shape.rounding if shape.size else 0.0, np.array(shape.pos), np.array(shape.quat), *shape.mesh()
+        text,
+        shape.geom_type,
+        shape.size,
+        shape.rounding if shape.size else 0.0,
+        np.array(shape.pos),
+        np.array(shape.quat),
+        *shape.mesh(),
     )
 
 
@@ -142,6 +178,8 @@ def add_indenter(spec: mujoco.MjSpec, body, shape: Indenter, exact: bool = True,
         kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.type.upper()}")
         return body.add_geom(name="indenter", type=kind, size=size, pos=shape.pos, quat=shape.quat, **geom)
     # a shell's inertia is defined for open and badly oriented triangles too
-    mesh = spec.add_mesh(name="indenter", uservert=shape.vert.ravel(), userface=shape.face.ravel().astype(np.int32))
+    mesh = spec.add_mesh(
+        name="indenter", uservert=shape.vert.ravel(), userface=shape.face.ravel().astype(np.int32)
+    )
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     return body.add_geom(name="indenter", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="indenter", **geom)

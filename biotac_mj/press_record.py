@@ -20,7 +20,8 @@ CSV_COLUMNS = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *CHAN
 
 @dataclasses.dataclass
 class PressRecord:
-    """One press, in the BioTac frame. n is the number of saved steps; row 0 is the rest, 5 um before first touch.
+    """One press, in the BioTac frame. n is the number of saved steps; row 0 is the rest, 5 um before first
+    touch.
 
     Attributes:
       geometry: the skin at rest.
@@ -52,11 +53,21 @@ class PressRecord:
 
     def __post_init__(self):
         n = len(self.time)
-        shapes = dict(depth=(n,), force=(n, 3), counts=(n, len(CHANNELS)), nonconverged=(n,), vert_xpos=(n, self.geometry.nvert, 3),
-                      indenter_pos=(n, 3), indenter_quat=(n, 4))  # fmt: skip
+        shapes = dict(
+            depth=(n,),
+            force=(n, 3),
+            counts=(n, len(CHANNELS)),
+            nonconverged=(n,),
+            vert_xpos=(n, self.geometry.nvert, 3),
+            indenter_pos=(n, 3),
+            indenter_quat=(n, 4),
+        )
         for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:
-                raise ValueError(f"{name} of a press with {n} saved steps has shape {np.shape(getattr(self, name))}: {shape} is needed")
+                raise ValueError(
+                    f"{name} of a press with {n} saved steps has shape {np.shape(getattr(self, name))}: "
+                    f"{shape} is needed"
+                )
 
     @property
     def electrode_change(self) -> np.ndarray:
@@ -71,7 +82,8 @@ class PressRecord:
 
 @contextlib.contextmanager
 def replacing(path):
-    """Gives a temporary path with the same ending in the same folder; renames it to `path` if all went well, else removes it."""
+    """Gives a temporary path with the same ending in the same folder; renames it to `path` if all went well,
+    else removes it."""
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
@@ -92,34 +104,67 @@ def versions() -> dict:
 
     from . import __version__
 
-    return {"biotac-mj": __version__, "mujoco": mujoco.__version__, "warp-lang": warp.__version__, "numpy": np.__version__}
+    return {
+        "biotac-mj": __version__,
+        "mujoco": mujoco.__version__,
+        "warp-lang": warp.__version__,
+        "numpy": np.__version__,
+    }
 
 
 def write_readings(record: PressRecord, path) -> None:
-    """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved step."""
+    """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved
+    step."""
     tier = record.parameters.get("tier", "full")
     rows = np.column_stack([record.time, record.depth, record.force])
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)
         for row, counts, nonconverged in zip(rows, record.counts, record.nonconverged):
-            writer.writerow([*(f"{value:.9g}" for value in row), *(f"{value:.6g}" for value in counts), int(nonconverged), tier])
+            writer.writerow(
+                [
+                    *(f"{value:.9g}" for value in row),
+                    *(f"{value:.6g}" for value in counts),
+                    int(nonconverged),
+                    tier,
+                ]
+            )
 
 
 def write_skin(record: PressRecord, path) -> None:
-    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and versions as JSON attributes."""
+    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and
+    versions as JSON attributes."""
     import h5py
 
     geometry = record.geometry
     pose = np.concatenate([record.indenter_pos, record.indenter_quat], axis=1)
-    columns = dict(time=(record.time, "s"), depth=(record.depth, "m"), force=(record.force, "N"), counts=(record.counts, "count"),
-                   indenter_pose=(pose, "m, then quaternion w x y z"), nonconverged=(record.nonconverged, "steps"))  # fmt: skip
-    topology = dict(vert=(geometry.vert, "m"), elem=(geometry.tets, "node"), outer_face=(geometry.outer_face, "node"),
-                    inner_face=(geometry.inner_face, "node"), fixed=(geometry.fixed, "node"),
-                    indenter_vert=(record.indenter_vert, "m"), indenter_face=(record.indenter_face, "vertex"))  # fmt: skip
+    columns = dict(
+        time=(record.time, "s"),
+        depth=(record.depth, "m"),
+        force=(record.force, "N"),
+        counts=(record.counts, "count"),
+        indenter_pose=(pose, "m, then quaternion w x y z"),
+        nonconverged=(record.nonconverged, "steps"),
+    )
+    topology = dict(
+        vert=(geometry.vert, "m"),
+        elem=(geometry.tets, "node"),
+        outer_face=(geometry.outer_face, "node"),
+        inner_face=(geometry.inner_face, "node"),
+        fixed=(geometry.fixed, "node"),
+        indenter_vert=(record.indenter_vert, "m"),
+        indenter_face=(record.indenter_face, "vertex"),
+    )
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
         shape = record.vert_xpos.shape
-        file.create_dataset("vert_xpos", data=record.vert_xpos, dtype="f4", chunks=(1, *shape[1:]), compression="gzip", shuffle=True)
+        file.create_dataset(
+            "vert_xpos",
+            data=record.vert_xpos,
+            dtype="f4",
+            chunks=(1, *shape[1:]),
+            compression="gzip",
+            shuffle=True,
+        )
         file["vert_xpos"].attrs["unit"] = "m"
         for name, (value, unit) in {**columns, **topology}.items():
             file[name] = value

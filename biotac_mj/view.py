@@ -1,4 +1,5 @@
-"""A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes are shown by the plugin."""
+"""A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes
+are shown by the plugin."""
 
 import os
 import sys
@@ -13,12 +14,15 @@ from .press_record import replacing
 
 __all__ = ["build_hand", "build_scene", "view"]
 
-_PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])  # turns the pad, -y of the BioTac, to the world's +z
+_PAD_UP = np.array(
+    [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
+)  # turns the pad, -y of the BioTac, to the world's +z
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 
 
 def build_scene(skin="default", **attach_options):
-    """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs keep it over the pad.
+    """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs
+    keep it over the pad.
 
     Args:
       skin: name, file or SkinGeometry.
@@ -43,7 +47,12 @@ def build_scene(skin="default", **attach_options):
         joint = ball.add_joint(name=f"ball_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
         joint.stiffness[0], joint.damping[0] = stiffness, 0.5
     ball.add_geom(
-        name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_RADIUS, 0, 0], contype=0, conaffinity=0, rgba=[0.85, 0.45, 0.15, 0.6]
+        name="ball",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[_RADIUS, 0, 0],
+        contype=0,
+        conaffinity=0,
+        rgba=[0.85, 0.45, 0.15, 0.6],
     )
     handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
     see_through(spec, handle)
@@ -54,10 +63,19 @@ def _light(spec):
     """Sky and light."""
     spec.visual.headlight.ambient[:] = 0.3
     sky = spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=64,
+        height=384,
     )
     sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
-    spec.worldbody.add_light(pos=[-0.1, -0.2, 0.3], dir=[0.3, 0.5, -0.8], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
+    spec.worldbody.add_light(
+        pos=[-0.1, -0.2, 0.3],
+        dir=[0.3, 0.5, -0.8],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False,
+    )
 
 
 def build_hand(path, skin="coarse", **attach_options):
@@ -79,7 +97,9 @@ def build_hand(path, skin="coarse", **attach_options):
     from .tasks.hands import attach_to_hand
 
     if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand")
+        raise FileNotFoundError(
+            f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand"
+        )
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     _light(spec)
@@ -90,13 +110,24 @@ def build_hand(path, skin="coarse", **attach_options):
 
 
 def view(
-    skin="default", material="default", liquid=None, seed=0, device="cpu", tier="full", render=None, seconds=0.3, hand=None, web=False,
-    recording=None, port=8080,
-):  # fmt: skip
+    skin="default",
+    material="default",
+    liquid=None,
+    seed=0,
+    device="cpu",
+    tier="full",
+    render=None,
+    seconds=0.3,
+    hand=None,
+    web=False,
+    recording=None,
+    port=8080,
+):
     """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
 
     Args:
-      skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's choice.
+      skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's
+        choice.
       render: path of a picture to write after `seconds` [s] instead.
       hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
       web: serve a page in the browser (`web_view`) at `port`, of the simulation or of the file `recording`.
@@ -113,10 +144,19 @@ def view(
 
         return play_file(recording, port=port)
     linux = sys.platform.startswith("linux")
-    if render is None and not web and linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ValueError("no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY")
+    if (
+        render is None
+        and not web
+        and linux
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
+        raise ValueError(
+            "no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY"
+        )
     liquid = preset(material).liquid if liquid is None else liquid
-    settings = dict(material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device)
+    settings = dict(
+        material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device
+    )
     if hand is None:
         spec, handle = build_scene(skin, tier=tier, **settings)
         handles, aim = {"biotac": handle}, _aim

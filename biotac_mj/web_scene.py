@@ -26,9 +26,15 @@ class Scene:
             if body not in self._frames:
                 self._frames[body] = server.scene.add_frame(f"/model/{body}", show_axes=False)
             server.scene.add_mesh_simple(
-                f"/model/{body}/{g}", mesh[0].astype(np.float32), mesh[1].astype(np.uint32), color=tuple(int(255 * c) for c in color[:3]),
-                opacity=None if color[3] == 1 else float(color[3]), position=model.geom_pos[g], wxyz=model.geom_quat[g], flat_shading=False,
-            )  # fmt: skip
+                f"/model/{body}/{g}",
+                mesh[0].astype(np.float32),
+                mesh[1].astype(np.uint32),
+                color=tuple(int(255 * c) for c in color[:3]),
+                opacity=None if color[3] == 1 else float(color[3]),
+                position=model.geom_pos[g],
+                wxyz=model.geom_quat[g],
+                flat_shading=False,
+            )
 
     def update(self, data):
         """Moves the bodies to where they are in `data`."""
@@ -43,7 +49,8 @@ def geom_color(model, g):
 
 
 def geom_mesh(model, g):
-    """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None for those without a surface of finite size."""
+    """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None for those without a surface of
+    finite size."""
     import trimesh
 
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]

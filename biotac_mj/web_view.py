@@ -1,4 +1,5 @@
-"""A page in the browser: deforming skins, electrodes coloured by their change, traces; live or from a recorded press. Extra `web`."""
+"""A page in the browser: deforming skins, electrodes coloured by their change, traces; live or from a
+recorded press. Extra `web`."""
 
 import dataclasses
 import time as clock
@@ -37,7 +38,14 @@ class Finger:
         """Of a SkinGeometry."""
         node, face = np.unique(geometry.outer_face, return_inverse=True)
         face = face.reshape(-1, 3)
-        return cls(node, face, geometry.core_vert, geometry.core_face, geometry.electrode_pos, np.asarray(rest, float))
+        return cls(
+            node,
+            face,
+            geometry.core_vert,
+            geometry.core_face,
+            geometry.electrode_pos,
+            np.asarray(rest, float),
+        )
 
 
 class Page:
@@ -72,8 +80,15 @@ class Page:
         scene, gui = self.server.scene, self.server.gui
         frame = scene.add_frame(f"/{name}", show_axes=False)
         vert = np.zeros((len(finger.node), 3), np.float32)
-        skin = scene.add_mesh_simple(f"/{name}/skin", vert, finger.face.astype(np.uint32), color=(80, 175, 120), opacity=0.55)
-        scene.add_mesh_simple(f"/{name}/core", finger.core_vert.astype(np.float32), finger.core_face.astype(np.uint32), color=(60, 60, 68))
+        skin = scene.add_mesh_simple(
+            f"/{name}/skin", vert, finger.face.astype(np.uint32), color=(80, 175, 120), opacity=0.55
+        )
+        scene.add_mesh_simple(
+            f"/{name}/core",
+            finger.core_vert.astype(np.float32),
+            finger.core_face.astype(np.uint32),
+            color=(60, 60, 68),
+        )
         spheres = [
             scene.add_icosphere(f"/{name}/e{i}", radius=5e-4, color=(217, 217, 217), position=p)
             for i, p in enumerate(finger.electrode_pos, 1)
@@ -84,8 +99,15 @@ class Page:
             empty = np.zeros(2)
             look = {"scales": {"x": viser.uplot.Scale(time=False)}, "aspect": 2.0}
             names = [f"e{i}" for i in range(1, 20)]
-            traces = gui.add_uplot((empty, *[empty] * 19), _series(viser, names), title="change [counts]", **look)
-            force = gui.add_uplot((empty, empty, empty), _series(viser, ["force [N]", "PDC/100"]), title="force and pressure", **look)
+            traces = gui.add_uplot(
+                (empty, *[empty] * 19), _series(viser, names), title="change [counts]", **look
+            )
+            force = gui.add_uplot(
+                (empty, empty, empty),
+                _series(viser, ["force [N]", "PDC/100"]),
+                title="force and pressure",
+                **look,
+            )
         self._gui[name] = picture, traces, force
         self._log[name] = []
 
@@ -94,18 +116,29 @@ class Page:
         from scipy.spatial.transform import Rotation
 
         place = np.concatenate(
-            [Rotation.from_quat(quat, scalar_first=True).apply(vert) + pos for vert, _, _, _, pos, quat in state.values()]
+            [
+                Rotation.from_quat(quat, scalar_first=True).apply(vert) + pos
+                for vert, _, _, _, pos, quat in state.values()
+            ]
         )
         low, high = place.min(0), place.max(0)
         center = (low + high) / 2
         away = center + 1.15 * np.linalg.norm(high - low) * _FROM / np.linalg.norm(_FROM)
-        self.server.initial_camera.look_at, self.server.initial_camera.position, self.server.initial_camera.up = (
+        (
+            self.server.initial_camera.look_at,
+            self.server.initial_camera.position,
+            self.server.initial_camera.up,
+        ) = (
             center,
             away,
             (0.0, 0.0, 1.0),
         )
         for client in self.server.get_clients().values():
-            client.camera.up_direction, client.camera.position, client.camera.look_at = (0.0, 0.0, 1.0), away, center
+            client.camera.up_direction, client.camera.position, client.camera.look_at = (
+                (0.0, 0.0, 1.0),
+                away,
+                center,
+            )
         self._aimed = True
 
     def update(self, time, state):
@@ -113,7 +146,8 @@ class Page:
 
         Args:
           time: [s].
-          state: {name: (vert (nnode, 3) [m] of the outer nodes, counts (19,), pdc above rest, force [N], pos (3,), quat (4,))}.
+          state: {name: (vert (nnode, 3) [m] of the outer nodes, counts (19,), pdc above rest, force [N], pos
+            (3,), quat (4,))}.
         """
         if not self._aimed:
             self._aim(state)
@@ -142,7 +176,8 @@ class Page:
 
 
 def electrode_map(position, change):
-    """(height, width, 3) uint8: electrodes at their place along (tip left) and around the finger, coloured by their change [counts]."""
+    """(height, width, 3) uint8: electrodes at their place along (tip left) and around the finger, coloured by
+    their change [counts]."""
     height, width = _MAP
     x = 12 + (position[:, 0] + 0.0185) / 0.021 * (width - 24)
     angle = np.arctan2(position[:, 2], -position[:, 1])
@@ -156,7 +191,10 @@ def electrode_map(position, change):
 
 def _series(viser, names):
     colors = [f"hsl({360 * i // max(len(names), 1)}, 70%, 45%)" for i in range(len(names))]
-    return (viser.uplot.Series(label="t [s]"), *(viser.uplot.Series(label=n, stroke=c, width=1) for n, c in zip(names, colors)))
+    return (
+        viser.uplot.Series(label="t [s]"),
+        *(viser.uplot.Series(label=n, stroke=c, width=1) for n, c in zip(names, colors)),
+    )
 
 
 def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **server):
@@ -177,7 +215,10 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
 
     if page is None:
         fingers = {
-            name: Finger.of(skins.load(h.config.skin), REST_COUNTS[h.config.options.get("readings", {}).get("sensor", "1")])
+            name: Finger.of(
+                skins.load(h.config.skin),
+                REST_COUNTS[h.config.options.get("readings", {}).get("sensor", "1")],
+            )
             for name, h in handles.items()
         }
         page = Page(fingers, **server)
@@ -194,7 +235,10 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
         if data.time - shown > 0.04 - 1e-9:
             shown = data.time
             scene.update(data)
-            page.update(shown, {name: _state(model, data, h, page.fingers[name], rest[name]) for name, h in handles.items()})
+            page.update(
+                shown,
+                {name: _state(model, data, h, page.fingers[name], rest[name]) for name, h in handles.items()},
+            )
         clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
     return page
 
@@ -203,7 +247,14 @@ def _state(model, data, handle, finger, rest):
     body = data.body(handle.body)
     force = float(np.linalg.norm(handle.read(data, "contact_force")[:3]))
     vert = handle.vert_xpos(model, data)[finger.node]
-    return vert, handle.read(data, "electrodes"), float(handle.read(data, "pdc")[0]) - rest, force, body.xpos.copy(), body.xquat.copy()
+    return (
+        vert,
+        handle.read(data, "electrodes"),
+        float(handle.read(data, "pdc")[0]) - rest,
+        force,
+        body.xpos.copy(),
+        body.xquat.copy(),
+    )
 
 
 def play_file(path, page=None, speed=1.0, rounds=np.inf, **server):
@@ -220,21 +271,32 @@ def play_file(path, page=None, speed=1.0, rounds=np.inf, **server):
     from .geometry import load_skin
 
     if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(f"no recording at {path}: make one with `biotac press --out DIR` and give DIR/skin.h5")
+        raise FileNotFoundError(
+            f"no recording at {path}: make one with `biotac press --out DIR` and give DIR/skin.h5"
+        )
     try:
         with h5py.File(path) as file:
             names = ("vert_xpos", "outer_face", "time", "counts", "force")
             vert, face, time, counts, force = (file[name][()] for name in names)
             skin = file.attrs["skin"]
     except (OSError, KeyError) as error:
-        raise ValueError(f"{path} is no recorded press ({error}): give the skin.h5 that `biotac press` writes") from error
+        raise ValueError(
+            f"{path} is no recorded press ({error}): give the skin.h5 that `biotac press` writes"
+        ) from error
     try:
         geometry = load_skin(skin)
     except (ValueError, FileNotFoundError):
         geometry = load_skin("default")  # of another skin only core and electrodes are lent: all share them
     node, local = np.unique(face, return_inverse=True)
     if page is None:
-        finger = Finger(node, local.reshape(-1, 3), geometry.core_vert, geometry.core_face, geometry.electrode_pos, counts[0, :19])
+        finger = Finger(
+            node,
+            local.reshape(-1, 3),
+            geometry.core_vert,
+            geometry.core_face,
+            geometry.electrode_pos,
+            counts[0, :19],
+        )
         page = Page({"biotac": finger}, **server)
     done = 0
     while done < rounds:

@@ -1,7 +1,8 @@
-"""Thousands of presses at once in mujoco_warp, every world with its own place, rubber and friction: python examples/batch_mujoco_warp.py
+"""Thousands of presses at once in mujoco_warp, every world with its own place, rubber and friction: python
+examples/batch_mujoco_warp.py
 
-On a GPU the whole step (bodies, skins, liquids, films, counts) is one CUDA graph: nothing goes back to the host until the press is over.
-"""
+On a GPU the whole step (bodies, skins, liquids, films, counts) is one CUDA graph: nothing goes back to the
+host until the press is over."""
 
 import argparse
 import dataclasses
@@ -38,7 +39,8 @@ def scene(skin):
 
 
 def first_touch(skin, axis, outwards):
-    """How far from points (n, 3) of the finger's axis a sphere's centre is when it just touches the skin's nodes (n,) [m]."""
+    """How far from points (n, 3) of the finger's axis a sphere's centre is when it just touches the skin's
+    nodes (n,) [m]."""
     geometry = load_skin(skin) if isinstance(skin, str) else skin
     nodes = cKDTree(geometry.vert[np.unique(geometry.outer_face)])
     near, far = np.full(len(axis), 5e-3), np.full(len(axis), 25e-3)
@@ -50,7 +52,8 @@ def first_touch(skin, axis, outwards):
 
 
 def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figure=None, seed=0):
-    """Presses; returns dict of youngs_modulus (nworld,), depth (steps,), force (steps, nworld, 3), electrodes (steps, nworld, 19)."""
+    """Presses; returns dict of youngs_modulus (nworld,), depth (steps,), force (steps, nworld, 3), electrodes
+    (steps, nworld, 19)."""
     rng = np.random.default_rng(seed)
     rubber = dataclasses.asdict(material("default"))
     youngs_modulus = rubber["youngs_modulus"] * rng.uniform(0.5, 1.5, nworld)
@@ -63,8 +66,13 @@ def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figur
     with wp.ScopedDevice(device):
         m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=nworld)
         biotac = batch.attach(
-            mjm, m, d, skin=skin, material=[{**rubber, "youngs_modulus": e} for e in youngs_modulus], friction=rng.uniform(0.3, 1.0, nworld)
-        )  # fmt: skip
+            mjm,
+            m,
+            d,
+            skin=skin,
+            material=[{**rubber, "youngs_modulus": e} for e in youngs_modulus],
+            friction=rng.uniform(0.3, 1.0, nworld),
+        )
         size = biotac.nbytes / nworld
         print(f"{nworld} worlds take {size / 1e6:.2f} MB each: about {80e9 / size:.0f} fit into 80 GB")
         d.mocap_pos.assign(start[:, None].astype(np.float32))
@@ -90,15 +98,25 @@ def main(nworld=1024, steps=50, depth=1.5e-3, skin="default", device=None, figur
                     step()
                 graph = capture.graph
             read = d.sensordata.numpy()
-            force[k], electrodes[k] = read[:, at["contact_force"] :][:, :3], read[:, at["electrodes"] :][:, :19]
+            force[k], electrodes[k] = (
+                read[:, at["contact_force"] :][:, :3],
+                read[:, at["electrodes"] :][:, :19],
+            )
             failed += int((read[:, at["status"]] != 1).sum())
     rest = np.median(seconds[1:])
-    print(f"{1e3 * rest:.2f} ms per step: {1e6 * rest / nworld:.1f} us per world and step, {nworld / rest / steps:.0f} presses per second")
+    print(
+        f"{1e3 * rest:.2f} ms per step: {1e6 * rest / nworld:.1f} us per world and step, "
+        f"{nworld / rest / steps:.0f} presses per second"
+    )
     print(f"{failed} of {steps * nworld} steps found no balance; force at {1e3 * depth:.1f} mm: "
           f"{np.linalg.norm(force[-1], axis=1).mean():.2f} N on average")  # fmt: skip
     record = dict(
-        youngs_modulus=youngs_modulus, depth=depth * np.arange(1, steps + 1) / steps, force=force, electrodes=electrodes, failed=failed
-    )  # fmt: skip
+        youngs_modulus=youngs_modulus,
+        depth=depth * np.arange(1, steps + 1) / steps,
+        force=force,
+        electrodes=electrodes,
+        failed=failed,
+    )
     if figure:
         draw(record, figure)
     return record
@@ -120,8 +138,12 @@ def draw(record, path, shown=200):
         color = colormaps["viridis"](colors[w])
         left.plot(1e3 * record["depth"], size[:, w], color=color, lw=0.7)
         right.plot(size[:, w], change[:, w], color=color, lw=0.7)
-    left.set(xlabel="depth [mm]", ylabel="force [N]", title=f"{size.shape[1]} presses, colour: Young's modulus")
-    right.set(xlabel="force [N]", ylabel="change of E17 [counts]", title="the electrode under the pad's middle")
+    left.set(
+        xlabel="depth [mm]", ylabel="force [N]", title=f"{size.shape[1]} presses, colour: Young's modulus"
+    )
+    right.set(
+        xlabel="force [N]", ylabel="change of E17 [counts]", title="the electrode under the pad's middle"
+    )
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)

@@ -1,4 +1,5 @@
-"""Make a small synthetic set, split it by interaction, predict electrodes from the skin by regression: python examples/data_set.py"""
+"""Make a small synthetic set, split it by interaction, predict electrodes from the skin by regression: python
+examples/data_set.py"""
 
 import argparse
 import tempfile
@@ -22,11 +23,17 @@ def features(data, interactions, basis=None):
 
 
 def main(out=None, count=24, steps=10, skin="coarse", tier="condensed", progress=True):
-    """Returns the RMS errors over the test interactions [counts]: of the regression, and of predicting no change at all."""
+    """Returns the RMS errors over the test interactions [counts]: of the regression, and of predicting no
+    change at all."""
     with tempfile.TemporaryDirectory() as folder:
-        options = GenerateOptions(count=count, labelled=0, steps=steps, skin=skin, tier=tier, objects=("sphere_7mm", "table_edge"))
+        options = GenerateOptions(
+            count=count, labelled=0, steps=steps, skin=skin, tier=tier, objects=("sphere_7mm", "table_edge")
+        )
         report = generate(out or folder, options, workers=0, progress=progress)
-        print(f"{report.interactions} interactions of {steps} time steps, {report.nonconverged} steps not converged")
+        print(
+            f"{report.interactions} interactions of {steps} time steps, {report.nonconverged} steps not "
+            "converged"
+        )
         with TactileSet(out or folder) as data:
             split = split_by_interaction(data, fractions=(0.7, 0.1, 0.2))
             x, y, basis = features(data, split.train)

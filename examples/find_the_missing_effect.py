@@ -1,11 +1,10 @@
-"""A sensor that was measured is not quite the simulated one: find what is missing, name it, add it, and see the gap shrink.
+"""A sensor that was measured is not quite the simulated one: find what is missing, name it, add it, and see
+the gap shrink.
 
     python examples/find_the_missing_effect.py --seed 3 --out out/missing.png
 
-The "measurement" is synthetic: the condensed skin with one effect that the seed chooses, another modulus, slips of the pose, noise and 12
-bits.
-Everything that is fitted starts from raw counts and newtons.
-"""
+The "measurement" is synthetic: the condensed skin with one effect that the seed chooses, another modulus,
+slips of the pose, noise and 12 bits. Everything that is fitted starts from raw counts and newtons."""
 
 import argparse
 import pathlib
@@ -37,13 +36,27 @@ def presses(count, seed):
             np.exp(rng.uniform(np.log(1e-3), np.log(1e-2))),
             np.exp(rng.uniform(np.log(0.3), np.log(4))),
         )
-        d = np.concatenate([[-2e-5] * 3, np.linspace(-2e-5, depth, 7)[1:], [depth] * 5, np.linspace(depth, -2e-5, 6)[1:]])
+        d = np.concatenate(
+            [[-2e-5] * 3, np.linspace(-2e-5, depth, 7)[1:], [depth] * 5, np.linspace(depth, -2e-5, 6)[1:]]
+        )
         t = np.concatenate([[0.1] * 2, [depth / speed / 6] * 6, [hold / 5] * 5, [depth / speed / 5] * 5])
         t = np.concatenate([[0], np.cumsum(t)])
         mat = Rotation.align_vectors([-normal], [[0.0, 1.0, 0.0]])[0].as_matrix()
         n = len(t)
-        out.append(Trajectory(f"press {i}", ["sphere_7mm", "sphere_14mm"][i % 2], clock, t, point - np.outer(d, normal), np.tile(mat, (n, 1, 1)),  # noqa: E501
-                              np.full((n, 19), 2000.0), np.full(n, 2000.0), None, np.zeros((n, 3))))  # fmt: skip
+        out.append(
+            Trajectory(
+                f"press {i}",
+                ["sphere_7mm", "sphere_14mm"][i % 2],
+                clock,
+                t,
+                point - np.outer(d, normal),
+                np.tile(mat, (n, 1, 1)),  # noqa: E501
+                np.full((n, 19), 2000.0),
+                np.full(n, 2000.0),
+                None,
+                np.zeros((n, 3)),
+            )
+        )
         clock += t[-1] + 5
     return out
 
@@ -56,24 +69,38 @@ def measure(sim, trajectories, effect, seed):
     out = []
     for t, r in zip(trajectories, runs):
         counts = np.clip(np.rint(r.counts + 3.5 * rng.standard_normal(r.counts.shape)), 0, 4095)
-        pdc, force = np.rint(r.pdc + rng.standard_normal(len(r.pdc))), r.force + 0.006 * rng.standard_normal(r.force.shape)
+        pdc, force = (
+            np.rint(r.pdc + rng.standard_normal(len(r.pdc))),
+            r.force + 0.006 * rng.standard_normal(r.force.shape),
+        )
         out.append(Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, counts, pdc, None, force))
     return out
 
 
 def picture(report, truth, path):
-    """Left: evidence of the first round; right: residual per channel on the presses kept aside, before and after."""
+    """Left: evidence of the first round; right: residual per channel on the presses kept aside, before and
+    after."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1, 2])
     y = np.arange(len(report.ranking))[::-1]
-    left.barh(y, [n for _, n, _ in report.ranking], color=["tab:blue" if i == truth else "0.7" for i, _, _ in report.ranking])
+    left.barh(
+        y,
+        [n for _, n, _ in report.ranking],
+        color=["tab:blue" if i == truth else "0.7" for i, _, _ in report.ranking],
+    )
     left.set_yticks(y, [i for i, _, _ in report.ranking])
     left.set_xlabel("nats per press left out (blue: the truth)")
     x, sigma = np.arange(report.comparison.width), report.comparison.sigma
     right.bar(x - 0.2, np.array(report.before["channels"]) / sigma, 0.4, color="0.6", label="as simulated")
-    right.bar(x + 0.2, np.array(report.after["channels"]) / sigma, 0.4, color="tab:blue", label="with the effect found")
+    right.bar(
+        x + 0.2,
+        np.array(report.after["channels"]) / sigma,
+        0.4,
+        color="tab:blue",
+        label="with the effect found",
+    )
     right.set_xticks(x, [*(f"e{k + 1}" for k in range(19)), "pdc", "Fx", "Fy", "Fz"], fontsize=7)
     right.set_ylabel("RMS / (noise, resolution)")
     right.set_title(f"presses kept aside; hidden: {truth} (synthetic); {report.verdict}", fontsize=9)
@@ -93,14 +120,22 @@ def main(argv=None):
     truth = str(rng.choice(list(HIDDEN)))
     hidden = next(e for e in CATALOGUE if e.id == truth)
     sim = Simulator(skin="coarse")
-    data = measure(sim, presses(args.count, args.seed), (hidden, {**hidden.default(), **HIDDEN[truth]}), args.seed + 1)
+    data = measure(
+        sim, presses(args.count, args.seed), (hidden, {**hidden.default(), **HIDDEN[truth]}), args.seed + 1
+    )
     report = diagnose(sim, data, progress=not args.quiet)
     print(f"hidden: {truth} {HIDDEN[truth]}\nverdict: {report.verdict}")
     for effect in report.effects:
         for p in effect["parameters"][:3]:
-            print(f"  {p['name']} {p['value']:.3g} {p['unit']} ({p['interval95'][0]:.3g} .. {p['interval95'][1]:.3g})")
-    print(f"gap closed on presses kept aside: {report.closed:.0%}; force {report.before['force']:.4f} -> {report.after['force']:.4f} N, "
-          f"electrodes {report.before['electrodes']:.2f} -> {report.after['electrodes']:.2f} counts RMS")  # fmt: skip
+            print(
+                f"  {p['name']} {p['value']:.3g} {p['unit']} ({p['interval95'][0]:.3g} .. "
+                f"{p['interval95'][1]:.3g})"
+            )
+    print(
+        f"gap closed on presses kept aside: {report.closed:.0%}; force {report.before['force']:.4f} -> "
+        f"{report.after['force']:.4f} N, "
+        f"electrodes {report.before['electrodes']:.2f} -> {report.after['electrodes']:.2f} counts RMS"
+    )
     picture(report, truth, args.out)
     return report, truth
 

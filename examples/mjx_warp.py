@@ -1,9 +1,9 @@
 """BioTacs beside mjx, for who works in JAX: python examples/mjx_warp.py (needs biotac_mj[mjx])
 
-mjx's Warp back end has no callback, so the skins step between its steps: they read JAX's arrays in place (DLPack) and hand theirs back the
-same way. The skin's force acts one step late, explicitly: that is stable for touched bodies of m > k (dt / 0.8)^2, k the stiffness of the
-contact. Lighter ones need `biotac_mj.batch.attach` and mujoco_warp itself (examples/batch_mujoco_warp.py).
-"""
+mjx's Warp back end has no callback, so the skins step between its steps: they read JAX's arrays in place
+(DLPack) and hand theirs back the same way. The skin's force acts one step late, explicitly: that is stable
+for touched bodies of m > k (dt / 0.8)^2, k the stiffness of the contact. Lighter ones need
+`biotac_mj.batch.attach` and mujoco_warp itself (examples/batch_mujoco_warp.py)."""
 
 import argparse
 

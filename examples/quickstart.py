@@ -1,4 +1,5 @@
-"""A ball of 100 g comes to rest on a BioTac's pad; the electrodes say where. Runs headless: python examples/quickstart.py"""
+"""A ball of 100 g comes to rest on a BioTac's pad; the electrodes say where. Runs headless: python
+examples/quickstart.py"""
 
 import mujoco
 

@@ -1,9 +1,10 @@
-"""A Shadow Hand with five BioTacs closes until each fingertip feels the object, then squeezes and lifts it, all from `mj_step`.
+"""A Shadow Hand with five BioTacs closes until each fingertip feels the object, then squeezes and lifts it,
+all from `mj_step`.
 
     python examples/shadow_hand_grasp.py --object ball --video out/grasp_ball.gif --traces out/grasp_ball.png
 
-The hand is MuJoCo Menagerie's: set MENAGERIE_ROOT to the folder that holds shadow_hand/, or pip install mujoco-menagerie.
-"""
+The hand is MuJoCo Menagerie's: set MENAGERIE_ROOT to the folder that holds shadow_hand/, or pip install
+mujoco-menagerie."""
 
 import argparse
 import dataclasses
@@ -47,7 +48,9 @@ def menagerie():
         except ImportError:
             root = "mujoco_menagerie"
     if not (pathlib.Path(root) / "shadow_hand" / "right_hand.xml").is_file():
-        raise FileNotFoundError(f"no shadow_hand/right_hand.xml in {root}: set MENAGERIE_ROOT to a clone of MuJoCo Menagerie")
+        raise FileNotFoundError(
+            f"no shadow_hand/right_hand.xml in {root}: set MENAGERIE_ROOT to a clone of MuJoCo Menagerie"
+        )
     return pathlib.Path(root)
 
 
@@ -59,17 +62,39 @@ def build(name, **settings):
     spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.impratio, spec.option.cone = 10, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.visual.headlight.ambient[:] = 0.3
-    sky = dict(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=384)
+    sky = dict(
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=64,
+        height=384,
+    )
     spec.add_texture(name="sky", rgb1=[0.95, 0.97, 1.0], rgb2=[0.6, 0.65, 0.7], **sky)
     world = spec.worldbody
     world.add_light(pos=[0, -0.3, 1], dir=[0.1, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.2, 0.01], pos=[0, 0, -0.01], rgba=[0.75, 0.6, 0.4, 1])
+    world.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.2, 0.2, 0.01],
+        pos=[0, 0, -0.01],
+        rgba=[0.75, 0.6, 0.4, 1],
+    )
     post = [0.015, STAND / 2, 0]
-    world.add_geom(name="stand", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=post, pos=[0, 0, STAND / 2], rgba=[0.5, 0.5, 0.5, 1])
+    world.add_geom(
+        name="stand",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=post,
+        pos=[0, 0, STAND / 2],
+        rgba=[0.5, 0.5, 0.5, 1],
+    )
     body = world.add_body(name="object", pos=[0, 0, STAND + height])
     body.add_freejoint(name="object")
     body.add_geom(
-        name="object", type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=size, mass=mass, rgba=[0.85, 0.45, 0.15, 1], condim=4
+        name="object",
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+        size=size,
+        mass=mass,
+        rgba=[0.85, 0.45, 0.15, 1],
+        condim=4,
     )
     carriage = world.add_body(name="carriage", gravcomp=1)
     carriage.mass, carriage.inertia, carriage.explicitinertial = 1.0, [0.01] * 3, True
@@ -89,10 +114,12 @@ def build(name, **settings):
 
 @dataclasses.dataclass
 class Grasp:
-    """Finds joint angles that lay the pads around the object: all fingers on one side, the thumb on the other.
+    """Finds joint angles that lay the pads around the object: all fingers on one side, the thumb on the
+    other.
 
     Attributes:
-      model, data: of the scene; core: ids of the BioTacs' bodies; joint: ids of the hand's joints that may move, wrist and carriage apart.
+      model, data: of the scene; core: ids of the BioTacs' bodies; joint: ids of the hand's joints that may
+        move, wrist and carriage apart.
     """
 
     model: mujoco.MjModel
@@ -103,13 +130,21 @@ class Grasp:
         m = self.model
         self.data = mujoco.MjData(m)
         self.core = np.array([m.body(h.body).id for h in self.handles.values()])
-        self.link = m.body_parentid[m.body_parentid[self.core]]  # the link before the one that carries the BioTac
-        self.joint = np.array([j for j in range(m.njnt) if m.joint(j).name.startswith("hand_") and "WRJ" not in m.joint(j).name])
+        self.link = m.body_parentid[
+            m.body_parentid[self.core]
+        ]  # the link before the one that carries the BioTac
+        self.joint = np.array(
+            [j for j in range(m.njnt) if m.joint(j).name.startswith("hand_") and "WRJ" not in m.joint(j).name]
+        )
         self.address = m.jnt_qposadr[self.joint]
         self.names = [m.joint(j).name for j in self.joint]
         # the last two joints of a finger are driven by one tendon
         self.paired = np.array(
-            [(self.names.index(n[:-1] + "2"), i) for i, n in enumerate(self.names) if n.endswith("J1") and "TH" not in n]
+            [
+                (self.names.index(n[:-1] + "2"), i)
+                for i, n in enumerate(self.names)
+                if n.endswith("J1") and "TH" not in n
+            ]
         )
         self.lift = m.jnt_qposadr[[m.joint(a).id for a in "xyz"]]
         self.kind, self.size, _ = OBJECTS[self.name]
@@ -137,7 +172,8 @@ class Grasp:
         return self.pads()
 
     def solve(self, gap=0.001):
-        """Angles (njoint,) and place of the carriage (3,) with all pads `gap` [m] from the surface and facing it."""
+        """Angles (njoint,) and place of the carriage (3,) with all pads `gap` [m] from the surface and facing
+        it."""
         low, high = self.model.jnt_range[self.joint].T
         thumb = np.array([f == "th" for f in self.handles])
         preferred = np.clip(self._preferred(), low + 1e-3, high - 1e-3)
@@ -150,47 +186,88 @@ class Grasp:
             distance, normal = self.surface(point, thumb)
             knuckle = self.data.xpos[self.link] + 0.025 * self.data.xmat[self.link].reshape(-1, 3, 3)[:, :, 2]
             fingers = point[~thumb, 1]
-            return np.concatenate([
-                200 * (distance - gap), 1.5 * (out + normal).ravel(), 100 * np.minimum(side * point[:, 0] - 0.5 * self.size[0], 0),
-                200 * np.minimum(self.surface(knuckle, thumb)[0] - CLEAR, 0),
-                40 * (point[:, 2] - self.center[2] - rise), 200 * np.minimum(fingers[:-1] - fingers[1:] - 0.0155, 0),
-                60 * (point[thumb, 1] - fingers.mean()), 60 * fingers.mean()[None], 60 * point[thumb, 1], 0.1 * (x[:-3] - preferred),
-                0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]]),
-            ])  # fmt: skip
+            return np.concatenate(
+                [
+                    200 * (distance - gap),
+                    1.5 * (out + normal).ravel(),
+                    100 * np.minimum(side * point[:, 0] - 0.5 * self.size[0], 0),
+                    200 * np.minimum(self.surface(knuckle, thumb)[0] - CLEAR, 0),
+                    40 * (point[:, 2] - self.center[2] - rise),
+                    200 * np.minimum(fingers[:-1] - fingers[1:] - 0.0155, 0),
+                    60 * (point[thumb, 1] - fingers.mean()),
+                    60 * fingers.mean()[None],
+                    60 * point[thumb, 1],
+                    0.1 * (x[:-3] - preferred),
+                    0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]]),
+                ]
+            )
 
-        return self._least_squares(residual, np.append(preferred, place), np.append(low, place - 0.1), np.append(high, place + 0.1))
+        return self._least_squares(
+            residual, np.append(preferred, place), np.append(low, place - 0.1), np.append(high, place + 0.1)
+        )
 
     def move(self, near, by):
-        """The same with every pad moved `by` [m] along the surface's normal, from a solution, whose place is kept.
+        """The same with every pad moved `by` [m] along the surface's normal, from a solution, whose place is
+        kept.
 
-        Inwards the thumb bends its last joint: what it presses against then pushes its other links away from the object.
+        Inwards the thumb bends its last joint: what it presses against then pushes its other links away from
+          the object.
         """
         point, out = self._place(near)
         thumb = np.array([f == "th" for f in self.handles])
         goal = point + by * self.surface(point, thumb)[1]
         held = np.array(["THJ" in n and not n.endswith("THJ1") for n in self.names]) & (by < 0)
-        stay, face = np.append(np.where(held, 10.0, 0.3), [0.3] * 3), np.where(thumb & (by < 0), 0.0, 1.0)[:, None]
+        stay, face = (
+            np.append(np.where(held, 10.0, 0.3), [0.3] * 3),
+            np.where(thumb & (by < 0), 0.0, 1.0)[:, None],
+        )
 
         def residual(x):
             there, facing = self._place(x)
-            return np.concatenate([200 * (there - goal).ravel(), (face * (facing - out)).ravel(), stay * (x - near),
-                                   0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]])])  # fmt: skip
+            return np.concatenate(
+                [
+                    200 * (there - goal).ravel(),
+                    (face * (facing - out)).ravel(),
+                    stay * (x - near),
+                    0.7 * (x[self.paired[:, 0]] - x[self.paired[:, 1]]),
+                ]
+            )
 
         low, high = self.model.jnt_range[self.joint].T
-        return self._least_squares(residual, near, np.append(low, near[-3:] - 1e-5), np.append(high, near[-3:] + 1e-5))
+        return self._least_squares(
+            residual, near, np.append(low, near[-3:] - 1e-5), np.append(high, near[-3:] + 1e-5)
+        )
 
     def _least_squares(self, residual, first, low, high):
         first = np.clip(first, low + 1e-6, high - 1e-6)
-        return least_squares(residual, first, bounds=(low, high), x_scale=np.append(np.ones(len(first) - 3), [0.1] * 3), max_nfev=300).x
+        return least_squares(
+            residual,
+            first,
+            bounds=(low, high),
+            x_scale=np.append(np.ones(len(first) - 3), [0.1] * 3),
+            max_nfev=300,
+        ).x
 
     def _preferred(self):
-        bent = {"J4": 0.0, "J3": 0.9, "J2": 0.6, "J1": 0.4, "J5": 0.0, "THJ5": 0.3, "THJ4": 1.15, "THJ3": 0.0, "THJ2": 0.3, "THJ1": 0.4}
+        bent = {
+            "J4": 0.0,
+            "J3": 0.9,
+            "J2": 0.6,
+            "J1": 0.4,
+            "J5": 0.0,
+            "THJ5": 0.3,
+            "THJ4": 1.15,
+            "THJ3": 0.0,
+            "THJ2": 0.3,
+            "THJ1": 0.4,
+        }
         names = self.names
         return np.array([bent.get(n[-4:], bent[n[-2:]]) for n in names])
 
 
 def targets(model, address, angle):
-    """ctrl values (nu,) of the hand's position actuators, nan elsewhere, for joint angles at qpos addresses."""
+    """ctrl values (nu,) of the hand's position actuators, nan elsewhere, for joint angles at qpos
+    addresses."""
     at = dict(zip(address.tolist(), angle))
     out = np.full(model.nu, np.nan)
     for u in range(model.nu):
@@ -208,7 +285,8 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
     """Grasps and lifts. `frame(data)` is called every 80 ms.
 
     Returns:
-      dict: time (n,), height of the object (n,) [m], and per finger counts (n, 5, 19), pdc (n, 5), force (n, 5) [N]; model, data, handles.
+      dict: time (n,), height of the object (n,) [m], and per finger counts (n, 5, 19), pdc (n, 5), force (n,
+        5) [N]; model, data, handles.
     """
     from tqdm import tqdm
 
@@ -221,7 +299,12 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
     data = mujoco.MjData(model)
     data.qpos[grasp.address], data.qpos[grasp.lift] = opened[:nj], touch[nj:]
     data.ctrl[[model.actuator(a).id for a in "xyz"]] = touch[nj:]
-    owner = np.array([next((i for i, f in enumerate(FINGERS) if f in model.actuator(u).name.lower()), -1) for u in range(model.nu)])
+    owner = np.array(
+        [
+            next((i for i, f in enumerate(FINGERS) if f in model.actuator(u).name.lower()), -1)
+            for u in range(model.nu)
+        ]
+    )
     way = np.stack([targets(model, grasp.address, angle[:nj]) for angle in (opened, touch, closed)])
     hand = np.isfinite(way[0]) & (owner >= 0)
     mujoco.mj_forward(model, data)
@@ -233,12 +316,18 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         pdc = np.array([h.read(data, "pdc")[0] for h in handles.values()])
         if data.time < CLOSE:  # who feels the object waits for the others
             closing += np.where(pdc - rest < FELT, 0.7 * TIMESTEP / CLOSE, 0.0)
-        else:  # then the thumb presses the object against the fingers; these stay where they are, and follow where they would lose it
+        # then the thumb presses the object against the fingers; these stay where they are, and follow where
+        # they would lose it
+        else:
             wanted = np.where(thumb, THUMB, FINGER)
-            closing += TIMESTEP * np.clip(2.5 * (wanted - pdc + rest) / wanted, np.where(thumb, -0.5, 0.0), 1.5)
+            closing += TIMESTEP * np.clip(
+                2.5 * (wanted - pdc + rest) / wanted, np.where(thumb, -0.5, 0.0), 1.5
+            )
             closing = np.minimum(closing, 2.0)
         c = closing[owner]
-        data.ctrl[hand] = (way[1] + np.where(c < 0.5, (1 - 2 * c) * (way[0] - way[1]), (2 * c - 1) * (way[2] - way[1])))[hand]
+        data.ctrl[hand] = (
+            way[1] + np.where(c < 0.5, (1 - 2 * c) * (way[0] - way[1]), (2 * c - 1) * (way[2] - way[1]))
+        )[hand]
         data.ctrl[z] = touch[nj + 2] + height * np.clip((data.time - CLOSE - SQUEEZE) / LIFT, 0, 1)
         mujoco.mj_step(model, data)
         biotac_mj.plugin.check()
@@ -249,7 +338,12 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         log["force"].append([np.linalg.norm(h.read(data, "contact_force")[:3]) for h in handles.values()])
         if frame is not None and i % round(0.08 / TIMESTEP) == 0:
             frame(data)
-    return {key: np.array(value) for key, value in log.items()} | {"model": model, "data": data, "handles": handles, "closing": closing}
+    return {key: np.array(value) for key, value in log.items()} | {
+        "model": model,
+        "data": data,
+        "handles": handles,
+        "closing": closing,
+    }
 
 
 def camera():
@@ -315,8 +409,12 @@ def main(arguments=None):
         draw_traces(result, options.traces, options.object)
     touching = [f for f, force in zip(FINGERS, result["force"][-1]) if force > HELD]
     all_hold = (result["force"] > HELD).all(axis=1)[result["time"] > CLOSE + SQUEEZE]
-    print(f"{options.object}: lifted by {1e3 * result['height'][-1]:.0f} mm, held by {', '.join(touching) or 'nothing'}; "
-          f"all five tips hold it in {100 * all_hold.mean():.0f} % of the lift; forces {np.round(result['force'][-1], 2)} N")  # fmt: skip
+    print(
+        f"{options.object}: lifted by {1e3 * result['height'][-1]:.0f} mm, held by "
+        f"{', '.join(touching) or 'nothing'}; "
+        f"all five tips hold it in {100 * all_hold.mean():.0f} % of the lift; forces "
+        f"{np.round(result['force'][-1], 2)} N"
+    )
     return result
 
 

@@ -1,4 +1,5 @@
-"""Every task with its scripted controller, which acts on touch alone: prints the score so far and writes a picture of each.
+"""Every task with its scripted controller, which acts on touch alone: prints the score so far and writes a
+picture of each.
 
 python examples/task_pictures.py --out docs/gallery [--tasks press,lift] [--seconds 2]
 """
@@ -47,7 +48,9 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/tasks"))
     parser.add_argument("--tasks", help="comma-separated; default all")
-    parser.add_argument("--seconds", type=float, help="how long each acts (default: until there is something to see)")
+    parser.add_argument(
+        "--seconds", type=float, help="how long each acts (default: until there is something to see)"
+    )
     options = parser.parse_args(arguments)
     written = {}
     for domain, task in tasks():
@@ -65,7 +68,9 @@ def main(arguments=None):
             path.parent.mkdir(parents=True, exist_ok=True)
             imsave(path, np.ascontiguousarray(picture))
             written[task] = path
-        print(f"{domain}/{task}: mean reward {score:.2f} in the first {env.physics.data.time:.1f} s", flush=True)
+        print(
+            f"{domain}/{task}: mean reward {score:.2f} in the first {env.physics.data.time:.1f} s", flush=True
+        )
         env.close()
     return written
 

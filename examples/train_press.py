@@ -1,8 +1,9 @@
-"""Short training on the force task with PPO, with touch and without: python examples/train_press.py --steps 30000 --json out/train.json
+"""Short training on the force task with PPO, with touch and without: python examples/train_press.py --steps
+30000 --json out/train.json
 
-The finger only moves up and down, thirty times a second, over a plate of unknown height; the wanted force is told and changes once. With
-touch the policy sees electrodes and PDC, without only its own height and the wanted force. Needs the extra `examples` (stable-baselines3).
-"""
+The finger only moves up and down, thirty times a second, over a plate of unknown height; the wanted force is
+told and changes once. With touch the policy sees electrodes and PDC, without only its own height and the
+wanted force. Needs the extra `examples` (stable-baselines3)."""
 
 import argparse
 import json
@@ -27,7 +28,13 @@ class PressByTouch(gymnasium.Env):
 
     def __init__(self, touch=True):
         self.touch = touch
-        self.env = BioTacEnv("finger", "press", observe="tactile" if touch else "none", time_limit=SECONDS, physics_timestep=0.01)
+        self.env = BioTacEnv(
+            "finger",
+            "press",
+            observe="tactile" if touch else "none",
+            time_limit=SECONDS,
+            physics_timestep=0.01,
+        )
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (22 if touch else 2,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
 
@@ -74,13 +81,30 @@ def train(touch, steps, seed=0, rollout=512, minutes=None):
         def _on_rollout_end(self):
             done = list(self.model.ep_info_buffer)[-10:]
             length = SECONDS / 0.01 / REPEAT
-            mean = float(np.mean([e["r"] for e in done]) / length) if done else float(np.mean(self.model.rollout_buffer.rewards))
-            rows.append({"steps": int(self.num_timesteps), "reward": mean, "seconds": time.process_time() - begin})
+            mean = (
+                float(np.mean([e["r"] for e in done]) / length)
+                if done
+                else float(np.mean(self.model.rollout_buffer.rewards))
+            )
+            rows.append(
+                {"steps": int(self.num_timesteps), "reward": mean, "seconds": time.process_time() - begin}
+            )
             print(f"{'touch' if touch else 'no touch'}: {rows[-1]}", flush=True)
 
     env = Monitor(PressByTouch(touch))
-    model = PPO("MlpPolicy", env, n_steps=rollout, batch_size=64, n_epochs=8, gamma=0.97, learning_rate=1e-3, ent_coef=1e-3, seed=seed,
-                policy_kwargs={"net_arch": [64, 64], "log_std_init": -0.7}, device="cpu")  # fmt: skip
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=rollout,
+        batch_size=64,
+        n_epochs=8,
+        gamma=0.97,
+        learning_rate=1e-3,
+        ent_coef=1e-3,
+        seed=seed,
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": -0.7},
+        device="cpu",
+    )
     model.learn(steps, callback=Log())
     env.close()
     return rows
@@ -94,7 +118,10 @@ def main(arguments=None):
     parser.add_argument("--inputs", default="touch,none", help="comma-separated: touch, none")
     parser.add_argument("--json", type=pathlib.Path, default=pathlib.Path("out/train.json"))
     options = parser.parse_args(arguments)
-    found = {name: train(name == "touch", options.steps, options.seed, minutes=options.minutes) for name in options.inputs.split(",")}
+    found = {
+        name: train(name == "touch", options.steps, options.seed, minutes=options.minutes)
+        for name in options.inputs.split(",")
+    }
     options.json.parent.mkdir(parents=True, exist_ok=True)
     options.json.write_text(json.dumps(found, indent=1))
     for name, rows in found.items():

@@ -1,8 +1,8 @@
 """The engine plugin "biotac_mj.skin": MuJoCo's plugin interface, served from Python through ctypes.
 
-MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter lock for each call. Nothing
-may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown as -1 in the status sensor and raised again by `check`.
-"""
+MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter
+lock for each call. Nothing may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown
+as -1 in the status sensor and raised again by `check`."""
 
 import atexit
 import ctypes
@@ -20,7 +20,8 @@ __all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
 
 PLUGIN_NAME = "biotac_mj.skin"
 
-# Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see `biotac_mj.coupling.config`.
+# Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
+# `biotac_mj.coupling.config`.
 ATTRIBUTES = (
     "skin",
     "stepper",
@@ -64,7 +65,17 @@ class _Plugin(ctypes.Structure):
         ("capabilityflags", _INT),
         ("needstage", _INT),
         *_CALLBACKS.items(),
-        *((name, _PTR) for name in ("act_dot", "sdf_distance", "sdf_gradient", "sdf_staticdistance", "sdf_attribute", "sdf_aabb")),
+        *(
+            (name, _PTR)
+            for name in (
+                "act_dot",
+                "sdf_distance",
+                "sdf_gradient",
+                "sdf_staticdistance",
+                "sdf_attribute",
+                "sdf_aabb",
+            )
+        ),
     ]
 
 
@@ -85,14 +96,20 @@ def _keep(error):
         if len(_errors) < _MAX_ERRORS:
             _errors.append(error)
     try:
-        warnings.warn(f"BioTac: {str(error) or type(error).__name__} (biotac_mj.plugin.check() raises it)", RuntimeWarning, stacklevel=3)
+        warnings.warn(
+            f"BioTac: {str(error) or type(error).__name__} (biotac_mj.plugin.check() raises it)",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     except RuntimeWarning:  # the user turned warnings into errors: it is kept above
         pass
 
 
 def _guarded(on_error):
     def decorate(function):
-        finalizing = sys.is_finalizing  # what is left when MuJoCo frees the last mjData: this module's names are gone by then
+        finalizing = (
+            sys.is_finalizing
+        )  # what is left when MuJoCo frees the last mjData: this module's names are gone by then
 
         @functools.wraps(function)
         def call(*args):
@@ -213,22 +230,28 @@ def register():
         )
         slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))
         if slot < 0:
-            raise RuntimeError(f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of biotac_mj loaded?")
+            raise RuntimeError(
+                f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of "
+                "biotac_mj loaded?"
+            )
         _alive.extend((callbacks, names, plugin))
         atexit.register(_fall_silent, slot)
 
 
 def _fall_silent(slot):
-    """When Python ends: an mjData that outlives it is freed by MuJoCo alone; a call into a finalized interpreter would crash."""
+    """When Python ends: an mjData that outlives it is freed by MuJoCo alone; a call into a finalized
+    interpreter would crash."""
     get = structs.LIBRARY.mjp_getPluginAtSlot
     get.restype, get.argtypes = ctypes.POINTER(_Plugin), (_INT,)
     get(slot).contents.destroy = _CALLBACKS["destroy"]()  # none
 
 
 def check():
-    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was none.
+    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was
+    none.
 
-    Call it in long loops: a KeyboardInterrupt that came while a skin was solved is among the errors, for it cannot pass through C either.
+    Call it in long loops: a KeyboardInterrupt that came while a skin was solved is among the errors, for it
+      cannot pass through C either.
     """
     with _lock:
         errors = list(_errors)

@@ -1,8 +1,8 @@
-"""mjModel and mjData seen from an engine plugin: numpy views on MuJoCo's own memory, laid out by `mujoco.introspect`.
+"""mjModel and mjData seen from an engine plugin: numpy views on MuJoCo's own memory, laid out by
+`mujoco.introspect`.
 
-A plugin's callbacks get bare addresses. The field layouts of the installed MuJoCo come from its own introspection tables, so that a new
-release that adds fields needs no change here.
-"""
+A plugin's callbacks get bare addresses. The field layouts of the installed MuJoCo come from its own
+introspection tables, so that a new release that adds fields needs no change here."""
 
 import ctypes
 import pathlib
@@ -13,7 +13,9 @@ from mujoco.introspect import ast_nodes, enums, structs
 
 __all__ = ["LIBRARY", "DataView", "ModelView", "c_structs"]
 
-LIBRARY = ctypes.CDLL(str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*"))))  # already loaded: this only finds it
+LIBRARY = ctypes.CDLL(
+    str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
+)  # already loaded: this only finds it
 LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
 LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
 LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
@@ -71,7 +73,10 @@ def _c_type(node):
         return c_structs(name)
     if name in enums.ENUMS:
         return ctypes.c_int
-    raise ValueError(f"biotac_mj does not know MuJoCo's type {node.name!r}: this MuJoCo is newer than the plugin; install mujoco>=3.17,<4")
+    raise ValueError(
+        f"biotac_mj does not know MuJoCo's type {node.name!r}: this MuJoCo is newer than the plugin; "
+        "install mujoco>=3.17,<4"
+    )
 
 
 def c_structs(name):
@@ -101,7 +106,9 @@ class _View:
         """(shape) view of the memory that pointer `name` points to now, without looking up its size."""
         address = getattr(self.struct, name)
         last = self._seen.get(name)
-        if last is not None and last[0] == address and last[1] == shape:  # the same memory, whatever it holds now
+        if (
+            last is not None and last[0] == address and last[1] == shape
+        ):  # the same memory, whatever it holds now
             return last[2]
         dtype = self._field[name][0]
         if not address:
@@ -123,8 +130,12 @@ class _View:
 def _extent(extent):
     if isinstance(extent, int) or extent.isdigit():
         return int(extent)
-    constants = {name: value for enum in enums.ENUMS.values() for name, value in enum.values.items() if name == extent}
-    return constants.get(extent, getattr(mujoco, extent, extent))  # a constant such as mjNREF, or the name of a size
+    constants = {
+        name: value for enum in enums.ENUMS.values() for name, value in enum.values.items() if name == extent
+    }
+    return constants.get(
+        extent, getattr(mujoco, extent, extent)
+    )  # a constant such as mjNREF, or the name of a size
 
 
 def _pointer_fields(kind):
@@ -133,7 +144,8 @@ def _pointer_fields(kind):
         _built[key] = {
             f.name: (_DTYPES.get(f.type.inner_type.name), tuple(_extent(e) for e in f.array_extent or ()))
             for f in structs.STRUCTS[kind].fields
-            if isinstance(getattr(f, "type", None), ast_nodes.PointerType) and isinstance(f.type.inner_type, ast_nodes.ValueType)
+            if isinstance(getattr(f, "type", None), ast_nodes.PointerType)
+            and isinstance(f.type.inner_type, ast_nodes.ValueType)
         }
     return _built[key]
 
@@ -166,7 +178,8 @@ class ModelView(_View):
 
 
 class DataView(_View):
-    """mjData at an address. Arrays of fixed size are kept; those that live on the arena (efc_*, contacts) are looked up at each use."""
+    """mjData at an address. Arrays of fixed size are kept; those that live on the arena (efc_*, contacts) are
+    looked up at each use."""
 
     def __init__(self, address, model):
         super().__init__("mjData", address)
@@ -180,7 +193,9 @@ class DataView(_View):
         if name not in self._field:
             return getattr(self.struct, name)
         value = self.array(name)
-        if not name.startswith(("efc_", "iefc_", "map_", "contact", "island_", "dof_island", "tree_island", "tendon_efcadr")):
+        if not name.startswith(
+            ("efc_", "iefc_", "map_", "contact", "island_", "dof_island", "tree_island", "tendon_efcadr")
+        ):
             self.__dict__[name] = value
         return value
 
@@ -188,19 +203,22 @@ class DataView(_View):
         """(6, nv) Jacobian of the point [m, world] that moves with `body`: translation, then rotation."""
         out = np.empty((6, self.model.nv))
         address = out.ctypes.data
-        LIBRARY.mj_jac(self.model.address, self.address, address, address + 24 * self.model.nv, point.ctypes.data, body)
+        LIBRARY.mj_jac(
+            self.model.address, self.address, address, address + 24 * self.model.nv, point.ctypes.data, body
+        )
         return out
 
     def project_constraints(self):
-        """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and regularisation."""
+        """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and
+        regularisation."""
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
 
     def acceleration(self):
-        """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint rows as they are now.
+        """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
+        rows as they are now.
 
-        Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of mj_inverse, warm start) is
-        put back.
-        """
+        Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of
+        mj_inverse, warm start) is put back."""
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart
         kept = qacc.copy(), warmstart.copy()

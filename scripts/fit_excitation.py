@@ -1,9 +1,13 @@
-"""Where the four excitation electrodes of the film model may sit: fits EXCITATION and CONDUCTIVITY of biotac_mj/sensor/film.py.
+"""Where the four excitation electrodes of the film model may sit: fits EXCITATION and CONDUCTIVITY of
+biotac_mj/sensor/film.py.
 
-Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric about z = 0, whose film
-impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its mean, over the mean pattern of
-the three published sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an estimate, not a measurement; the
-list of local optima shows how flat it is. EXCITATION is the best on the paper's mesh (import it, then pass --skin); takes a minute.
+Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric
+about z = 0, whose film
+impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its
+  mean, over the mean pattern of
+the three published sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an
+estimate, not a measurement; the list of local optima shows how flat it is. EXCITATION is the best on the
+paper's mesh (import it, then pass --skin); takes a minute.
 
     python scripts/fit_excitation.py [--skin default]
 """
@@ -17,7 +21,9 @@ from scipy.optimize import minimize
 from biotac_mj.sensor.channels import REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.film import CONDUCTIVITY, FilmConduction
 
-CLEARANCE = 1.7e-3  # [m] between the centres of any two discs, so that their footprints in the sheet do not overlap
+CLEARANCE = (
+    1.7e-3  # [m] between the centres of any two discs, so that their footprints in the sheet do not overlap
+)
 
 
 def target():
@@ -32,7 +38,8 @@ def pairs(parameter):
 
 
 def misfit(geometry, parameter, goal):
-    """RMS of ln(published / film) about its mean, its mean, and the correlation; infinite where discs overlap or lack a film."""
+    """RMS of ln(published / film) about its mean, its mean, and the correlation; infinite where discs overlap
+    or lack a film."""
     try:
         film = FilmConduction(geometry, excitation=pairs(parameter), sensor=None)
         centre = np.concatenate([geometry.electrode_pos, film.excitation_pos])
@@ -69,7 +76,9 @@ def fit(geometry, starts=6):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--skin", default="default", help="name or path of a stored skin")
     parser.add_argument("--starts", type=int, default=6, help="how many grid points to refine")
     arguments = parser.parse_args()
@@ -83,7 +92,8 @@ def main():
         x1, a1, x2, a2 = parameter
         sigma = CONDUCTIVITY * np.exp(-offset)
         print(
-            f"{rms:.4f}  {correlation:.3f}  {x1 * 1e3:7.2f}  {np.degrees(a1):12.1f}  {x2 * 1e3:7.2f}  {np.degrees(a2):12.1f}  {sigma:10.4f}"
+            f"{rms:.4f}  {correlation:.3f}  {x1 * 1e3:7.2f}  {np.degrees(a1):12.1f}  {x2 * 1e3:7.2f}  "
+            f"{np.degrees(a2):12.1f}  {sigma:10.4f}"
         )
 
 

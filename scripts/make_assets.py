@@ -1,9 +1,11 @@
-"""Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid parts and the indenters.
+"""Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid
+parts and the indenters.
 
     pip install -e ".[mesh]"
     python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
 
-fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run; the surfaces and the quality
+fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run; the
+  surfaces and the quality
 stay the same.
 """
 
@@ -26,7 +28,8 @@ from biotac_mj.geometry.tet_mesh import TetMesh
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
 
-# edge of the ten-node tetrahedra [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of the box's diagonal (32 mm)
+# edge of the ten-node tetrahedra [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of
+# the box's diagonal (32 mm)
 RESOLUTIONS = {
     "coarse": {"edge": 3.5, "spacing": 0.5, "epsilon": 8e-3},
     "default": {"edge": 2.4, "spacing": 0.4, "epsilon": 6e-3},
@@ -43,9 +46,20 @@ def surface_only(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=[*RESOLUTIONS, "rigid", "indenters"], default=[*RESOLUTIONS, "rigid", "indenters"])
-    parser.add_argument("--keep-tetrahedra", action="store_true", help="put the stored skins together again, around new rigid parts")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=[*RESOLUTIONS, "rigid", "indenters"],
+        default=[*RESOLUTIONS, "rigid", "indenters"],
+    )
+    parser.add_argument(
+        "--keep-tetrahedra",
+        action="store_true",
+        help="put the stored skins together again, around new rigid parts",
+    )
     args = parser.parse_args()
     only = args.only
     bodies = biotac_bodies()
@@ -73,7 +87,10 @@ def main():
         skin = with_edge_nodes(skin, lambda point, side: 1e-3 * bodies[SIDES[side]].project(1e3 * point))
         skin = dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held_nodes(skin.vert, rigid.values())))
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
-        made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then `improve` and `with_edge_nodes`"
+        made = (
+            f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then `improve` "
+            "and `with_edge_nodes`"
+        )
         print(write_card(path.with_suffix(".md"), skin, made).read_text())
 
 

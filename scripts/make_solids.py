@@ -1,11 +1,12 @@
-"""Makes the filled bodies of the solid configurations (`biotac_mj.calibration.configurations`) with a card each.
+"""Makes the filled bodies of the solid configurations (`biotac_mj.calibration.configurations`) with a card
+each.
 
     pip install -e ".[mesh]"
     python scripts/make_solids.py [--edge 1.7] [--only solid_coarse solid_with_core_coarse]
 
-`solid` fills everything inside the outer surface and is held by nail and clamp plate; `solid_with_core` fills the space between the
-outer surface and the rigid core and is bonded to the core too. Neither has an inner surface: there is no liquid and no gap.
-"""
+`solid` fills everything inside the outer surface and is held by nail and clamp plate; `solid_with_core` fills
+the space between the outer surface and the rigid core and is bonded to the core too. Neither has an inner
+surface: there is no liquid and no gap."""
 
 import argparse
 import importlib.metadata
@@ -22,7 +23,9 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
-BONDED = 0.05  # [mm] boundary nodes nearer to the core's surface than this are bonded to it; the outer surface is 1.5 mm away
+# [mm] boundary nodes nearer to the core's surface than this are bonded to it; the outer surface is 1.5 mm
+# away
+BONDED = 0.05
 NAMES = ("solid_coarse", "solid_with_core_coarse")
 
 
@@ -39,7 +42,9 @@ def make_solid(name: str, settings: dict) -> SkinGeometry:
     rigid = {part: read_obj(ASSETS / f"{part}.obj")[0] for part in ("core", "nail", "clamp")}
     held = held_nodes(mesh.vert, [rigid["nail"], rigid["clamp"]])
     position, normal = electrodes(bodies["core"])
-    parts = {f"{part}_{what}": value for part, pair in rigid.items() for what, value in zip(("vert", "face"), pair)}
+    parts = {
+        f"{part}_{what}": value for part, pair in rigid.items() for what, value in zip(("vert", "face"), pair)
+    }
     return SkinGeometry(
         name=name,
         vert=mesh.vert,
@@ -85,7 +90,9 @@ Licence: Apache-2.0, like the rest of the project. No part of another mesh is in
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES)
     parser.add_argument("--edge", type=float, default=1.7, help="wanted edge length [mm]")
     args = parser.parse_args()
@@ -93,7 +100,10 @@ def main():
     for name in args.only:
         skin = make_solid(name, settings)
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
-        made = f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then biotac_mj.geometry.meshing.improve"
+        made = (
+            f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then "
+            "biotac_mj.geometry.meshing.improve"
+        )
         write_card(path.with_suffix(".md"), skin, made)
         print(path.with_suffix(".md").read_text())
 

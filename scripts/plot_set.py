@@ -1,4 +1,5 @@
-"""A look at a data set: where objects touched, how hard, and what simulated and measured electrodes said: python scripts/plot_set.py SET"""
+"""A look at a data set: where objects touched, how hard, and what simulated and measured electrodes said:
+python scripts/plot_set.py SET"""
 
 import argparse
 
@@ -18,12 +19,21 @@ def places(axes, data, peak):
     """First touch along and around the finger, on the skin seen from the pad and unrolled."""
     start = np.array([data.parameters(i)["start"] for i in range(len(data))])
     axes.scatter(*unrolled(data.geometry.vert[np.unique(data.geometry.outer_face)]), s=1, c="0.85")
-    axes.scatter(*unrolled(data.geometry.electrode_pos), s=60, marker="s", facecolors="none", edgecolors="0.4", label="electrodes")
+    axes.scatter(
+        *unrolled(data.geometry.electrode_pos),
+        s=60,
+        marker="s",
+        facecolors="none",
+        edgecolors="0.4",
+        label="electrodes",
+    )
     for kind, colour in KINDS.items():
         mine = data.kind == kind
         axes.scatter(*unrolled(start[mine]), s=6 + 4 * peak[mine], c=colour, alpha=0.6, linewidths=0)
         axes.scatter([], [], s=30, c=colour, label=kind)
-    axes.set(xlabel="x [mm] (tip left)", ylabel="angle round the finger [deg], 0 is the pad", ylim=(-135, 135))
+    axes.set(
+        xlabel="x [mm] (tip left)", ylabel="angle round the finger [deg], 0 is the pad", ylim=(-135, 135)
+    )
     axes.set_title(f"{len(data)} synthetic interactions, {data.nstep} time steps; size: largest force")
     axes.legend(loc="upper right", fontsize=8)
 
@@ -35,7 +45,12 @@ def unrolled(point):
 def forces(axes, data, peak):
     """Largest force of each interaction, object by object."""
     names = sorted(set(data.object.tolist()))
-    axes.boxplot([peak[data.object == name] for name in names], orientation="horizontal", tick_labels=names, flierprops={"markersize": 2})
+    axes.boxplot(
+        [peak[data.object == name] for name in names],
+        orientation="horizontal",
+        tick_labels=names,
+        flierprops={"markersize": 2},
+    )
     axes.set(xlabel="largest force [N]", title="force")
     axes.grid(axis="x", alpha=0.3)
 
@@ -51,7 +66,11 @@ def traces(axes, data, peak):
     for k, e in enumerate(np.abs(measured).max(0).argsort()[-2:]):
         axes.plot(one.time, measured[:, e], f"C{k}o-", label=f"e{e + 1}, synthetic measured sensor")
         axes.plot(one.time, simulated[:, e], f"C{k}--", label=f"e{e + 1}, simulated")
-    axes.set(xlabel="time [s]", ylabel="change [counts]", title=f"interaction {one.id}: {one.kind} with {one.object}")
+    axes.set(
+        xlabel="time [s]",
+        ylabel="change [counts]",
+        title=f"interaction {one.id}: {one.kind} with {one.object}",
+    )
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
 
@@ -69,10 +88,17 @@ def main(path, out):
         if data.labelled.any():
             step = data.steps(data.labelled)
             tare = np.repeat(data.start[data.labelled], (data.stop - data.start)[data.labelled])
-            simulated, measured = (data[name][step][:, :19] - data[name][tare][:, :19] for name in ("counts", "measured_counts"))
+            simulated, measured = (
+                data[name][step][:, :19] - data[name][tare][:, :19] for name in ("counts", "measured_counts")
+            )
             rms = {"no change": measured, "the simulator": measured - simulated}
             rows = {name: np.sqrt((value**2).mean(1)) for name, value in rms.items()}
-            print("; ".join(f"{name} misses measured counts by {np.median(value):.1f} RMS (median step)" for name, value in rows.items()))
+            print(
+                "; ".join(
+                    f"{name} misses measured counts by {np.median(value):.1f} RMS (median step)"
+                    for name, value in rows.items()
+                )
+            )
 
 
 if __name__ == "__main__":

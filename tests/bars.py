@@ -41,7 +41,8 @@ def cube(law, element, nu=0.3, modulus=None, young=E, **material):
 
 
 def deform(model, data, F, dt):
-    """First Piola stress (3, 3) [Pa] after a step to the homogeneous F: mean over the cube of f x X on its surface."""
+    """First Piola stress (3, 3) [Pa] after a step to the homogeneous F: mean over the cube of f x X on its
+    surface."""
     for array in (data.x, data.x_last):
         view(array)[:, 0] = model.geometry.vert @ F.T
     step(model, data, NOTHING, dt)

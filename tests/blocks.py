@@ -1,4 +1,5 @@
-"""Small bodies with known answers: boxes, bars and thick spherical shells of tetrahedra, as skins without a core."""
+"""Small bodies with known answers: boxes, bars and thick spherical shells of tetrahedra, as skins without a
+core."""
 
 import itertools
 
@@ -29,7 +30,9 @@ def box(axes, jitter=0.0, seed=0):
     node = np.arange(len(vert)).reshape(shape)
     cell = np.stack(np.meshgrid(*[np.arange(n - 1) for n in shape], indexing="ij"), -1).reshape(-1, 3)
     elem = []
-    for order in itertools.permutations(range(3)):  # Kuhn's split: from corner to opposite corner along the three axes in every order
+    for order in itertools.permutations(
+        range(3)
+    ):  # Kuhn's split: from corner to opposite corner along the three axes in every order
         corner, path = cell.copy(), []
         path.append(node[tuple(corner.T)])
         for axis in order:
@@ -50,10 +53,19 @@ def shell(outer, inner, subdivisions=2, layers=3):
     n = len(ball.vertices)
     vert = np.concatenate([r * ball.vertices for r in np.linspace(outer, inner, layers + 1)])
     f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
-    elem = np.concatenate([np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
-                                           np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
-                                           np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1)]) + k * n
-                           for k in range(layers)])  # fmt: skip
+    elem = np.concatenate(
+        [
+            np.concatenate(
+                [
+                    np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
+                    np.stack([f[:, 0], f[:, 1], f[:, 1] + n, f[:, 2] + n], 1),
+                    np.stack([f[:, 0], f[:, 0] + n, f[:, 1] + n, f[:, 2] + n], 1),
+                ]
+            )
+            + k * n
+            for k in range(layers)
+        ]
+    )
     flipped = np.linalg.det(vert[elem[:, 1:]] - vert[elem[:, :1]]) < 0
     elem[flipped] = elem[flipped][:, [0, 1, 3, 2]]
     return vert, elem.astype(np.int32), (ball.faces[:, ::-1] + layers * n).astype(np.int32)
@@ -72,7 +84,8 @@ def faces_on(vert, face, axis, value):
 
 
 def nodal_areas(vert, face):
-    """A third of each face's area to each of its corners (nvert,): the nodal loads of a uniform traction of one."""
+    """A third of each face's area to each of its corners (nvert,): the nodal loads of a uniform traction of
+    one."""
     edge = vert[face[:, 1:]] - vert[face[:, :1]]
     out = np.zeros(len(vert))
     np.add.at(out, face.ravel(), np.repeat(np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 6, 3))
@@ -80,7 +93,8 @@ def nodal_areas(vert, face):
 
 
 def half_space(cells, radius, fine, touched):
-    """Block below z = 0 that reaches 4.5 radii: `cells` cells per radius within `fine` radii of the origin, coarser away from it.
+    """Block below z = 0 that reaches 4.5 radii: `cells` cells per radius within `fine` radii of the origin,
+    coarser away from it.
 
     Returns:
       vert, elem, held (nodes of sides and bottom), and the faces on top within `touched` radii.
@@ -107,11 +121,14 @@ def skin(vert, elem, fixed, outer_face=None, inner_face=None, name="block", core
             outer_face = np.array([f for f in outer_face if tuple(np.sort(f)) not in known])
     core_vert, core_face = (none, no_face) if core is None else core
     plates, electrodes = (none, no_face, none, no_face), (np.zeros((19, 3)), np.zeros((19, 3)))
-    return SkinGeometry(name, vert, elem, outer_face, inner_face, fixed, core_vert, core_face, *plates, *electrodes)
+    return SkinGeometry(
+        name, vert, elem, outer_face, inner_face, fixed, core_vert, core_face, *plates, *electrodes
+    )
 
 
 def place(data, nodes, position):
-    """Puts nodes of all worlds at `position` (n, 3) [m]: fixed ones stay there, which is how tests prescribe displacements."""
+    """Puts nodes of all worlds at `position` (n, 3) [m]: fixed ones stay there, which is how tests prescribe
+    displacements."""
     for array in (data.x, data.x_last):
         view(array)[nodes] = np.asarray(position)[:, None]
 
@@ -121,5 +138,8 @@ def four_nodes(name):
     shipped = load_skin(name)
     elem = shipped.elem[:, :4]
     mesh = TetMesh(shipped.vert[: elem.max() + 1], elem)
-    rigid = [(getattr(shipped, f"{part}_vert"), getattr(shipped, f"{part}_face")) for part in ("core", "nail", "clamp")]
+    rigid = [
+        (getattr(shipped, f"{part}_vert"), getattr(shipped, f"{part}_face"))
+        for part in ("core", "nail", "clamp")
+    ]
     return assemble(name, mesh, *rigid)

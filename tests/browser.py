@@ -16,7 +16,9 @@ __all__ = ["Browser", "executable"]
 
 def executable():
     """Path of a Chromium or Chrome, or None."""
-    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+    return next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
+    )
 
 
 class Browser:
@@ -27,14 +29,24 @@ class Browser:
 
         self._log = open(pathlib.Path(profile) / "chromium.log", "w")
         flags = [
-            *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--disable-background-networking"),
+            *(
+                "--headless=new",
+                "--no-sandbox",
+                "--no-first-run",
+                "--disable-extensions",
+                "--disable-background-networking",
+            ),
             *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0"),
             f"--window-size={size[0]},{size[1]}",
             f"--user-data-dir={profile}",
         ]
         self._process = subprocess.Popen([executable(), *flags, url], stdout=self._log, stderr=self._log)
         try:
-            port = int(self._wait(lambda: (pathlib.Path(profile) / "DevToolsActivePort").read_text().split("\n")[0], 30))
+            port = int(
+                self._wait(
+                    lambda: (pathlib.Path(profile) / "DevToolsActivePort").read_text().split("\n")[0], 30
+                )
+            )
             page = self._wait(lambda: next(p for p in self._pages(port) if p["type"] == "page"), 30)
             self._socket, self._count = connect(page["webSocketDebuggerUrl"], max_size=None), 0
         except BaseException:

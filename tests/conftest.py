@@ -16,7 +16,8 @@ REPO = pathlib.Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="session", autouse=True)
 def default_device():
-    """Arrays of the tests are on the CPU, as the package's own are by default, also where CUDA is; tests of CUDA name their device."""
+    """Arrays of the tests are on the CPU, as the package's own are by default, also where CUDA is; tests of
+    CUDA name their device."""
     import warp as wp
 
     wp.set_device("cpu")
@@ -39,7 +40,8 @@ def shared():
 
 @pytest.fixture(scope="session")
 def shell():
-    """A small closed shell of a finger's size with 19 electrodes along a helix: for what needs a skin's topology, not its physics."""
+    """A small closed shell of a finger's size with 19 electrodes along a helix: for what needs a skin's
+    topology, not its physics."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=3)
@@ -58,13 +60,28 @@ def shell():
     normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
     electrode = np.stack([np.linspace(-16e-3, -2e-3, 19), 5e-3 * normal[:, 1], 5e-3 * normal[:, 2]], 1)
     empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
-    return SkinGeometry("synthetic", vert, elem, ball.faces, ball.faces[:, ::-1] + n, np.flatnonzero(vert[:, 0] > 3e-3),
-                        core, ball.faces, empty, no_face, empty, no_face, electrode, normal)  # fmt: skip
+    return SkinGeometry(
+        "synthetic",
+        vert,
+        elem,
+        ball.faces,
+        ball.faces[:, ::-1] + n,
+        np.flatnonzero(vert[:, 0] > 3e-3),
+        core,
+        ball.faces,
+        empty,
+        no_face,
+        empty,
+        no_face,
+        electrode,
+        normal,
+    )
 
 
 @pytest.fixture(scope="session")
 def synthetic_press(shell):
-    """A recorded press that nobody simulated: a sphere of 3.5 mm radius leaves its print in the shell, Hertz's force, made-up counts."""
+    """A recorded press that nobody simulated: a sphere of 3.5 mm radius leaves its print in the shell,
+    Hertz's force, made-up counts."""
     import trimesh
 
     from biotac_mj.press_record import PressRecord

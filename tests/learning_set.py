@@ -1,4 +1,5 @@
-"""A small data set whose truth is known: smooth dents, and electrodes that answer to the film above them by a rule written here."""
+"""A small data set whose truth is known: smooth dents, and electrodes that answer to the film above them by a
+rule written here."""
 
 import numpy as np
 
@@ -21,7 +22,8 @@ def dent(geometry, centre, depth, radius, slide):
 
 
 def log_change(geometry, u):
-    """(19,): the rule. 600 per metre of the mean inward motion of the inner nodes within 2.5 mm of an electrode."""
+    """(19,): the rule. 600 per metre of the mean inward motion of the inner nodes within 2.5 mm of an
+    electrode."""
     inner = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
     out = np.empty(19)
     for e, (place, normal) in enumerate(zip(geometry.electrode_pos, geometry.electrode_normal)):
@@ -31,7 +33,8 @@ def log_change(geometry, u):
 
 
 def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labelled=None, gain=1.0):
-    """Writes shards and returns their folder. The first `labelled` interactions are labelled; simulated changes are 0.8 as large."""
+    """Writes shards and returns their folder. The first `labelled` interactions are labelled; simulated
+    changes are 0.8 as large."""
     geometry = load_skin(skin)
     rng = np.random.default_rng(seed)
     outer = np.unique(geometry.outer_face)
@@ -51,17 +54,38 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
         counts = np.full((steps, 23), 2000.0)
         counts[:, :19] = np.rint(4095 / (1 + np.exp(z0 + 0.8 * d)))
         bell = np.exp(-0.5 * ((geometry.vert[outer] - centre) ** 2).sum(1) / radius**2)
-        force = (depth[:, None] * 1e3 * np.where(bell > 0.4, bell, 0) / bell.sum())[..., None] * [0.0, 1.0, 0.0]
+        force = (depth[:, None] * 1e3 * np.where(bell > 0.4, bell, 0) / bell.sum())[..., None] * [
+            0.0,
+            1.0,
+            0.0,
+        ]
         flag = labelled is None or k < labelled
-        zeros = {"wrench": np.zeros((steps, 6)), "pressure": np.zeros(steps), "indenter_pos": np.zeros((steps, 3))}
+        zeros = {
+            "wrench": np.zeros((steps, 6)),
+            "pressure": np.zeros(steps),
+            "indenter_pos": np.zeros((steps, 3)),
+        }
         one = dict(
-            id=f"t{seed}-{k}", object=name, kind="press", split="train", seed=k, parameters={}, time=0.05 * np.arange(steps),
-            displacement=u, contact_force=force, impedance=1e4 * np.exp(z0 + 0.8 * d), **zeros,
-            counts=counts, indenter_quat=np.tile([1.0, 0, 0, 0], (steps, 1)), converged=np.ones(steps, bool),
-        )  # fmt: skip
+            id=f"t{seed}-{k}",
+            object=name,
+            kind="press",
+            split="train",
+            seed=k,
+            parameters={},
+            time=0.05 * np.arange(steps),
+            displacement=u,
+            contact_force=force,
+            impedance=1e4 * np.exp(z0 + 0.8 * d),
+            **zeros,
+            counts=counts,
+            indenter_quat=np.tile([1.0, 0, 0, 0], (steps, 1)),
+            converged=np.ones(steps, bool),
+        )
         if flag:
             measured = counts.copy()
-            measured[:, :19] = np.rint(4095 / (1 + np.exp(z0 + gain * d)) + noise * rng.normal(size=(steps, 19)))
+            measured[:, :19] = np.rint(
+                4095 / (1 + np.exp(z0 + gain * d)) + noise * rng.normal(size=(steps, 19))
+            )
             measured[0, :19] = rest
             one |= dict(measured_counts=measured, measured_wrench=np.zeros((steps, 6)))
         groups[flag].append(Interaction(**one))

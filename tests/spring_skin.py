@@ -1,8 +1,8 @@
 """A skin of independent springs on a flat pad: the coupling's test double, simple enough to know by heart.
 
-Every node of a square grid in the plane y = -8 mm resists the depth d of a geom over it with the force k d along the geom's normal there,
-and sliding with a tangential spring (stiffness k / 2) that is anchored in the geom and yields at mu k d.
-"""
+Every node of a square grid in the plane y = -8 mm resists the depth d of a geom over it with the force k d
+along the geom's normal there, and sliding with a tangential spring (stiffness k / 2) that is anchored in the
+geom and yields at mu k d."""
 
 import numpy as np
 
@@ -18,17 +18,43 @@ def pad_geometry(count=9, spacing=0.001, name="pad of springs"):
     x, z = np.meshgrid(line - 0.010, line, indexing="ij")
     vert = np.stack([x.ravel(), np.full(x.size, HEIGHT), z.ravel()], axis=1)
     a = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
-    outer = np.concatenate([np.stack([a, a + count, a + 1], 1), np.stack([a + 1, a + count, a + count + 1], 1)])
+    outer = np.concatenate(
+        [np.stack([a, a + count, a + 1], 1), np.stack([a + 1, a + count, a + count + 1], 1)]
+    )
     corner = np.array([[x, y, z] for x in (-0.019, 0.005) for y in (-0.005, 0.003) for z in (-0.005, 0.005)])
     box = np.array(
-        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+        [
+            [0, 1, 3],
+            [0, 3, 2],
+            [4, 6, 7],
+            [4, 7, 5],
+            [0, 4, 5],
+            [0, 5, 1],
+            [2, 3, 7],
+            [2, 7, 6],
+            [0, 2, 6],
+            [0, 6, 4],
+            [1, 5, 7],
+            [1, 7, 3],
+        ]
     )
     electrode = np.stack([np.linspace(-0.015, 0.0, 19), np.full(19, -0.005), np.zeros(19)], axis=1)
     return SkinGeometry(
-        name=name, vert=vert, elem=np.zeros((0, 4)), outer_face=outer, inner_face=np.zeros((0, 3)), fixed=np.zeros(0),
-        core_vert=corner, core_face=box, nail_vert=np.zeros((0, 3)), nail_face=np.zeros((0, 3)), clamp_vert=np.zeros((0, 3)),
-        clamp_face=np.zeros((0, 3)), electrode_pos=electrode, electrode_normal=np.tile([0.0, -1.0, 0.0], (19, 1)),
-    )  # fmt: skip
+        name=name,
+        vert=vert,
+        elem=np.zeros((0, 4)),
+        outer_face=outer,
+        inner_face=np.zeros((0, 3)),
+        fixed=np.zeros(0),
+        core_vert=corner,
+        core_face=box,
+        nail_vert=np.zeros((0, 3)),
+        nail_face=np.zeros((0, 3)),
+        clamp_vert=np.zeros((0, 3)),
+        clamp_face=np.zeros((0, 3)),
+        electrode_pos=electrode,
+        electrode_normal=np.tile([0.0, -1.0, 0.0], (19, 1)),
+    )
 
 
 def _depth(geom, point):
@@ -44,11 +70,14 @@ def _depth(geom, point):
         normal = np.zeros_like(point)
         normal[np.arange(len(point)), axis] = np.sign(point[np.arange(len(point)), axis])
         return -gap.max(axis=1), normal
-    return np.full(len(point), -1.0), np.tile([0.0, 0.0, 1.0], (len(point), 1))  # the springs do not feel other shapes
+    return np.full(len(point), -1.0), np.tile(
+        [0.0, 0.0, 1.0], (len(point), 1)
+    )  # the springs do not feel other shapes
 
 
 class SpringSkin:
-    """A SkinStepper. State of a node: geom it touches (0: none, i + 1), then its anchor in that geom's frame."""
+    """A SkinStepper. State of a node: geom it touches (0: none, i + 1), then its anchor in that geom's
+    frame."""
 
     def __init__(self, config, geometry, geoms):
         self.vert, self.geoms = geometry.vert, geoms
@@ -91,7 +120,8 @@ class SpringSkin:
             project = out[:, :, None] * out[:, None, :]
             across = np.eye(3) - project
             along = slip / np.maximum(np.linalg.norm(slip, axis=1), 1e-300)[:, None]
-            # a sliding spring resists across its motion only; how its force follows the normal force is left out (not symmetric)
+            # a sliding spring resists across its motion only; how its force follows the normal force is left
+            # out (not symmetric)
             across -= np.where(share < 1.0, 1.0, 0.0)[:, None, None] * along[:, :, None] * along[:, None, :]
             stiff = self.k * project + 0.5 * self.k * share[:, None, None] * across
             at = np.zeros((len(node), 3, 6))  # velocity at x of a body that moves by (t, w): t + w x x
@@ -106,7 +136,8 @@ class SpringSkin:
 
 
 class SumReadings:
-    """Readings with memory: e1 counts steps, pdc is the pressure, pac a random walk seeded by the settings."""
+    """Readings with memory: e1 counts steps, pdc is the pressure, pac a random walk seeded by the
+    settings."""
 
     nstate = 2
     rest = {"electrodes": np.full(19, 3000.0)}

@@ -1,4 +1,5 @@
-"""Slot times, filters, converter and noise against closed forms, for time steps that do not divide the frame."""
+"""Slot times, filters, converter and noise against closed forms, for time steps that do not divide the
+frame."""
 
 import numpy as np
 import pytest
@@ -25,7 +26,9 @@ def run(acquisition, state, dt, duration, signal):
 
 
 def flat(readings):
-    return np.concatenate([readings["electrodes"], readings["pac"], [readings["pdc"], readings["tac"], readings["tdc"]]])
+    return np.concatenate(
+        [readings["electrodes"], readings["pac"], [readings["pdc"], readings["tac"], readings["tdc"]]]
+    )
 
 
 def test_rest_counts():
@@ -45,7 +48,9 @@ def test_every_electrode_is_sampled_at_its_slot(dt):
     rate = np.linspace(1e4, 4e4, 19)
     run(acquisition, state, dt, 0.14, lambda t: (REST + rate * t, 0.0, 31.0))
     slot = 2 * np.arange(19) + 1
-    last = slot + SLOTS_PER_FRAME * np.floor((round(0.14 / dt) * dt * SLOT_RATE + 1e-6 - slot) / SLOTS_PER_FRAME)
+    last = slot + SLOTS_PER_FRAME * np.floor(
+        (round(0.14 / dt) * dt * SLOT_RATE + 1e-6 - slot) / SLOTS_PER_FRAME
+    )
     expected = np.round(channels.counts_from_impedance(REST + rate * last / SLOT_RATE))
     assert np.array_equal(acquisition.readings(state)["electrodes"], expected)
 
@@ -61,7 +66,9 @@ def test_pdc_step_response():
         acquisition.advance(state, start, 1e-9, REST, 50e3)
         acquisition.advance(state, start + 1e-9, 5e-4, REST, 50e3)
         expected = 50e3 * (1 - np.exp(-2 * np.pi * 1040 * delay))
-        assert channels.pressure_from_counts(acquisition.readings(state)["pdc"]) == pytest.approx(expected, abs=30)
+        assert channels.pressure_from_counts(acquisition.readings(state)["pdc"]) == pytest.approx(
+            expected, abs=30
+        )
 
 
 @pytest.mark.parametrize("hertz", [2.0, 100.0, 800.0])
@@ -131,7 +138,11 @@ def test_clipping_to_twelve_bits():
     acquisition, state = started()
     run(acquisition, state, 5e-3, 0.03, lambda t: (np.full(19, 1e12), 1e9, 31.0))
     readings = acquisition.readings(state)
-    assert np.all(readings["electrodes"] <= 25) and np.all(readings["electrodes"] >= 0) and readings["pdc"] == 4095
+    assert (
+        np.all(readings["electrodes"] <= 25)
+        and np.all(readings["electrodes"] >= 0)
+        and readings["pdc"] == 4095
+    )
 
 
 def test_one_film_solution_per_frame():
@@ -150,7 +161,9 @@ def test_impedance_is_held_between_solutions():
     for i in range(100):
         impedance = REST * (1 + i * 1e-3)
         time = i * 1e-3
-        acquisition.advance(state, time, 1e-3, impedance if acquisition.needs_impedance(state, time, 1e-3) else None)
+        acquisition.advance(
+            state, time, 1e-3, impedance if acquisition.needs_impedance(state, time, 1e-3) else None
+        )
     expected = channels.counts_from_impedance(REST[18] * (1 + 90e-3))  # solved in the step from 90 to 91 ms
     assert acquisition.readings(state)["electrodes"][18] == np.round(expected)
 

@@ -26,7 +26,9 @@ def spec_of(text=WORLD):
 
 
 def springs(spec, **settings):
-    return attach(spec, **({"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings))
+    return attach(
+        spec, **({"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings)
+    )
 
 
 def touching(model, index=0):
@@ -49,8 +51,12 @@ def test_pose_is_that_of_the_site_then_pos_and_quat():
     turn, own = np.empty(9), np.empty(9)
     mujoco.mju_quat2Mat(turn, [0.6, 0.8, 0, 0])
     mujoco.mju_quat2Mat(own, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
-    np.testing.assert_allclose(data.body(handle.body).xpos, [0, 0, 0.1] + turn.reshape(3, 3) @ [0.01, 0.02, 0.03], atol=1e-12)
-    np.testing.assert_allclose(data.body(handle.body).xmat.reshape(3, 3), turn.reshape(3, 3) @ own.reshape(3, 3), atol=1e-12)
+    np.testing.assert_allclose(
+        data.body(handle.body).xpos, [0, 0, 0.1] + turn.reshape(3, 3) @ [0.01, 0.02, 0.03], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        data.body(handle.body).xmat.reshape(3, 3), turn.reshape(3, 3) @ own.reshape(3, 3), atol=1e-12
+    )
 
 
 def test_model_carries_the_skins_parts():
@@ -63,31 +69,44 @@ def test_model_carries_the_skins_parts():
     node = np.unique(geometry.outer_face)
     np.testing.assert_allclose(model.skin_vert, geometry.vert[node], atol=1e-7)
     assert model.body(handle.body).parentid == model.body("hand").id
-    dims = {c: model.sensor(handle.sensor(c)).dim[0] for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")}
+    dims = {
+        c: model.sensor(handle.sensor(c)).dim[0]
+        for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
+    }
     assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=5)
     # the rigid core's mesh lies where the geometry says, whatever frame MuJoCo stores it in
     mujoco.mj_forward(model, data)
     geom = model.geom("tip_core")
     mesh = model.mesh(geom.dataid[0])
     world = (
-        model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]] @ data.geom(geom.id).xmat.reshape(3, 3).T
+        model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+        @ data.geom(geom.id).xmat.reshape(3, 3).T
         + data.geom(geom.id).xpos
     )
     local = (world - data.body(handle.body).xpos) @ data.body(handle.body).xmat.reshape(3, 3)
-    np.testing.assert_allclose(sorted(local.round(6).tolist()), sorted(geometry.core_vert.round(6).tolist()), atol=1e-6)
+    np.testing.assert_allclose(
+        sorted(local.round(6).tolist()), sorted(geometry.core_vert.round(6).tolist()), atol=1e-6
+    )
 
 
 def test_geoms_that_touch_by_default():
-    """Colliding geoms, but those of the link it is fixed to, of the link's parent (as in MuJoCo's own filter), and of excluded bodies."""
+    """Colliding geoms, but those of the link it is fixed to, of the link's parent (as in MuJoCo's own
+    filter), and of excluded bodies."""
     spec = spec_of()
     springs(spec, body="hand")
     assert touching(spec.compile())[0] == ["cup"]
-    spec = spec_of(WORLD.replace("</worldbody>", '<geom name="floor" type="plane" size="1 1 1"/></worldbody>'))
+    spec = spec_of(
+        WORLD.replace("</worldbody>", '<geom name="floor" type="plane" size="1 1 1"/></worldbody>')
+    )
     springs(spec, body="hand")
     names, setup = touching(spec.compile())
     assert sorted(names) == ["cup", "floor"]
-    assert setup.touching.geoms[names.index("cup")].friction == pytest.approx(0.783414394)  # MuJoCo's rule: the larger
-    spec = spec_of(WORLD.replace("</mujoco>", '<contact><exclude body1="hand" body2="arm"/></contact></mujoco>'))
+    assert setup.touching.geoms[names.index("cup")].friction == pytest.approx(
+        0.783414394
+    )  # MuJoCo's rule: the larger
+    spec = spec_of(
+        WORLD.replace("</mujoco>", '<contact><exclude body1="hand" body2="arm"/></contact></mujoco>')
+    )
     springs(spec, geoms=["arm"], body="hand", rounding={"arm": 1e-3})
     names, setup = touching(spec.compile())
     assert names == ["arm"] and setup.touching.geoms[0].rounding == 1e-3
@@ -101,9 +120,13 @@ def test_excluded_bodies_do_not_touch():
 
 
 def test_meshes_arrive_in_the_geoms_frame():
-    text = WORLD.replace("<worldbody>", '<asset><mesh name="tetra" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .02"/></asset><worldbody>')
+    text = WORLD.replace(
+        "<worldbody>",
+        '<asset><mesh name="tetra" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .02"/></asset><worldbody>',
+    )
     text = text.replace(
-        "</worldbody>", '<body name="t" pos="1 0 0"><freejoint/><geom name="t" type="mesh" mesh="tetra"/></body></worldbody>'
+        "</worldbody>",
+        '<body name="t" pos="1 0 0"><freejoint/><geom name="t" type="mesh" mesh="tetra"/></body></worldbody>',
     )
     spec = spec_of(text)
     springs(spec, body="hand", geoms=["t"])
@@ -112,13 +135,17 @@ def test_meshes_arrive_in_the_geoms_frame():
     mujoco.mj_forward(model, data)
     geom = touching(model)[1].touching.geoms[0]
     world = geom.vert @ data.geom("t").xmat.reshape(3, 3).T + data.geom("t").xpos - [1, 0, 0]
-    np.testing.assert_allclose(sorted(world.round(6).tolist()), [[0, 0, 0], [0, 0, 0.02], [0, 0.02, 0], [0.02, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(
+        sorted(world.round(6).tolist()), [[0, 0, 0], [0, 0, 0.02], [0, 0.02, 0], [0.02, 0, 0]], atol=1e-6
+    )
     assert geom.face.shape == (4, 3)
 
 
 def test_saved_xml_says_everything(tmp_path):
     spec = spec_of()
-    handle = springs(spec, body="hand", rounding={"cup": 2e-3}, options={"stiffness": 500.0}, seed=7, coupling="one-way")
+    handle = springs(
+        spec, body="hand", rounding={"cup": 2e-3}, options={"stiffness": 500.0}, seed=7, coupling="one-way"
+    )
     model = spec.compile()
     (tmp_path / "model.xml").write_text(spec.to_xml())
     again = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
@@ -130,7 +157,10 @@ def test_saved_xml_says_everything(tmp_path):
 
 
 def test_a_hand_with_biotacs_can_itself_be_attached():
-    hand = spec_of('<mujoco><worldbody><body name="palm"><geom type="box" size=".01 .01 .01" pos="0 0 -.03"/></body></worldbody></mujoco>')
+    hand = spec_of(
+        '<mujoco><worldbody><body name="palm"><geom type="box" size=".01 .01 .01" pos="0 0 '
+        '-.03"/></body></worldbody></mujoco>'
+    )
     for side in ("left", "right"):
         springs(hand, body="palm", prefix=f"{side}_", slots=4)
     scene = spec_of(WORLD)
@@ -148,7 +178,9 @@ def test_room_for_more_bodies_must_be_there():
     spec = spec_of()
     springs(spec, body="hand", slots=0)
     with pytest.warns(
-        RuntimeWarning, match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding the objects"
+        RuntimeWarning,
+        match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding "
+        r"the objects",
     ):
         with pytest.raises((ValueError, mujoco.FatalError)):
             mujoco.MjData(spec.compile())
@@ -213,9 +245,11 @@ def test_settings_survive_as_text():
 def test_plain_mjcf_loads_without_the_plugin():
     code = (
         "import importlib.util, pathlib, mujoco\n"
-        "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else pathlib.Path(r'{}')\n"
+        "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else "
+        "pathlib.Path(r'{}')\n"
         "m = mujoco.MjModel.from_xml_path(str(folder / 'biotac.xml'))\n"
-        "assert m.nplugin == 0 and m.nsensordata == 55 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) < 1e-9\n"
+        "assert m.nplugin == 0 and m.nsensordata == 55 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) "
+        "< 1e-9\n"
         "mujoco.MjModel.from_xml_path(str(folder / 'scene_press.xml'))\n"
     )
     import importlib.resources
@@ -225,7 +259,8 @@ def test_plain_mjcf_loads_without_the_plugin():
 
 
 def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
-    """Mass, centre and inertia from the parts' volumes, by the divergence theorem over their surfaces and sums over the tetrahedra."""
+    """Mass, centre and inertia from the parts' volumes, by the divergence theorem over their surfaces and
+    sums over the tetrahedra."""
     geometry = biotac_mj.load_skin("default")
     mass, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
 
@@ -234,7 +269,10 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
         m = sign * density * np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
         total = corner.sum(axis=1)
         mass, first = mass + m.sum(), first + np.einsum("n,ni->i", m, total) / 4
-        second = second + (np.einsum("n,nai,naj->ij", m, corner, corner) + np.einsum("n,ni,nj->ij", m, total, total)) / 20
+        second = (
+            second
+            + (np.einsum("n,nai,naj->ij", m, corner, corner) + np.einsum("n,ni,nj->ij", m, total, total)) / 20
+        )
 
     def cone(vert, face):
         return np.concatenate([np.zeros((len(face), 1, 3)), vert[face]], axis=1)
@@ -242,10 +280,16 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
     add(1050.0, geometry.vert[geometry.tets])
     for part in ("core", "nail", "clamp"):
         add(1200.0, cone(getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")))
-    add(1000.0, cone(geometry.vert, geometry.inner_face), -1.0)  # liquid: the cavity, whose face normals point inwards,
+    add(
+        1000.0, cone(geometry.vert, geometry.inner_face), -1.0
+    )  # liquid: the cavity, whose face normals point inwards,
     add(1000.0, cone(geometry.core_vert, geometry.core_face), -1.0)  # without the core
     center = first / mass
-    inertia = np.trace(second) * np.eye(3) - second - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    inertia = (
+        np.trace(second) * np.eye(3)
+        - second
+        - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    )
     import importlib.resources
 
     with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
@@ -265,14 +309,17 @@ def test_electrode_colors():
 
 def test_scene_update_shows_skin_and_electrodes():
     spec = spec_of(
-        '<mujoco><worldbody><body name="ball" mocap="true" pos="-.01 -.0175 0"><geom type="sphere" size=".01"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body name="ball" mocap="true" pos="-.01 -.0175 0"><geom type="sphere" '
+        'size=".01"/></body></worldbody></mujoco>'
     )
     springs(spec)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
     scene = mujoco.MjvScene(model, maxgeom=100)
-    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene)
+    mujoco.mjv_updateScene(
+        model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene
+    )
     dent = np.abs(model.skin_vert[:, 1] - spring_skin.HEIGHT).max()
     assert dent == pytest.approx(0.5e-3, rel=0.05)  # the ball is half a millimetre deep
     # what is drawn, after MuJoCo's own skinning, is the dented surface of this very update

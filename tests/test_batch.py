@@ -1,4 +1,5 @@
-"""BioTacs in mujoco_warp against the engine plugin in MuJoCo: one world of the batch is one simulation on the CPU."""
+"""BioTacs in mujoco_warp against the engine plugin in MuJoCo: one world of the batch is one simulation on the
+CPU."""
 
 import functools
 
@@ -33,11 +34,13 @@ def where_batches_run(default_device):
 
 @functools.cache
 def shell():
-    """A closed shell of a finger's size of 324 nodes, one layer, with 19 electrodes: every path of the code, but no real sensor."""
+    """A closed shell of a finger's size of 324 nodes, one layer, with 19 electrodes: every path of the code,
+    but no real sensor."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     n, center = len(ball.vertices), np.array([-8e-3, 0, 0])
     outer, inner, core = (
-        ball.vertices * size + center for size in ([13e-3, 7e-3, 7e-3], [11.5e-3, 5.5e-3, 5.5e-3], [10e-3, 4.5e-3, 4.5e-3])
+        ball.vertices * size + center
+        for size in ([13e-3, 7e-3, 7e-3], [11.5e-3, 5.5e-3, 5.5e-3], [10e-3, 4.5e-3, 4.5e-3])
     )
     f = np.sort(ball.faces, axis=1)  # prisms split by their lowest vertex fit together
     elem = np.concatenate([np.stack([f[:, 0], f[:, 1], f[:, 2], f[:, 2] + n], 1),
@@ -50,8 +53,22 @@ def shell():
     normal = np.stack([0 * angle, -np.cos(angle), np.sin(angle)], 1)
     electrode = np.stack([np.linspace(-14e-3, -2e-3, 19), 0 * angle, 0 * angle], 1) + 4.5e-3 * normal
     empty, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
-    return SkinGeometry("synthetic", vert, elem, ball.faces, ball.faces[:, ::-1] + n, np.flatnonzero(vert[:, 0] > 2e-3),
-                        core, ball.faces, empty, no_face, empty, no_face, electrode, normal)  # fmt: skip
+    return SkinGeometry(
+        "synthetic",
+        vert,
+        elem,
+        ball.faces,
+        ball.faces[:, ::-1] + n,
+        np.flatnonzero(vert[:, 0] > 2e-3),
+        core,
+        ball.faces,
+        empty,
+        no_face,
+        empty,
+        no_face,
+        electrode,
+        normal,
+    )
 
 
 def press_spec():
@@ -81,7 +98,9 @@ def impact_spec():
     spec.option.gravity = [0, 0, 0]
     finger = spec.worldbody.add_body(name="finger")
     finger.add_freejoint()
-    finger.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.02, contype=0, conaffinity=0)
+    finger.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.02, contype=0, conaffinity=0
+    )
     ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.0107, 0.001])
     ball.add_freejoint()
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.01)
@@ -108,7 +127,8 @@ def read(mjm, d, channel):
 
 
 def places(nworld, seed=0, geometry=None):
-    """Random places around the pad (nworld, 3) [m]: where the sphere touches a skin's first node; for the shell, a depth that it bears."""
+    """Random places around the pad (nworld, 3) [m]: where the sphere touches a skin's first node; for the
+    shell, a depth that it bears."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(-0.4, 0.4, nworld)
     along = rng.uniform(-13e-3, -4e-3, nworld)
@@ -144,7 +164,8 @@ def press(m, d, start, steps, depth):
 
 
 def single(pos, skin, settings):
-    """Force (nstep, 6), electrodes, pdc and status of one world by the engine plugin over the poses pos (nstep, 3)."""
+    """Force (nstep, 6), electrodes, pdc and status of one world by the engine plugin over the poses pos
+    (nstep, 3)."""
     spec = press_spec()
     handle = biotac_mj.attach(spec, skin=skin, **settings)
     model = spec.compile()
@@ -153,19 +174,34 @@ def single(pos, skin, settings):
     for p in pos:
         data.mocap_pos[0] = p.astype(np.float32)
         mujoco.mj_step(model, data)
-        rows.append(np.concatenate([handle.read(data, c) for c in ("contact_force", "electrodes", "pdc", "status")]))
+        rows.append(
+            np.concatenate([handle.read(data, c) for c in ("contact_force", "electrodes", "pdc", "status")])
+        )
     return np.array(rows)
 
 
 def compare_with_single_worlds(skin, nworld, steps, force_error, counts):
     rng = np.random.default_rng(1)
     base = preset("default")
-    materials = [{**_fields(base), "youngs_modulus": e} for e in base.youngs_modulus * rng.uniform(0.6, 1.5, nworld)]
-    friction, depth, start = rng.uniform(0.2, 1.0, nworld), rng.uniform(0.8e-3, 1.6e-3, nworld), places(nworld, geometry=skin)
+    materials = [
+        {**_fields(base), "youngs_modulus": e} for e in base.youngs_modulus * rng.uniform(0.6, 1.5, nworld)
+    ]
+    friction, depth, start = (
+        rng.uniform(0.2, 1.0, nworld),
+        rng.uniform(0.8e-3, 1.6e-3, nworld),
+        places(nworld, geometry=skin),
+    )
     options = {"skin": {"contact_stiffness": K, "tolerance": 1e-4}}
     mjm, m, d, _ = make(
-        press_spec(), nworld, skin=skin, material=materials, friction=friction, priority=1, options=options, readings={"noise": False}
-    )  # fmt: skip
+        press_spec(),
+        nworld,
+        skin=skin,
+        material=materials,
+        friction=friction,
+        priority=1,
+        options=options,
+        readings={"noise": False},
+    )
     rows, paths = [], []
     for _ in press(m, d, start, steps, depth):
         rows.append(np.concatenate([read(mjm, d, c) for c in ("contact_force", "electrodes", "pdc")], axis=1))
@@ -182,7 +218,9 @@ def compare_with_single_worlds(skin, nworld, steps, force_error, counts):
         expected, mine = expected[good, :26], got[w, good]
         scale = np.linalg.norm(expected[:, :3], axis=1).max()
         assert scale > 0.2
-        np.testing.assert_allclose(mine[:, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}")
+        np.testing.assert_allclose(
+            mine[:, :3], expected[:, :3], atol=force_error * scale, err_msg=f"world {w}"
+        )
         np.testing.assert_allclose(mine[:, 6:], expected[:, 6:], atol=counts, err_msg=f"world {w}")
         worst = max(worst, np.abs(mine[:, :3] - expected[:, :3]).max() / scale)
     assert lost <= 0.05 * nworld * steps
@@ -218,7 +256,9 @@ def test_readings_are_those_of_the_single_sensor():
             sensor.advance(states[w], (k - 1) * DT, DT, x[w], pressure[w])
             expected = sensor.readings(states[w])
             for name in ("electrodes", "pdc", "pac", "tac", "tdc"):
-                np.testing.assert_array_equal(read(mjm, d, name)[w], expected[name], err_msg=f"{name}, step {k}")
+                np.testing.assert_array_equal(
+                    read(mjm, d, name)[w], expected[name], err_msg=f"{name}, step {k}"
+                )
     change = read(mjm, d, "electrodes") - channels.REST_COUNTS["1"]
     assert np.abs(pressure).min() > 200 and np.abs(change).max() > 50
 
@@ -239,7 +279,9 @@ def run(bad_step=None, bad_pose=None, bad_world=1, nworld=3, steps=8):
 
 
 @pytest.mark.parametrize(
-    ("step", "pose"), [(5, [np.nan, 0, 0]), (0, [np.nan, 0, 0]), (5, [-12e-3, -4e-3, 0])], ids=["nan", "nan at once", "in the core"]
+    ("step", "pose"),
+    [(5, [np.nan, 0, 0]), (0, [np.nan, 0, 0]), (5, [-12e-3, -4e-3, 0])],
+    ids=["nan", "nan at once", "in the core"],
 )
 def test_a_world_with_a_bad_pose_is_flagged_and_disturbs_no_other(step, pose):
     mjm, good = run()
@@ -248,9 +290,17 @@ def test_a_world_with_a_bad_pose_is_flagged_and_disturbs_no_other(step, pose):
     np.testing.assert_array_equal(bad[:, others], good[:, others])
     status, force = mjm.sensor("biotac_status").adr[0], mjm.sensor("biotac_contact_force").adr[0]
     assert (good[:, :, status] == 1).all()
-    assert bad[step, 1, status] == -1 and np.isnan(bad[step, 1, status + 3]) and (bad[step, 1, force : force + 6] == 0).all()
+    assert (
+        bad[step, 1, status] == -1
+        and np.isnan(bad[step, 1, status + 3])
+        and (bad[step, 1, force : force + 6] == 0).all()
+    )
     assert (np.delete(bad[:, 1, status], step) == 1).all()  # and goes on
-    np.testing.assert_allclose(bad[-1, 1, force : force + 3], good[-1, 1, force : force + 3], atol=0.05 * np.abs(good[-1, 1, force + 1]))
+    np.testing.assert_allclose(
+        bad[-1, 1, force : force + 3],
+        good[-1, 1, force : force + 3],
+        atol=0.05 * np.abs(good[-1, 1, force + 1]),
+    )
     assert np.isfinite(np.delete(bad, step, axis=0)).all()
 
 
@@ -268,7 +318,9 @@ def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
     for _ in range(150):
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(d.qpos.numpy()[:, 0], data.qpos[0], atol=1e-6)
-    np.testing.assert_allclose(read(mjm, d, "contact_force")[0], handle.read(data, "contact_force"), atol=5e-3 * weight)
+    np.testing.assert_allclose(
+        read(mjm, d, "contact_force")[0], handle.read(data, "contact_force"), atol=5e-3 * weight
+    )
 
 
 def test_sparse_and_dense_constraints_give_one_motion():
@@ -311,7 +363,9 @@ def test_finger_and_ball_exchange_momentum_and_lose_none():
             data.qpos[:], data.qvel[:] = d.qpos.numpy()[w], d.qvel.numpy()[w]
             mujoco.mj_forward(mjm, data)
             mujoco.mj_subtreeVel(mjm, data)
-            out.append(np.concatenate([mjm.body_subtreemass[0] * data.subtree_linvel[0], data.subtree_angmom[0]]))
+            out.append(
+                np.concatenate([mjm.body_subtreemass[0] * data.subtree_linvel[0], data.subtree_angmom[0]])
+            )
         return np.array(out)
 
     before, force = momentum(), 0.0
@@ -336,10 +390,15 @@ def test_a_ball_between_two_biotacs_feels_both():
     data = mujoco.MjData(mjm)
     mujoco.mj_forward(mjm, data)
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, data, nworld=1)
-    both = [batches.attach(mjm, m, d, skin=shell(), prefix=prefix, readings=False) for prefix in ("biotac_", "other_")]
+    both = [
+        batches.attach(mjm, m, d, skin=shell(), prefix=prefix, readings=False)
+        for prefix in ("biotac_", "other_")
+    ]
     for _ in range(40):
         mjw.step(m, d)
-    force = [d.sensordata.numpy()[0, mjm.sensor(f"{p}contact_force").adr[0] :][:3] for p in ("biotac_", "other_")]
+    force = [
+        d.sensordata.numpy()[0, mjm.sensor(f"{p}contact_force").adr[0] :][:3] for p in ("biotac_", "other_")
+    ]
     assert force[0][1] > 0.02 and np.abs(d.qvel.numpy()).max() < 1e-4
     assert force[1][1] == pytest.approx(force[0][1], rel=0.01)
     assert d.qpos.numpy()[0, 0] == pytest.approx(-1e-4, abs=3e-5)  # half-way between the pads
@@ -386,7 +445,9 @@ def test_an_inactive_batch_changes_nothing():
     batch.active = False
     for _ in range(20):
         mjw.step(m, d)
-    assert d.qpos.numpy()[0, 0] == pytest.approx(0.5 * 9.81 * (20 * DT) ** 2, rel=0.06)  # free fall, through the pad
+    assert d.qpos.numpy()[0, 0] == pytest.approx(
+        0.5 * 9.81 * (20 * DT) ** 2, rel=0.06
+    )  # free fall, through the pad
     assert (read(mjm, d, "status") == 0).all()
 
 
@@ -414,7 +475,9 @@ def attach(mjm, nworld=1, **settings):
 def test_errors_say_what_to_do():
     spec = ball_spec()
     with pytest.raises(
-        ValueError, match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are world, ball"
+        ValueError,
+        match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are "
+        "world, ball",
     ):
         attach(spec.compile())
     batches.add(spec, skin=shell())
@@ -429,12 +492,18 @@ def test_errors_say_what_to_do():
         attach(mjm, options={"skin": {"dynamics": "implicit"}})
     with pytest.raises(ValueError, match="larger njmax"):
         attach(mjm, njmax=12)
-    for flags, text in (("rk4", "integrator implicitfast"), ("spring", "springs and dampers"), ("equality", "coupling='one-way'")):
+    for flags, text in (
+        ("rk4", "integrator implicitfast"),
+        ("spring", "springs and dampers"),
+        ("equality", "coupling='one-way'"),
+    ):
         other = ball_spec()
         if flags == "rk4":
             other.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         elif flags == "spring":
-            other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+            other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(
+                mujoco.mjtDisableBit.mjDSBL_DAMPER
+            )
         else:
             other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         batches.add(other, skin=shell())
@@ -442,7 +511,10 @@ def test_errors_say_what_to_do():
             attach(other.compile())
     crowded = ball_spec()
     batches.add(crowded, skin=shell(), coupling="one-way")
-    with pytest.raises(ValueError, match="no room for two-way coupling of the BioTac 'biotac_' with ball: add it after the objects"):
+    with pytest.raises(
+        ValueError,
+        match="no room for two-way coupling of the BioTac 'biotac_' with ball: add it after the objects",
+    ):
         attach(crowded.compile())
 
 
@@ -450,7 +522,10 @@ def test_strong_damping_is_warned_of():
     spec = ball_spec(mass=0.001)
     spec.body("ball").first_joint().damping, spec.body("ball").first_joint().name = [1.0, 0, 0], "slide"
     batches.add(spec, skin=shell())
-    with pytest.warns(UserWarning, match=r"joint 'slide' is damped strongly \(time step x damping / inertia = 2\): .* smaller steps"):
+    with pytest.warns(
+        UserWarning,
+        match=r"joint 'slide' is damped strongly \(time step x damping / inertia = 2\): .* smaller steps",
+    ):
         attach(spec.compile(), readings=False)
 
 

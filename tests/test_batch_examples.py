@@ -32,7 +32,10 @@ def test_presses_in_mujoco_warp(tmp_path):
     record = example("batch_mujoco_warp").main(nworld=3, steps=10, depth=1e-3, skin=shell(), figure=figure)
     force = np.linalg.norm(record["force"], axis=2)
     assert record["failed"] == 0 and (force[-1] > 0.1).all() and (np.diff(force, axis=0) >= 0).all()
-    assert record["electrodes"].shape == (10, 3, 19) and np.abs(record["electrodes"][-1] - record["electrodes"][0]).max() > 20
+    assert (
+        record["electrodes"].shape == (10, 3, 19)
+        and np.abs(record["electrodes"][-1] - record["electrodes"][0]).max() > 20
+    )
     assert figure.stat().st_size > 10_000
 
 
@@ -47,11 +50,18 @@ def test_ball_beside_mjx():
 
 
 def test_poses_between_the_steps_of_another_simulator():
-    """MuJoCo itself stands for it: forces on the bodies are those of the engine plugin, one-way, at the same poses."""
+    """MuJoCo itself stands for it: forces on the bodies are those of the engine plugin, one-way, at the same
+    poses."""
     spec = press_spec()
     exact = {"skin": {"tolerance": 1e-5}}
     handle = biotac_mj.attach(
-        spec, skin=shell(), readings="none", coupling="one-way", options=exact, pos=[0.01, 0.02, 0.03], quat=[0.8, 0.6, 0, 0]
+        spec,
+        skin=shell(),
+        readings="none",
+        coupling="one-way",
+        options=exact,
+        pos=[0.01, 0.02, 0.03],
+        quat=[0.8, 0.6, 0, 0],
     )
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -64,11 +74,15 @@ def test_poses_between_the_steps_of_another_simulator():
         local = np.array([-9e-3, -10.6e-3 + 1e-4 * k, 7e-4])
         data.mocap_pos[0] = frame @ local + [0.01, 0.02, 0.03]
         mujoco.mj_step(model, data)
-        arrays = [np.stack([a, a]).astype(np.float32) for a in (data.xpos, data.xmat.reshape(-1, 3, 3), data.xipos)]
+        arrays = [
+            np.stack([a, a]).astype(np.float32) for a in (data.xpos, data.xmat.reshape(-1, 3, 3), data.xipos)
+        ]
         skins.step(*arrays)
     expected = handle.read(data, "contact_force")
     assert np.linalg.norm(expected[:3]) > 0.1
-    np.testing.assert_allclose(skins.readings()["contact_force"].numpy()[1], expected, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        skins.readings()["contact_force"].numpy()[1], expected, atol=2e-3 * np.abs(expected).max()
+    )
     force = skins.xfrc_applied.numpy()[0]
     pin, core = model.body("pin").id, model.body(handle.body).id
     np.testing.assert_allclose(force[core, :3], frame @ expected[:3], atol=2e-3 * np.abs(expected).max())
@@ -90,7 +104,9 @@ def test_wp_arrays_are_taken_as_they_are():
     mujoco.mj_comPos(mjm, data)
     arrays = [data.xpos, data.xmat.reshape(-1, 3, 3), data.xipos]
     kinds = (wp.vec3, wp.mat33, wp.vec3)
-    skins.step(*(wp.array(a[None].astype(np.float32), dtype=k, ndim=2, device="cpu") for a, k in zip(arrays, kinds)))
+    skins.step(
+        *(wp.array(a[None].astype(np.float32), dtype=k, ndim=2, device="cpu") for a, k in zip(arrays, kinds))
+    )
     first = skins.xfrc_applied.numpy().copy()
     skins.reset()
     skins.step(*(a[None].astype(np.float32) for a in arrays))

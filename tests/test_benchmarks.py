@@ -10,8 +10,16 @@ import pytest
 
 
 def _run(repo, script, *arguments):
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(repo), os.environ.get("PYTHONPATH")]))}
-    return subprocess.run([sys.executable, repo / "benchmarks" / script, *map(str, arguments)], capture_output=True, text=True, env=env)
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(repo), os.environ.get("PYTHONPATH")])),
+    }
+    return subprocess.run(
+        [sys.executable, repo / "benchmarks" / script, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=env,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +38,18 @@ def test_accuracy_of_stored_cases(repo, shared, tmp_path):
     for name in names:
         (cases / f"{name}.npz").symlink_to(shared / "reference" / f"{name}.npz")
     skin = shared / "data" / "nvlabs_biotac_sim"
-    done = _run(repo, "accuracy.py", "--cases", cases, "--json", tmp_path / "out.json", "--skin", skin, "--picture", tmp_path / "out.png")
+    done = _run(
+        repo,
+        "accuracy.py",
+        "--cases",
+        cases,
+        "--json",
+        tmp_path / "out.json",
+        "--skin",
+        skin,
+        "--picture",
+        tmp_path / "out.png",
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count(" pass") == 2
     rows = json.loads((tmp_path / "out.json").read_text())["cases"]
@@ -42,7 +61,10 @@ def test_accuracy_of_stored_cases(repo, shared, tmp_path):
         assert row["not_converged"] == 0
         # the error is what the file says, not what the benchmark says
         stored = np.load(shared / "reference" / f"{row['name']}.npz")["force"]
-        wrong = np.linalg.norm(np.array(row["force"]) - stored, axis=1).mean() / np.linalg.norm(stored, axis=1).max()
+        wrong = (
+            np.linalg.norm(np.array(row["force"]) - stored, axis=1).mean()
+            / np.linalg.norm(stored, axis=1).max()
+        )
         assert row["force_error_rel"] == pytest.approx(wrong)
     assert (tmp_path / "out.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -51,9 +73,20 @@ def test_a_case_that_cannot_be_solved_is_told(repo, shared, tmp_path):
     case = dict(np.load(shared / "reference" / "L_sphere3.5_pad.npz"))
     case["indenter"] = json.dumps({**json.loads(str(case["indenter"])), "shape": "cone"})
     np.savez(tmp_path / "odd.npz", **case)
-    done = _run(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json", "--skin", shared / "data" / "nvlabs_biotac_sim")
+    done = _run(
+        repo,
+        "accuracy.py",
+        "--cases",
+        tmp_path,
+        "--json",
+        tmp_path / "out.json",
+        "--skin",
+        shared / "data" / "nvlabs_biotac_sim",
+    )
     assert done.returncode == 1
-    assert "unknown indenter shape 'cone': the case must hold a sphere, cube, cylinder or annulus" in done.stdout
+    assert (
+        "unknown indenter shape 'cone': the case must hold a sphere, cube, cylinder or annulus" in done.stdout
+    )
     assert json.loads((tmp_path / "out.json").read_text())["cases"][0]["force_error_rel"] is None
 
 
@@ -68,22 +101,42 @@ def test_no_cases(repo, tmp_path):
     "shape",
     [
         {"shape": "sphere", "radius": 0.00175},
-        {"shape": "cylinder on its side, axis = indenter x", "radius": 0.0035, "length": 0.028, "edge_radius": 0.001},
+        {
+            "shape": "cylinder on its side, axis = indenter x",
+            "radius": 0.0035,
+            "length": 0.028,
+            "edge_radius": 0.001,
+        },
         {"shape": "cylinder on its side", "radius": 0.0035, "half_length": 0.014, "edge_radius": 0.001},
-        {"shape": "cylinder on its side", "radius": 0.00175, "edge_radius": 0.001, "seed_mesh": "cylinder_short_3-5mm.obj"},
+        {
+            "shape": "cylinder on its side",
+            "radius": 0.00175,
+            "edge_radius": 0.001,
+            "seed_mesh": "cylinder_short_3-5mm.obj",
+        },
         {"shape": "cube, flat top at y=0", "half_width": 0.007, "edge_radius": 0.001},
-        {"shape": "annulus about indenter y", "inner_radius": 0.0035, "outer_radius": 0.007, "edge_radius": 0.001},
+        {
+            "shape": "annulus about indenter y",
+            "inner_radius": 0.0035,
+            "outer_radius": 0.007,
+            "edge_radius": 0.001,
+        },
     ],
     ids=lambda shape: f"{shape['shape'].split()[0]} {len(shape)} {shape.get('seed_mesh', '')}",
 )
 def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
-    """The distance of points to each indenter, against formulas for the surface written from the cases' description."""
+    """The distance of points to each indenter, against formulas for the surface written from the cases'
+    description."""
     import warp as wp
 
     from biotac_mj.skin.clearance import rest_gap
 
     geoms, pos, mat = accuracy.case_geoms(shape, 0.0)
-    point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [0, 5e-4, 0]  # around the front
+    point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [
+        0,
+        5e-4,
+        0,
+    ]  # around the front
     if shape["shape"].startswith("cylinder"):
         point *= [2, 1, 0.5]
     local = (point - pos[0]) @ mat[0]
@@ -99,7 +152,9 @@ def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
     gap, expected = gap.numpy(), _distance(shape, point)
     near = (expected < 0) & (expected > -2e-4)  # where it would press
     assert near.sum() > 50
-    np.testing.assert_allclose(gap[near], expected[near], atol=1.5e-6 if "annulus" in shape["shape"] else 1e-12)
+    np.testing.assert_allclose(
+        gap[near], expected[near], atol=1.5e-6 if "annulus" in shape["shape"] else 1e-12
+    )
 
 
 def _distance(shape, p):
@@ -120,7 +175,10 @@ def _distance(shape, p):
     if kind.startswith("cube"):
         h = shape["half_width"]
         return rounded(np.abs(x) - h, np.abs(y + h) - h, np.abs(z) - h)
-    mean, half = (shape["outer_radius"] + shape["inner_radius"]) / 2, (shape["outer_radius"] - shape["inner_radius"]) / 2
+    mean, half = (
+        (shape["outer_radius"] + shape["inner_radius"]) / 2,
+        (shape["outer_radius"] - shape["inner_radius"]) / 2,
+    )
     return rounded(np.abs(np.hypot(x, z) - mean) - half, y)
 
 
@@ -152,9 +210,18 @@ def test_speed_writes_rows(repo, tmp_path):
     for row, ours in zip(condensed, rows):
         assert row["not_converged"] == 0 and row["ms_per_press"] == pytest.approx(5 * row["ms_per_step"])
         wrong = np.linalg.norm(np.array(row["force"]) - ours["force"], axis=1)
-        assert 0 < row["force_error_rel"] == pytest.approx(wrong.mean() / ours["peak_force_N"]) and row["force_error_to_1mm"] < 0.15
+        assert (
+            0 < row["force_error_rel"] == pytest.approx(wrong.mean() / ours["peak_force_N"])
+            and row["force_error_to_1mm"] < 0.15
+        )
     for row in rows:
-        assert (row["device"], row["solver"], row["skin"], row["tier"], row["worlds"]) == ("cpu", "biotac_mj", "coarse", "full", 1)
+        assert (row["device"], row["solver"], row["skin"], row["tier"], row["worlds"]) == (
+            "cpu",
+            "biotac_mj",
+            "coarse",
+            "full",
+            1,
+        )
         assert row["ms_per_press"] == pytest.approx(5 * row["ms_per_step"])
         assert row["not_converged"] == row["not_converged_tight"] == 0
         assert 0 < row["force_error_rel"] < 0.01
@@ -163,7 +230,8 @@ def test_speed_writes_rows(repo, tmp_path):
 
 
 def test_standard_path_starts_at_first_touch(repo, accuracy):
-    """No point of the skin, sampled in faces by another library, is inside the sphere at the start, and one is as soon as it moves."""
+    """No point of the skin, sampled in faces by another library, is inside the sphere at the start, and one
+    is as soon as it moves."""
     import speed
     import trimesh
 
@@ -175,7 +243,9 @@ def test_standard_path_starts_at_first_touch(repo, accuracy):
     for k, center in enumerate(path[:2]):
         _, distance, _ = trimesh.proximity.closest_point(surface, center[None])
         assert distance[0] - speed.RADIUS == pytest.approx(-k * speed.INCREMENT, abs=2e-6 if k else 1e-8)
-    np.testing.assert_allclose(np.diff(path, axis=0), speed.INCREMENT * np.tile(direction, (3, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        np.diff(path, axis=0), speed.INCREMENT * np.tile(direction, (3, 1)), atol=1e-12
+    )
     assert abs(path[0] @ [0, 0, 1]) < 1e-3
     assert direction[1] > 0.9  # from the pad towards the nail
 

@@ -1,4 +1,5 @@
-"""Calibration: recovery of known parameters, columns of a batch against single runs, statistics against closed forms, error texts."""
+"""Calibration: recovery of known parameters, columns of a batch against single runs, statistics against
+closed forms, error texts."""
 
 import dataclasses
 
@@ -43,8 +44,16 @@ def shell():
 def test_recovers_stiffness_and_friction_quickly(shell):
     short = plan_indentation(depth=0.6e-3, slide=0.6e-3, samples=8)
     true = simulate(shell.geometry, shell.options, [TRUTH], short).force[0]
-    data = dataclasses.replace(short, force=true + 0.001 * np.random.default_rng(1).standard_normal(true.shape))
-    found = calibrate(shell, dataclasses.replace(TRUTH, youngs_modulus=1.5e6, friction=0.6), data, ["E", "mu"], max_iterations=8)
+    data = dataclasses.replace(
+        short, force=true + 0.001 * np.random.default_rng(1).standard_normal(true.shape)
+    )
+    found = calibrate(
+        shell,
+        dataclasses.replace(TRUTH, youngs_modulus=1.5e6, friction=0.6),
+        data,
+        ["E", "mu"],
+        max_iterations=8,
+    )
     assert found.success and not found.nonconverged
     assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=0.02)
     assert (found.interval[:, 0] < found.value).all() and (found.value < found.interval[:, 1]).all()
@@ -56,18 +65,26 @@ def test_recovers_known_parameters_from_noisy_forces(way, shell):
     true = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
     noise = 0.002
     data = dataclasses.replace(way, force=true + noise * np.random.default_rng(1).standard_normal(true.shape))
-    found = calibrate(shell, Material(liquid=False, youngs_modulus=1.5e6, poissons_ratio=0.32, friction=0.6), data)
+    found = calibrate(
+        shell, Material(liquid=False, youngs_modulus=1.5e6, poissons_ratio=0.32, friction=0.6), data
+    )
     wanted = np.array([TRUTH.youngs_modulus, TRUTH.poissons_ratio, TRUTH.friction])
     assert found.success and not found.nonconverged and not found.at_bound.any()
-    # 2 %, 2 %, 5 %, or what the noise allows: no fit can be expected within three standard errors of a poorer measurement
+    # 2 %, 2 %, 5 %, or what the noise allows: no fit can be expected within three standard errors of a poorer
+    # measurement
     error = np.maximum(found.standard_error, found.standard_error_robust)
-    assert (np.abs(found.value - wanted) <= np.maximum([0.02, 0.02, 0.05] * wanted, 3 * error)).all(), found.value / wanted
+    assert (np.abs(found.value - wanted) <= np.maximum([0.02, 0.02, 0.05] * wanted, 3 * error)).all(), (
+        found.value / wanted
+    )
     assert abs(found.value[0] / wanted[0] - 1) < 0.05 and abs(found.value[2] / wanted[2] - 1) < 0.05
-    assert found.rms < 1.1 * np.sqrt((np.linalg.norm(data.force - true, axis=1) ** 2).mean())  # no worse than the truth itself
+    assert found.rms < 1.1 * np.sqrt(
+        (np.linalg.norm(data.force - true, axis=1) ** 2).mean()
+    )  # no worse than the truth itself
 
 
 def test_correction_takes_the_mesh_out_of_the_fit(shell):
-    """Forces made on the default skin, fitted on the coarse one, which is 8 % stiffer there: alone it takes that for the material."""
+    """Forces made on the default skin, fitted on the coarse one, which is 8 % stiffer there: alone it takes
+    that for the material."""
     short = plan_indentation(depth=0.6e-3, slide=0.0, samples=4)
     finer = configuration("shell_with_core", "default")
     data = dataclasses.replace(short, force=simulate(finer.geometry, shell.options, [TRUTH], short).force[0])
@@ -84,7 +101,9 @@ def test_refined_skin_is_the_same_body():
     fine = refined(skin)
     assert len(fine.elem) == 8 * len(skin.elem) and np.isin(skin.fixed, fine.fixed).all()
     once, twice = (TetMesh(g.vert, g.tets).check().volumes.sum() for g in (skin, fine))
-    assert once < twice < 1.005 * once and fine.name == "refined:coarse"  # both are polyhedra inside the curved body
+    assert (
+        once < twice < 1.005 * once and fine.name == "refined:coarse"
+    )  # both are polyhedra inside the curved body
     with pytest.raises(ValueError, match="four-node tetrahedra"):
         refined(dataclasses.replace(skin, elem=skin.tets))
 
@@ -105,7 +124,11 @@ def test_batch_columns_equal_single_runs(way, shell):
     alone = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
     np.testing.assert_allclose(force, alone, atol=1e-5)
     for i, change in enumerate(
-        (dict(youngs_modulus=1.2e6 * np.exp(0.01)), dict(poissons_ratio=0.38 + 0.00245), dict(friction=0.5 * np.exp(0.01)))
+        (
+            dict(youngs_modulus=1.2e6 * np.exp(0.01)),
+            dict(poissons_ratio=0.38 + 0.00245),
+            dict(friction=0.5 * np.exp(0.01)),
+        )
     ):
         moved = simulate(shell.geometry, shell.options, [dataclasses.replace(TRUTH, **change)], way).force[0]
         column = (moved - alone) / 0.01
@@ -117,12 +140,15 @@ def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
     one = configuration("deformable_shell", tolerance=1e-6, contact_stiffness=2e11)
     two = dataclasses.replace(one, options=dataclasses.replace(one.options, contact_stiffness=4e11))
     force = simulate(one.geometry, one.options, [TRUTH], way).force
-    double = simulate(two.geometry, two.options, [dataclasses.replace(TRUTH, youngs_modulus=2.4e6)], way).force
+    double = simulate(
+        two.geometry, two.options, [dataclasses.replace(TRUTH, youngs_modulus=2.4e6)], way
+    ).force
     np.testing.assert_allclose(double, 2 * force, atol=1e-3 * np.abs(force).max())
 
 
 def test_four_configurations_order_of_stiffness():
-    """More material and more core are stiffer: shell < shell on its core < solid, and shell < solid < solid on its core."""
+    """More material and more core are stiffer: shell < shell on its core < solid, and shell < solid < solid
+    on its core."""
     deep = plan_indentation(depth=1.8e-3, slide=0.0, samples=11)
     peak = {}
     for name in CONFIGURATIONS:
@@ -138,7 +164,9 @@ def test_four_configurations_order_of_stiffness():
 def test_solids_fill_what_they_should(name):
     skin = configuration(name).geometry
     shell = configuration("deformable_shell").geometry
-    outside = 1e9 * (TetMesh(shell.vert, shell.tets).volumes.sum()) + 1751.130  # the coarse skin and the cavity of its card [mm^3]
+    outside = (
+        1e9 * (TetMesh(shell.vert, shell.tets).volumes.sum()) + 1751.130
+    )  # the coarse skin and the cavity of its card [mm^3]
     wanted = outside - (1395.597 if name == "solid_with_core" else 0.0)
     mesh = TetMesh(skin.vert, skin.elem).check()
     assert 1e9 * mesh.volumes.sum() == pytest.approx(wanted, rel=0.02)
@@ -146,14 +174,17 @@ def test_solids_fill_what_they_should(name):
 
 
 def test_robust_covariance_of_autocorrelated_noise():
-    """A constant fitted to AR(1) noise of coefficient a: the mean's variance is (1 + a) / (1 - a) times that of white noise."""
+    """A constant fitted to AR(1) noise of coefficient a: the mean's variance is (1 + a) / (1 - a) times that
+    of white noise."""
     rng, a, n = np.random.default_rng(0), 0.6, 20000
     noise = np.zeros(n)
     for t, shock in enumerate(rng.standard_normal(n)):
         noise[t] = a * noise[t - 1] + shock
     white, robust, lags = covariance(np.ones((n, 1, 1)), noise[:, None])
     assert white[0, 0] == pytest.approx(1 / (1 - a**2) / n, rel=0.05)
-    weights = 1 + 2 * sum((1 - k / (lags + 1)) * a**k for k in range(1, lags + 1))  # Bartlett's share of (1 + a) / (1 - a)
+    weights = 1 + 2 * sum(
+        (1 - k / (lags + 1)) * a**k for k in range(1, lags + 1)
+    )  # Bartlett's share of (1 + a) / (1 - a)
     assert robust[0, 0] / white[0, 0] == pytest.approx(weights, rel=0.1)
 
 
@@ -167,8 +198,12 @@ def test_ljung_box_level_and_power():
 def test_comparison_of_a_skin_with_itself_is_zero(way):
     body = configuration("deformable_shell")
     truth = simulate(body.geometry, body.options, [TRUTH], way)
-    case = dataclasses.replace(way, force=truth.force[0], peak_norm=truth.peak_norm[0], mean_norm=truth.mean_norm[0])
-    same, softer = (evaluate(body, m, [case]) for m in (TRUTH, dataclasses.replace(TRUTH, youngs_modulus=0.6e6)))
+    case = dataclasses.replace(
+        way, force=truth.force[0], peak_norm=truth.peak_norm[0], mean_norm=truth.mean_norm[0]
+    )
+    same, softer = (
+        evaluate(body, m, [case]) for m in (TRUTH, dataclasses.replace(TRUTH, youngs_modulus=0.6e6))
+    )
     assert same.force_mean < 1e-3 and same.nodal_peak < 1e-7 and same.nodal_mean < 1e-8
     mean_force = np.linalg.norm(case.force, axis=1).mean()
     assert softer.force_mean == pytest.approx(0.5 * mean_force, rel=0.05)
@@ -243,7 +278,8 @@ def test_command_line_errors(capsys):
 
 
 def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
-    """What was finished is not made again; other settings start anew; the table is that of a run in one go."""
+    """What was finished is not made again; other settings start anew; the table is that of a run in one
+    go."""
     from biotac_mj.calibration import verbs
 
     calls = []
@@ -256,12 +292,28 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(verbs, "calibrate", calibrated)
     monkeypatch.setattr(verbs, "calibration_table", lambda fitted: "fitted")
-    monkeypatch.setattr(verbs, "stand_in", lambda plan, **settings: dataclasses.replace(plan, force=np.ones_like(plan.force)))
-    monkeypatch.setattr(verbs, "references", lambda plans, progress, **settings: calls.append("reference") or plans)
-    given = ["compare", "--configurations", "deformable_shell", "shell_with_core", "--indenters", "sphere_7mm", "--out", str(tmp_path)]
+    monkeypatch.setattr(
+        verbs, "stand_in", lambda plan, **settings: dataclasses.replace(plan, force=np.ones_like(plan.force))
+    )
+    monkeypatch.setattr(
+        verbs, "references", lambda plans, progress, **settings: calls.append("reference") or plans
+    )
+    given = [
+        "compare",
+        "--configurations",
+        "deformable_shell",
+        "shell_with_core",
+        "--indenters",
+        "sphere_7mm",
+        "--out",
+        str(tmp_path),
+    ]
     monkeypatch.setattr(verbs, "evaluate", lambda body, material, *rest: _compared(body.name, material))
     assert cli.main(given) != 0  # stopped
-    assert calls == ["reference", "deformable_shell", "shell_with_core"] and not (tmp_path / "compare.json").exists()
+    assert (
+        calls == ["reference", "deformable_shell", "shell_with_core"]
+        and not (tmp_path / "compare.json").exists()
+    )
     assert cli.main(given) == 0
     assert calls[3:] == ["shell_with_core"] and "goes on after reference" in capsys.readouterr().out
     assert cli.main([*given, "--seed", "1"]) == 0
@@ -281,4 +333,6 @@ class Fitted:
 def _compared(name, material):
     from biotac_mj.calibration.comparison import Comparison
 
-    return Comparison(name, Fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, 1e-5, 0, 1, [])
+    return Comparison(
+        name, Fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, 1e-5, 0, 1, []
+    )

@@ -26,16 +26,29 @@ def test_help_shows_all_choices(capsys):
     assert stop.value.code == 0
     text = " ".join(capsys.readouterr().out.split())
     options = (
-        "--location --direction --depth --slide --slide-direction --timestep --speed --two-way --one-way --mu --seed --out --no-render"
+        "--location --direction --depth --slide --slide-direction --timestep --speed --two-way "
+        "--one-way --mu --seed --out --no-render"
     )
     geoms = "capsule cylinder ellipsoid box plane mesh:FILE"
-    for choice in (*cli.INDENTERS, *cli.MATERIALS, *cli.SKINS, *options.split(), "--no-liquid", *geoms.split()):
+    for choice in (
+        *cli.INDENTERS,
+        *cli.MATERIALS,
+        *cli.SKINS,
+        *options.split(),
+        "--no-liquid",
+        *geoms.split(),
+    ):
         assert choice in text, choice
 
 
 def test_help_is_light():
-    code = "import sys; from biotac_mj.cli import parser; parser(); print({'warp', 'trimesh', 'matplotlib'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
+    code = (
+        "import sys; from biotac_mj.cli import parser; parser(); print({'warp', 'trimesh', 'matplotlib'} "
+        "& set(sys.modules))"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,9 +57,15 @@ def test_help_is_light():
         (["press", "--indenter", "cone"], "unknown indenter 'cone': choose one of"),
         (["press", "--indenter", "geom:torus:1"], "unknown geom type 'torus'"),
         (["press", "--indenter", "mesh:nowhere.obj"], "no indenter mesh at nowhere.obj"),
-        (["press", "--skin", "nowhere.npz"], "no skin at nowhere.npz: pass 'coarse', 'default', 'fine' or a file made by"),
+        (
+            ["press", "--skin", "nowhere.npz"],
+            "no skin at nowhere.npz: pass 'coarse', 'default', 'fine' or a file made by",
+        ),
         (["press", "--skin", "coarse", "--location", "40"], "no skin at x = 40 mm"),
-        (["press", "--skin", "coarse", "--material", "jelly"], "unknown material 'jelly': choose one of default, paper, rubber"),
+        (
+            ["press", "--skin", "coarse", "--material", "jelly"],
+            "unknown material 'jelly': choose one of default, paper, rubber",
+        ),
         (["press", "--depth", "-1"], "depth is -0.001: it must be a positive number"),
         (["import-mesh", "nowhere"], "no mesh at nowhere"),
         (["import-mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
@@ -98,7 +117,9 @@ def test_import_mesh_prints_a_table_and_stores_a_skin(shared, capsys, tmp_path):
     said = capsys.readouterr().out
     # numbers of the published mesh
     for name, value in (("nodes", 4246), ("tetrahedra", 15410), ("held nodes", 400)):
-        assert any(line.split()[-1] == str(value) for line in said.splitlines() if line.strip().startswith(name)), said
+        assert any(
+            line.split()[-1] == str(value) for line in said.splitlines() if line.strip().startswith(name)
+        ), said
     from biotac_mj.geometry import load_skin
 
     assert load_skin(out).nvert == 4246

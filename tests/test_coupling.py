@@ -1,4 +1,5 @@
-"""The two-way coupling against statics, Coulomb's law and conservation of momentum, with a skin of springs."""
+"""The two-way coupling against statics, Coulomb's law and conservation of momentum, with a skin of
+springs."""
 
 import sys
 
@@ -36,14 +37,21 @@ def scene(
         f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="{integrator}"/>'
         f"<worldbody>{finger}{bodies}</worldbody></mujoco>"
     )
-    settings = dict(stepper="springs", readings="none", friction=0.3, options={"stiffness": stiffness}) | settings
-    handle = attach(spec, body="finger", quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(), **settings)
+    settings = (
+        dict(stepper="springs", readings="none", friction=0.3, options={"stiffness": stiffness}) | settings
+    )
+    handle = attach(
+        spec, body="finger", quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(), **settings
+    )
     model = spec.compile()
     return model, mujoco.MjData(model), handle
 
 
 def ball(mass, joint="<freejoint/>", pos=f"0 0 {0.018 - 1e-5}", friction=0.3):
-    return f'<body name="ball" pos="{pos}">{joint}<geom name="ball" type="sphere" size=".01" mass="{mass}" friction="{friction}"/></body>'
+    return (
+        f'<body name="ball" pos="{pos}">{joint}<geom name="ball" type="sphere" size=".01" mass="{mass}" '
+        f'friction="{friction}"/></body>'
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +72,9 @@ def test_a_ball_reads_its_weight(mass, timestep):
         mujoco.mj_step(model, data)
         forces.append(handle.read(data, "contact_force")[:3])
     weight = mass * G
-    np.testing.assert_allclose(forces, np.tile([0.0, weight, 0.0], (20, 1)), atol=0.01 * weight)  # no chatter: every step, not the mean
+    np.testing.assert_allclose(
+        forces, np.tile([0.0, weight, 0.0], (20, 1)), atol=0.01 * weight
+    )  # no chatter: every step, not the mean
     assert np.ptp(np.array(forces)[:, 1]) < 0.005 * weight
     # MuJoCo's balance without constraints: the passive force carries the weight
     np.testing.assert_allclose(data.qfrc_passive[2], data.qfrc_bias[2], rtol=0.01)
@@ -74,9 +84,14 @@ def test_a_ball_reads_its_weight(mass, timestep):
 @pytest.mark.parametrize("timestep", [0.0005, 0.004])
 @pytest.mark.parametrize("mass", [0.001, 1.0, None])
 def test_a_light_finger_pushes_without_static_error(mass, timestep):
-    """A hinged finger of 24 g turns against a ball that a joint limit (or the world) holds back: the torques balance exactly."""
-    joint = '<joint type="slide" axis="0 0 1" range="-1 0" limited="true" solreflimit=".01 1"/>' if mass else ""
-    model, data, _ = scene(ball(mass or 1.0, joint, "0 0 .0181"), timestep, "0 0 0", finger=HINGED.format(""), stiffness=2e3)
+    """A hinged finger of 24 g turns against a ball that a joint limit (or the world) holds back: the torques
+    balance exactly."""
+    joint = (
+        '<joint type="slide" axis="0 0 1" range="-1 0" limited="true" solreflimit=".01 1"/>' if mass else ""
+    )
+    model, data, _ = scene(
+        ball(mass or 1.0, joint, "0 0 .0181"), timestep, "0 0 0", finger=HINGED.format(""), stiffness=2e3
+    )
     torque = -0.04 * min(2 * G * (mass or 1.0), 5.0)
     data.qfrc_applied[0] = torque
     mujoco.mj_step(model, data, int(0.5 / timestep))
@@ -90,19 +105,25 @@ def test_a_light_finger_on_its_limit_carries_a_ball():
     mujoco.mj_step(model, data, 200)
     assert abs(data.qvel).max() < 1e-6
     assert data.qfrc_passive[1] == pytest.approx(0.1 * G, rel=1e-6)
-    assert data.qfrc_constraint[1] == pytest.approx(0.0, abs=1e-6)  # at rest the rows that carry the stiffness push nothing
+    assert data.qfrc_constraint[1] == pytest.approx(
+        0.0, abs=1e-6
+    )  # at rest the rows that carry the stiffness push nothing
 
 
 @pytest.mark.parametrize("timestep", [0.0005, 0.004])
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
 @pytest.mark.parametrize("damping", [0.0, 0.05, 1.55])
 def test_a_damped_ball_moves_as_backward_euler_says(damping, integrator, timestep):
-    """1 g on a damped slide, up to h c / m = 6: the skin acts where the integrator takes the ball, not where the solver's qacc points."""
+    """1 g on a damped slide, up to h c / m = 6: the skin acts where the integrator takes the ball, not where
+    the solver's qacc points."""
     mass, stiffness, start = 0.001, 5.0, 0.0181
     model, data, handle = scene(
-        ball(mass, f'<joint type="slide" axis="0 0 1" damping="{damping}"/>', f"0 0 {start}"), timestep, "0 0 -9.81", integrator,
+        ball(mass, f'<joint type="slide" axis="0 0 1" damping="{damping}"/>', f"0 0 {start}"),
+        timestep,
+        "0 0 -9.81",
+        integrator,
         stiffness=stiffness,
-    )  # fmt: skip
+    )
     line = np.linspace(-0.004, 0.004, 9)
     x, y = (grid.ravel() for grid in np.meshgrid(line, line))
 
@@ -116,33 +137,43 @@ def test_a_damped_ball_moves_as_backward_euler_says(damping, integrator, timeste
         mujoco.mj_step(model, data)
 
         def wrong(after, height=height, speed=speed):
-            return mass * (after - speed) / timestep + weight + damping * after - push(height + timestep * after)
+            return (
+                mass * (after - speed) / timestep + weight + damping * after - push(height + timestep * after)
+            )
 
         height += timestep * brentq(wrong, -5, 5, xtol=1e-15, rtol=1e-14)
         assert data.qpos[0] + start - 0.008 == pytest.approx(height, abs=1e-6)
-        assert handle.read(data, "contact_force")[1] == pytest.approx(push(height), abs=2e-6 * 81 * stiffness)  # solved within 2 um
+        assert handle.read(data, "contact_force")[1] == pytest.approx(
+            push(height), abs=2e-6 * 81 * stiffness
+        )  # solved within 2 um
         most = max(most, push(height))
     assert most > 0.5 * weight  # it has met the springs
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
-@pytest.mark.parametrize("disabled", [0, mujoco.mjtDisableBit.mjDSBL_EULERDAMP, mujoco.mjtDisableBit.mjDSBL_DAMPER])
+@pytest.mark.parametrize(
+    "disabled", [0, mujoco.mjtDisableBit.mjDSBL_EULERDAMP, mujoco.mjtDisableBit.mjDSBL_DAMPER]
+)
 def test_the_skin_is_solved_where_the_integrator_takes_its_bodies(integrator, disabled):
-    """(M - h D)^-1 M a is the change of the velocities in mj_step: dampers of higher order, a tendon's, servos, also at their limit."""
+    """(M - h D)^-1 M a is the change of the velocities in mj_step: dampers of higher order, a tendon's,
+    servos, also at their limit."""
     finger = (
-        '<body name="finger"><joint name="a" type="hinge" axis="0 1 0" pos="-.04 0 0" damping=".01 .002 .001"/>'
+        '<body name="finger"><joint name="a" type="hinge" axis="0 1 0" pos="-.04 0 0" damping=".01 .002 '
+        '.001"/>'
         '<geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass=".02"/></body>'
     )
     arm = (
         '<body name="arm" pos="0 .1 0"><joint name="b" type="hinge" axis="0 1 0" damping="1e-3"/>'
-        '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/><body pos=".1 0 0"><joint name="c" type="hinge" axis="0 1 0"/>'
+        '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/><body pos=".1 0 0"><joint '
+        'name="c" type="hinge" axis="0 1 0"/>'
         '<geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" mass=".05"/></body></body>'
     )
     spec = mujoco.MjSpec.from_string(
         f'<mujoco><option timestep="0.004" integrator="{integrator}"/><worldbody>{finger}{arm}'
         + ball(0.03, '<joint type="free" damping=".2"/>', "0 0 .03")
         + "</worldbody>"
-        '<tendon><fixed name="t" damping=".02"><joint joint="b" coef="1"/><joint joint="c" coef="-1"/></fixed></tendon>'
+        '<tendon><fixed name="t" damping=".02"><joint joint="b" coef="1"/><joint joint="c" '
+        'coef="-1"/></fixed></tendon>'
         '<actuator><velocity joint="b" kv=".05"/><position joint="c" kp="1" kv=".03" forcerange="-.01 .01"/>'
         '<position joint="a" kp="1" kv=".02"/></actuator></mujoco>'
     )
@@ -165,11 +196,16 @@ def test_the_skin_is_solved_where_the_integrator_takes_its_bodies(integrator, di
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
 def test_only_dampers_take_momentum(integrator):
-    """A damped finger hit by a free ball: what both lose is what the joint's dampers take, at the end of each step."""
+    """A damped finger hit by a free ball: what both lose is what the joint's dampers take, at the end of each
+    step."""
     damping, timestep = 5.0, 0.004
-    joints = "".join(f'<joint type="slide" axis="{axis}" damping="{damping}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    joints = "".join(
+        f'<joint type="slide" axis="{axis}" damping="{damping}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
+    )
     finger = f'<body name="finger">{joints}<geom type="box" size=".008 .008 .008" mass=".02" {GHOST}/></body>'
-    model, data, handle = scene(ball(0.03, pos=".002 .001 .0182"), timestep, "0 0 0", integrator, finger, stiffness=2e3)
+    model, data, handle = scene(
+        ball(0.03, pos=".002 .001 .0182"), timestep, "0 0 0", integrator, finger, stiffness=2e3
+    )
     data.qvel[3:6] = [0.1, 0.05, -0.3]
     finger_mass, touched = model.body_subtreemass[1], 0
     for _ in range(20):
@@ -202,7 +238,9 @@ def _momentum(model, data):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
         axes = data.ximat[b].reshape(3, 3)
         linear += model.body_mass[b] * velocity[3:]
-        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (model.body_inertia[b] * (axes.T @ velocity[:3]))
+        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (
+            model.body_inertia[b] * (axes.T @ velocity[:3])
+        )
     return linear, angular
 
 
@@ -211,10 +249,15 @@ def _momentum(model, data):
 @pytest.mark.parametrize("masses", [(0.02, 0.001), (0.05, 0.03), (0.02, 1.0)])
 def test_momentum_of_free_finger_and_object_is_conserved(masses, integrator, timestep):
     """A spinning ball hits a free finger off its centre and slides."""
-    finger = f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" {GHOST}/></body>'
-    model, data, handle = scene(ball(masses[1], pos=".002 .001 .0185"), timestep, "0 0 0", integrator, finger, stiffness=2e3)
-    # MuJoCo's own step of a free body errs by 1e-3 at 4 ms, with its own contacts too, where its centre of mass is off its joint or its
-    # inertia has unequal axes: such a finger would test MuJoCo
+    finger = (
+        f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" '
+        f"{GHOST}/></body>"
+    )
+    model, data, handle = scene(
+        ball(masses[1], pos=".002 .001 .0185"), timestep, "0 0 0", integrator, finger, stiffness=2e3
+    )
+    # MuJoCo's own step of a free body errs by 1e-3 at 4 ms, with its own contacts too, where its centre of
+    # mass is off its joint or its inertia has unequal axes: such a finger would test MuJoCo
     core = model.body("biotac_core").id
     model.body_ipos[core] = [-0.01, 0, 0]
     model.body_inertia[core] = model.body_inertia[core].mean()
@@ -233,11 +276,22 @@ def test_momentum_of_free_finger_and_object_is_conserved(masses, integrator, tim
 
 
 def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
-    """Energy, too, comes close to what it was as the step shrinks: implicit Euler's loss is of first order."""
+    """Energy, too, comes close to what it was as the step shrinks: implicit Euler's loss is of first
+    order."""
     losses = []
     for timestep in (0.0001, 0.00005):
-        finger = f'<body name="finger"><joint type="slide" axis="0 0 1"/><geom type="box" size=".01 .01 .01" mass=".03" {GHOST}/></body>'
-        model, data, _ = scene(ball(0.03, '<joint type="slide" axis="0 0 1"/>', "0 0 .0181"), timestep, "0 0 0", "Euler", finger, 1e2)
+        finger = (
+            '<body name="finger"><joint type="slide" axis="0 0 1"/><geom type="box" size=".01 .01 '
+            f'.01" mass=".03" {GHOST}/></body>'
+        )
+        model, data, _ = scene(
+            ball(0.03, '<joint type="slide" axis="0 0 1"/>', "0 0 .0181"),
+            timestep,
+            "0 0 0",
+            "Euler",
+            finger,
+            1e2,
+        )
         data.qvel[1] = -0.2
         mujoco.mj_step(model, data, int(0.04 / timestep))
         losses.append(1 - (data.qvel[1] - data.qvel[0]) ** 2 / 0.04)
@@ -250,7 +304,10 @@ def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
 @pytest.mark.parametrize("mass", [0.001, 0.1])
 def test_a_block_sticks_and_slips_at_mu(mass, timestep):
     joints = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
-    block = f'<body name="block" pos="0 0 .01299">{joints}<geom type="box" size=".05 .05 .005" mass="{mass}" friction="0.2"/></body>'
+    block = (
+        f'<body name="block" pos="0 0 .01299">{joints}<geom type="box" size=".05 .05 .005" '
+        f'mass="{mass}" friction="0.2"/></body>'
+    )
     model, data, _ = scene(block, timestep, friction=0.3)  # MuJoCo's rule: the larger friction counts
     mujoco.mj_step(model, data, int(0.2 / timestep))
     limit = 0.3 * mass * G
@@ -268,7 +325,10 @@ def test_a_block_sticks_and_slips_at_mu(mass, timestep):
 
 def test_priority_decides_whose_friction_counts():
     for priority, expected in ((0, 0.8), (1, 0.3), (-1, 0.2)):
-        block = '<body name="block" pos="0 0 .013"><freejoint/><geom type="box" size=".05 .05 .005" mass="0.1" friction="{}"/></body>'
+        block = (
+            '<body name="block" pos="0 0 .013"><freejoint/><geom type="box" size=".05 .05 .005" '
+            'mass="0.1" friction="{}"/></body>'
+        )
         friction = 0.8 if priority == 0 else 0.2
         seen = {}
         name = f"watch{priority}"
@@ -285,21 +345,34 @@ def test_priority_decides_whose_friction_counts():
 
 @pytest.mark.parametrize("timestep", [0.001, 0.004])
 def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
-    """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction there is."""
+    """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction
+    there is."""
     fingers = "".join(
         f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/>'
         f'<geom size=".003" mass=".03" {GHOST}/></body>'
         for i, (z, s) in enumerate(((-0.0131, 1), (0.0131, -1)))
     )
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" integrator="implicitfast"/><worldbody>{fingers}'
-        '<body name="box"><freejoint/><geom type="box" size=".004 .004 .005" mass=".005"/></body></worldbody></mujoco>'
+        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" '
+        f'integrator="implicitfast"/><worldbody>{fingers}'
+        '<body name="box"><freejoint/><geom type="box" size=".004 .004 .005" '
+        'mass=".005"/></body></worldbody></mujoco>'
     )
     handles = [
-        attach(spec, body=f"finger{i}", quat=quat, pos=[0.01, 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(), stepper="springs",
-               readings="none", friction=0.5, options={"stiffness": 1e3})
+        attach(
+            spec,
+            body=f"finger{i}",
+            quat=quat,
+            pos=[0.01, 0, 0],
+            prefix=f"b{i}_",
+            skin=spring_skin.pad_geometry(),
+            stepper="springs",
+            readings="none",
+            friction=0.5,
+            options={"stiffness": 1e3},
+        )
         for i, quat in enumerate((PAD_UP, PAD_DOWN))
-    ]  # fmt: skip
+    ]
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qfrc_applied[:2] = 1.0
@@ -309,7 +382,9 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
     np.testing.assert_allclose(data.body("box").xpos, start, atol=1e-6)
     for handle in handles:
         assert handle.read(data, "contact_force")[1] == pytest.approx(1.0, rel=0.01)
-    total = sum(data.xmat[model.body(h.body).id].reshape(3, 3) @ h.read(data, "contact_force")[:3] for h in handles)
+    total = sum(
+        data.xmat[model.body(h.body).id].reshape(3, 3) @ h.read(data, "contact_force")[:3] for h in handles
+    )
     np.testing.assert_allclose(total, [-0.005 * G, 0, 0], atol=1e-5)
 
 
@@ -345,7 +420,9 @@ def test_every_solver_and_jacobian_gives_the_same_motion(solver, jacobian):
         mujoco.mj_step(model, data, 25)
         return data.qpos.copy()
 
-    np.testing.assert_allclose(run(solver=solver, jacobian=jacobian), run(solver="Newton", jacobian="dense"), atol=2e-7)
+    np.testing.assert_allclose(
+        run(solver=solver, jacobian=jacobian), run(solver="Newton", jacobian="dense"), atol=2e-7
+    )
 
 
 def test_one_way_leaves_the_dynamics_alone():
@@ -353,7 +430,8 @@ def test_one_way_leaves_the_dynamics_alone():
     model, data, handle = scene(bodies, coupling="one-way", readings="sum")
     bare = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>'
-        f'<body name="finger"><body name="core" quat="{" ".join(map(str, PAD_UP))}" pos=".01 0 0"><inertial pos="0 0 0" mass=".004" '
+        f'<body name="finger"><body name="core" quat="{" ".join(map(str, PAD_UP))}" pos=".01 0 0"><inertial '
+        'pos="0 0 0" mass=".004" '
         f'diaginertia="1e-7 1e-7 1e-7"/></body></body>{bodies}</worldbody></mujoco>'
     )
     plain = mujoco.MjData(bare)
@@ -377,5 +455,7 @@ def test_displacement_undoes_displace():
     np.testing.assert_allclose(displacement(*displace(pos, mat, motion), pos, mat), motion, atol=1e-11)
     large = rotation(np.array([[0.0, 0.0, 3.0], [1.0, 0.0, 0.0]]))
     np.testing.assert_allclose(
-        displacement(np.zeros((2, 3)), large, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))[:, 3:], [[0, 0, 3], [1, 0, 0]], atol=1e-12
+        displacement(np.zeros((2, 3)), large, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))[:, 3:],
+        [[0, 0, 3], [1, 0, 0]],
+        atol=1e-12,
     )

@@ -1,4 +1,5 @@
-"""The two-way coupling with the finite-element skin: statics, Coulomb's law, momentum, replay and errors, through the public way in."""
+"""The two-way coupling with the finite-element skin: statics, Coulomb's law, momentum, replay and errors,
+through the public way in."""
 
 import sys
 
@@ -37,7 +38,9 @@ def scene(bodies, timestep=0.002, gravity="0 0 -9.81", finger='<body name="finge
         f'<mujoco><option timestep="{timestep}" gravity="{gravity}" integrator="implicitfast"/>'
         f"<worldbody>{finger}{bodies}</worldbody></mujoco>"
     )
-    handle = biotac_mj.attach(spec, body="finger", quat=PAD_UP, pos=APEX, **(dict(skin="coarse", readings="none") | settings))
+    handle = biotac_mj.attach(
+        spec, body="finger", quat=PAD_UP, pos=APEX, **(dict(skin="coarse", readings="none") | settings)
+    )
     model = spec.compile()
     return model, mujoco.MjData(model), handle
 
@@ -61,7 +64,8 @@ def state_of(model, data, kind=STATE):
     return state
 
 
-# stiffness [N/m] of the coarse skin under each mass [kg], roughly: only to choose a damping with which the ball settles soon
+# stiffness [N/m] of the coarse skin under each mass [kg], roughly: only to choose a damping with which the
+# ball settles soon
 STIFFNESS = {0.001: 600, 0.01: 1000, 0.1: 1500, 1.0: 12000}
 
 
@@ -69,7 +73,9 @@ def check_weight(mass, timestep, **settings):
     stiffness = STIFFNESS[mass]
     critical = 2 * np.sqrt(stiffness * mass)
     damping = min(0.7 * critical, 0.2 * mass / timestep)
-    rate = damping / (2 * mass) + min(0.5 * stiffness / mass * timestep, 0.5 / timestep)  # the damper's, and backward Euler's own
+    rate = damping / (2 * mass) + min(
+        0.5 * stiffness / mass * timestep, 0.5 / timestep
+    )  # the damper's, and backward Euler's own
     model, data, handle = scene(ball(mass, UPRIGHT.format(damping)), timestep, **settings)
     mujoco.mj_step(model, data, int(12 / rate / timestep) + 20)
     weight, force, balance, clamp, speed = mass * G, [], [], [], []
@@ -78,7 +84,8 @@ def check_weight(mass, timestep, **settings):
         skin = solved_skin(data)
         force.append(handle.read(data, "contact_force")[:3])
         balance.append(data.qfrc_passive[0] + damping * data.qvel[0])
-        # what holds the skin: clamp and nail, the core it lies on, and the liquid, which rests on the core too
+        # what holds the skin: clamp and nail, the core it lies on, and the liquid, which rests on the core
+        # too
         clamp.append(skin.reaction[0] + skin.core_force[0].sum(0) + skin.liquid_force[0].sum(0))
         speed.append(data.qvel[0])
     force, clamp = np.array(force), np.array(clamp)
@@ -90,7 +97,8 @@ def check_weight(mass, timestep, **settings):
     np.testing.assert_allclose(clamp[:, 1], -weight, rtol=0.015)
     assert force[:, 1].mean() == pytest.approx(weight, rel=0.002)
     assert abs(data.qacc[0]) < 0.01 * G
-    # chatter: no more than a force error of 1 % of the weight during one step would make, 0.05 mm/s on the whole
+    # chatter: no more than a force error of 1 % of the weight during one step would make, 0.05 mm/s on the
+    # whole
     assert max(np.abs(speed)) < 0.01 * G * timestep + 2e-5
     assert np.sqrt(np.mean(np.square(speed))) < 5e-5
 
@@ -103,7 +111,8 @@ def test_a_ball_reads_its_weight(mass, timestep):
 
 @pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST", "IMPLICIT"])
 def test_a_damped_ball_settles_along_the_static_curve(integrator):
-    """1 g, h c / m = 6.2: what it reads at each depth is what the skin reads where a geom is held at that depth, and nothing rings."""
+    """1 g, h c / m = 6.2: what it reads at each depth is what the skin reads where a geom is held at that
+    depth, and nothing rings."""
     mass, timestep = 0.001, 0.004
     weight = mass * G
     model, data, handle = scene(ball(mass, UPRIGHT.format(1.55)), timestep)
@@ -139,7 +148,9 @@ def test_a_ball_sticks_and_slips_at_mu(timestep):
     """Pressed by 0.3 N and pushed along the finger, where the pad is flat to 2 degrees."""
     mass, load, mu = 0.03, 0.3, 0.4
     joints = UPRIGHT.format(3) + '<joint name="x" type="slide" axis="1 0 0" damping="1"/>'
-    model, data, handle = scene(ball(mass, joints), timestep, friction=mu)  # MuJoCo's rule: the larger friction counts
+    model, data, handle = scene(
+        ball(mass, joints), timestep, friction=mu
+    )  # MuJoCo's rule: the larger friction counts
     data.qfrc_applied[0] = mass * G - load
     mujoco.mj_step(model, data, int(0.1 / timestep))
     for share in np.linspace(0, 0.85, int(0.05 / timestep)):
@@ -172,7 +183,9 @@ def momentum(model, data):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
         axes = data.ximat[b].reshape(3, 3)
         linear += model.body_mass[b] * velocity[3:]
-        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (model.body_inertia[b] * (axes.T @ velocity[:3]))
+        angular += np.cross(data.xipos[b], model.body_mass[b] * velocity[3:]) + axes @ (
+            model.body_inertia[b] * (axes.T @ velocity[:3])
+        )
     return linear, angular
 
 
@@ -180,8 +193,13 @@ def momentum(model, data):
 @pytest.mark.parametrize("masses", [(0.02, 0.005), (0.05, 0.05)])
 def test_momentum_of_a_free_finger_and_a_ball_is_conserved(masses, timestep):
     """A spinning ball hits a free finger beside its centre and slides."""
-    finger = f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" {GHOST}/></body>'
-    model, data, handle = scene(ball(masses[1], pos=(0.002, 0.001, TOP + RADIUS + 2e-4)), timestep, "0 0 0", finger, friction=0.3)
+    finger = (
+        f'<body name="finger"><freejoint/><geom type="box" size=".008 .008 .008" mass="{masses[0]}" '
+        f"{GHOST}/></body>"
+    )
+    model, data, handle = scene(
+        ball(masses[1], pos=(0.002, 0.001, TOP + RADIUS + 2e-4)), timestep, "0 0 0", finger, friction=0.3
+    )
     data.qvel[6:] = [0.1, 0.05, -0.3, 3, 4, 2]
     linear, angular = momentum(model, data)
     touched = 0
@@ -195,19 +213,30 @@ def test_momentum_of_a_free_finger_and_a_ball_is_conserved(masses, timestep):
 
 
 def pinch(timestep, friction, mass=0.02, grip=2.0):
-    """Two BioTacs face each other, pads 16 mm apart with a ball between; gravity along the fingers, towards their tips."""
+    """Two BioTacs face each other, pads 16 mm apart with a ball between; gravity along the fingers, towards
+    their tips."""
     fingers = "".join(
         f'<body name="finger{i}" pos="0 0 {z}"><joint name="f{i}" type="slide" axis="0 0 {s}" damping="5"/>'
         f'<geom size=".003" mass=".05" {GHOST}/></body>'
         for i, (z, s) in enumerate(((-TOP - RADIUS, 1), (TOP + RADIUS, -1)))
     )
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" integrator="implicitfast"/><worldbody>{fingers}'
+        f'<mujoco><option timestep="{timestep}" gravity="-9.81 0 0" '
+        f'integrator="implicitfast"/><worldbody>{fingers}'
         f"{ball(mass, pos=(0, 0, 0), friction=0)}</worldbody>"
         '<actuator><motor joint="f0"/><motor joint="f1"/></actuator></mujoco>'
     )
     handles = [
-        biotac_mj.attach(spec, body=f"finger{i}", quat=quat, pos=APEX, prefix=f"b{i}_", skin="coarse", readings="none", friction=friction)
+        biotac_mj.attach(
+            spec,
+            body=f"finger{i}",
+            quat=quat,
+            pos=APEX,
+            prefix=f"b{i}_",
+            skin="coarse",
+            readings="none",
+            friction=friction,
+        )
         for i, quat in enumerate((PAD_UP, PAD_DOWN))
     ]
     model = spec.compile()
@@ -246,9 +275,12 @@ def test_without_friction_the_pinched_ball_falls():
 
 def two_biotacs(**settings):
     """Two BioTacs side by side, a ball sliding on each; the balls are light and not in the same state."""
-    bodies = "".join(ball(0.002 * (i + 1), pos=(0.04 * i, 0, TOP + RADIUS - 2e-5), name=f"ball{i}") for i in range(2))
+    bodies = "".join(
+        ball(0.002 * (i + 1), pos=(0.04 * i, 0, TOP + RADIUS - 2e-5), name=f"ball{i}") for i in range(2)
+    )
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>{bodies}</worldbody></mujoco>'
+        '<mujoco><option timestep="0.002" '
+        f'integrator="implicitfast"/><worldbody>{bodies}</worldbody></mujoco>'
     )
     for i in range(2):
         settings = dict(skin="coarse", friction=0.3, seed=i) | settings
@@ -275,11 +307,16 @@ def test_replay_copies_and_reset_are_bit_equal(both):
     copied = mujoco.MjData(both)
     mujoco.mj_copyData(copied, both, data)
     mujoco.mj_step(both, data, 4)
-    assert all(data.sensor(f"b{i}_contact_force").data[1] > 0.005 for i in range(2)) and data.sensor("b0_electrodes").data.all()
+    assert (
+        all(data.sensor(f"b{i}_contact_force").data[1] > 0.005 for i in range(2))
+        and data.sensor("b0_electrodes").data.all()
+    )
 
     def same(other):
         assert np.array_equal(other.qpos, data.qpos) and np.array_equal(other.qvel, data.qvel)
-        assert np.array_equal(other.sensordata, data.sensordata) and np.array_equal(state_of(both, other), state_of(both, data))
+        assert np.array_equal(other.sensordata, data.sensordata) and np.array_equal(
+            state_of(both, other), state_of(both, data)
+        )
 
     restored = mujoco.MjData(both)
     mujoco.mj_setState(both, restored, saved, STATE)
@@ -295,7 +332,9 @@ def test_replay_copies_and_reset_are_bit_equal(both):
 
 def test_rollout_with_two_threads_equals_the_loop(both):
     starts = np.stack([state_of(both, start(both, 0.02 * i), FULL) for i in range(3)])
-    states, sensors = mujoco.rollout.rollout(both, [mujoco.MjData(both), mujoco.MjData(both)], starts, nstep=5)
+    states, sensors = mujoco.rollout.rollout(
+        both, [mujoco.MjData(both), mujoco.MjData(both)], starts, nstep=5
+    )
     for i in range(3):
         data = mujoco.MjData(both)
         mujoco.mj_setState(both, data, starts[i], FULL)
@@ -329,12 +368,17 @@ def test_one_way_reads_and_leaves_the_dynamics_alone():
     for _ in range(40):
         mujoco.mj_step(reading, data)
         mujoco.mj_step(deaf, plain)
-        assert np.array_equal(data.qpos, plain.qpos) and np.array_equal(data.qvel, plain.qvel) and np.array_equal(data.qacc, plain.qacc)
+        assert (
+            np.array_equal(data.qpos, plain.qpos)
+            and np.array_equal(data.qvel, plain.qvel)
+            and np.array_equal(data.qacc, plain.qacc)
+        )
     assert handle.read(data, "contact_force")[1] > 0.05  # it did read
 
 
 def pressing(shape, timestep=0.002, **settings):
-    """A geom on a mocap body; it moves with data.mocap_pos[0], which starts over the pad without touching it."""
+    """A geom on a mocap body; it moves with data.mocap_pos[0], which starts over the pad without touching
+    it."""
     return scene(f'<body name="probe" mocap="true" pos="0 0 .03">{shape}</body>', timestep, **settings)
 
 
@@ -356,7 +400,9 @@ def test_a_geom_deep_in_the_core_is_named_and_survived():
 
 
 def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted():
-    model, data, handle = pressing(f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}})
+    model, data, handle = pressing(
+        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}}
+    )
     data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
     mujoco.mj_step(model, data, 5)
     failed = handle.read(data, "status")[1]
@@ -367,7 +413,9 @@ def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted(
     status = handle.read(data, "status")
     assert status[0] == 0 and status[1] == failed + 3 and status[3] > 3e-4
     assert np.array_equal(handle.read(data, "contact_force"), force)
-    assert np.array_equal(data.plugin_state[4 + 54 :], good[4 + 54 :])  # all but the counters and the pose of the one touching body
+    assert np.array_equal(
+        data.plugin_state[4 + 54 :], good[4 + 54 :]
+    )  # all but the counters and the pose of the one touching body
     data.mocap_pos[0, 2] += 2.2e-3
     mujoco.mj_step(model, data, 3)
     assert handle.read(data, "status")[:2].tolist() == [1, status[1]]
@@ -379,7 +427,9 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
     ring = indenter("ring_7mm")
     vert, face = ring.mesh()
     mass, damping, timestep = 0.05, 5.0, 0.004
-    spec = mujoco.MjSpec.from_string(f'<mujoco><option timestep="{timestep}" integrator="implicitfast"/></mujoco>')
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" integrator="implicitfast"/></mujoco>'
+    )
     spec.add_mesh(name="ring", uservert=vert.ravel().tolist(), userface=face.ravel().tolist())
     body = spec.worldbody.add_body(name="ring", pos=[0, 0, TOP], quat=PAD_UP)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -1, 0], damping=[damping, 0, 0])
@@ -393,7 +443,9 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
         mujoco.mj_step(model, data)
         force.append(handle.read(data, "contact_force")[1])
     np.testing.assert_allclose(force, mass * G, rtol=0.01)
-    place = solved_skin(data).contacts()[:, 2:] @ data.geom("ring").xmat.reshape(3, 3).T + data.geom("ring").xpos
+    place = (
+        solved_skin(data).contacts()[:, 2:] @ data.geom("ring").xmat.reshape(3, 3).T + data.geom("ring").xpos
+    )
     axis = np.linalg.norm(vert[:, [0, 2]], axis=1)
     radius = np.linalg.norm(place[:, :2], axis=1)
     assert len(radius) > 3
@@ -401,7 +453,8 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
 
 
 def sagging(model, acceleration):
-    """(nvert, 3) displacements of the linear skin, of scipy's own, under the inertia of a constant acceleration of the core."""
+    """(nvert, 3) displacements of the linear skin, of scipy's own, under the inertia of a constant
+    acceleration of the core."""
     force = -model.material.density * model.elasticity.node_volume[model.free, None] * acceleration
     out = np.zeros((model.nvert, 3))
     out[model.free] = scipy.sparse.linalg.spsolve(model._stiffness, force.ravel()).reshape(-1, 3)
@@ -410,8 +463,11 @@ def sagging(model, acceleration):
 
 @pytest.mark.parametrize("coupling", ["two-way", "one-way"])
 def test_an_accelerating_finger_leaves_its_skin_behind(coupling):
-    """Implicit dynamics: 100 m/s^2, along and around, from a moving start; backward Euler damps the skin's own vibration."""
-    finger = f'<body name="finger"><joint type="slide" axis="0 0 1"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    """Implicit dynamics: 100 m/s^2, along and around, from a moving start; backward Euler damps the skin's
+    own vibration."""
+    finger = (
+        f'<body name="finger"><joint type="slide" axis="0 0 1"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    )
     settings = dict(coupling=coupling, liquid=False, geoms=[], options={"skin": {"dynamics": "implicit"}})
     model, data, _ = scene("", 0.002, "0 0 0", finger, **settings)
     data.qvel[0] = 1.5
@@ -422,15 +478,21 @@ def test_an_accelerating_finger_leaves_its_skin_behind(coupling):
     acceleration = 100.0
     data.qfrc_applied[0] = acceleration * model.body_subtreemass[1]
     mujoco.mj_step(model, data, 60)
-    moved, expected = skin.vert_xpos[0] - rest, sagging(skin.model, [0, -acceleration, 0])  # up is the BioTac's -y
+    moved, expected = (
+        skin.vert_xpos[0] - rest,
+        sagging(skin.model, [0, -acceleration, 0]),
+    )  # up is the BioTac's -y
     assert abs(expected).max() > 2e-5
     assert abs(moved - expected).max() < 0.03 * abs(expected).max()
 
 
 @pytest.mark.slow
 def test_a_turning_finger_feels_the_centrifugal_force():
-    """50 rad/s about the finger's axis: the skin turns with it and is drawn outwards by omega^2 r, late by a step: by the angle omega h."""
-    finger = f'<body name="finger"><joint type="hinge" axis="1 0 0"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    """50 rad/s about the finger's axis: the skin turns with it and is drawn outwards by omega^2 r, late by a
+    step: by the angle omega h."""
+    finger = (
+        f'<body name="finger"><joint type="hinge" axis="1 0 0"/><geom size=".01" mass=".02" {GHOST}/></body>'
+    )
     options = {"skin": {"dynamics": "implicit", "mass_damping": 300.0}}
     model, data, _ = scene("", 0.00025, "0 0 0", finger, liquid=False, geoms=[], options=options)
     data.qvel[0] = omega = 50.0
@@ -453,7 +515,8 @@ def steps_made(monkeypatch):
 
 
 def test_a_skin_that_nothing_reaches_is_not_solved(monkeypatch):
-    """A ball falls onto the pad and is taken away: only steps in which it is within a millimetre ask, only those in contact solve."""
+    """A ball falls onto the pad and is taken away: only steps in which it is within a millimetre ask, only
+    those in contact solve."""
     model, data, handle = scene(ball(0.02, pos=(0, 0, TOP + RADIUS + 3e-3)), readings="biotac")
     mujoco.mj_forward(model, data)
     at_rest, counts = state_of(model, data), handle.read(data, "electrodes")
@@ -473,8 +536,12 @@ def test_a_skin_that_nothing_reaches_is_not_solved(monkeypatch):
     again = mujoco.MjData(model)
     mujoco.mj_setState(model, again, state, STATE)
     mujoco.mj_step(model, again, 20)
-    assert np.array_equal(again.sensordata, data.sensordata) and np.array_equal(state_of(model, again), state_of(model, data))
-    assert np.abs(handle.read(data, "electrodes") - counts).max() < 20  # noise alone; in contact they changed by more
+    assert np.array_equal(again.sensordata, data.sensordata) and np.array_equal(
+        state_of(model, again), state_of(model, data)
+    )
+    assert (
+        np.abs(handle.read(data, "electrodes") - counts).max() < 20
+    )  # noise alone; in contact they changed by more
     mujoco.mj_setState(model, data, at_rest, STATE)
     mujoco.mj_step(model, data)
     assert not made
@@ -484,7 +551,9 @@ def test_a_skin_that_nothing_reaches_is_not_solved(monkeypatch):
 def test_a_skin_at_rest_is_what_a_solve_would_leave(options):
     """The stepper with and without its short cut: near the skin, in contact, and after it."""
     stepper = fem.FemStepper(
-        Config(skin="coarse", options={"skin": options}), load_skin("coarse"), [Geom("b", "sphere", [RADIUS, 0, 0], 0.5, 0)]
+        Config(skin="coarse", options={"skin": options}),
+        load_skin("coarse"),
+        [Geom("b", "sphere", [RADIUS, 0, 0], 0.5, 0)],
     )
     state = np.empty(stepper.nstate)
     stepper.reset(state)
@@ -503,7 +572,9 @@ def test_a_skin_at_rest_is_what_a_solve_would_leave(options):
 
 
 def test_a_geom_inside_the_core_is_refused_though_no_skin_feels_it():
-    stepper = fem.FemStepper(Config(skin="coarse"), load_skin("coarse"), [Geom("b", "sphere", [3e-3, 0, 0], 0.5, 0)])
+    stepper = fem.FemStepper(
+        Config(skin="coarse"), load_skin("coarse"), [Geom("b", "sphere", [3e-3, 0, 0], 0.5, 0)]
+    )
     state = np.empty(stepper.nstate)
     stepper.reset(state)
     with pytest.raises(ValueError, match="inside the rigid core"):

@@ -1,4 +1,5 @@
-"""Why the coupling is what it is: ways to tie two free masses by a stiff spring, by the eigenvalues of one step.
+"""Why the coupling is what it is: ways to tie two free masses by a stiff spring, by the eigenvalues of one
+step.
 
 Run as a script for the table of docs/coupling.md.
 """
@@ -17,7 +18,9 @@ def _accelerations(scheme, m1, m2, k, h, x, v1, v2, last):
         return -k * y / (m1 + stiff), k * y / (m2 + stiff)
     if scheme == "own inertia, twice":
         return -k * y / (m1 + 2 * stiff), k * y / (m2 + 2 * stiff)
-    if scheme == "reaction one step late":  # h^2 k added to the object's block; the finger gets what the object felt
+    if (
+        scheme == "reaction one step late"
+    ):  # h^2 k added to the object's block; the finger gets what the object felt
         return -k * y / (m1 + stiff), -last / m2
     if scheme == "rows":  # h^2 k added across both trees
         return np.linalg.solve([[m1 + stiff, -stiff], [-stiff, m2 + stiff]], [-k * y, k * y])
@@ -50,7 +53,13 @@ def momentum_error(scheme, m1, m2, k, h):
     return worst / abs(start)
 
 
-CASES = [(m1, m2, k, h) for m1 in (1e-3, 0.03, 1.0) for m2 in (0.02, 0.05) for k in (1e3, 2e4) for h in (5e-4, 1e-3, 2e-3, 4e-3)]
+CASES = [
+    (m1, m2, k, h)
+    for m1 in (1e-3, 0.03, 1.0)
+    for m2 in (0.02, 0.05)
+    for k in (1e3, 2e4)
+    for h in (5e-4, 1e-3, 2e-3, 4e-3)
+]
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -74,8 +83,14 @@ if __name__ == "__main__":
         unstable = sum(growth(scheme, *case) > 1 + 1e-7 for case in CASES)
         errors = [momentum_error(scheme, *case) for case in CASES if growth(scheme, *case) <= 1 + 1e-7]
         steps = [
-            max((h for h in np.geomspace(1e-5, 8e-3, 300) if growth(scheme, m1, 0.02, 1e4, h) <= 1 + 1e-7), default=0)
+            max(
+                (h for h in np.geomspace(1e-5, 8e-3, 300) if growth(scheme, m1, 0.02, 1e4, h) <= 1 + 1e-7),
+                default=0,
+            )
             for m1 in (1e-3, 0.03, 1.0)
         ]
-        print(f"{scheme:24s} unstable in {unstable:2d} of {len(CASES)}; largest stable step {['%.2f' % (1e3 * s) for s in steps]} ms; "
-              f"momentum error where stable {max(errors, default=np.nan):.1e}")  # fmt: skip
+        print(
+            f"{scheme:24s} unstable in {unstable:2d} of {len(CASES)}; largest stable step "
+            f"{['%.2f' % (1e3 * s) for s in steps]} ms; "
+            f"momentum error where stable {max(errors, default=np.nan):.1e}"
+        )

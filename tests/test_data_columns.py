@@ -50,7 +50,10 @@ def test_one_column(tmp_path):
         ("1 2 3\n1 x 3\n1 2 y\n", r"line 2: Fy is 'x', not a finite number \(2 such cells\)"),
         ("1 2 3\n# a\n1 inf 3\n", "line 3: Fy is 'inf'"),
         ("x 2 3\n1 2 3\n", "line 1: Fx is 'x'"),
-        ("nan nan nan\n1 2 3\n", r"line 1: Fx is 'nan', not a finite number \(3 such cells\): a gap cannot be guessed"),
+        (
+            "nan nan nan\n1 2 3\n",
+            r"line 1: Fx is 'nan', not a finite number \(3 such cells\): a gap cannot be guessed",
+        ),
         ("1,5;2,5;3,5\n", "line 1: 6 columns"),
     ],
 )
@@ -62,5 +65,7 @@ def test_bad_tables_are_named(tmp_path, text, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="none.txt: no such file; give a text file with 19 columns, e1..e19"):
+    with pytest.raises(
+        FileNotFoundError, match="none.txt: no such file; give a text file with 19 columns, e1..e19"
+    ):
         read_columns(tmp_path / "none.txt", [f"e{i}" for i in range(1, 20)])

@@ -1,4 +1,5 @@
-"""Generation: where objects touch, how they move, and that a set is what its seed says, however often it was interrupted."""
+"""Generation: where objects touch, how they move, and that a set is what its seed says, however often it was
+interrupted."""
 
 import dataclasses
 import importlib.util
@@ -24,8 +25,17 @@ from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressur
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import SkinModel, SkinOptions
 
-SMALL = GenerateOptions(count=3, labelled=1, steps=8, seed=5, objects=("sphere_7mm", "table_edge"), kinds=("press", "twist"), skin="coarse",
-                        measured_skin="coarse", batch=2)  # fmt: skip
+SMALL = GenerateOptions(
+    count=3,
+    labelled=1,
+    steps=8,
+    seed=5,
+    objects=("sphere_7mm", "table_edge"),
+    kinds=("press", "twist"),
+    skin="coarse",
+    measured_skin="coarse",
+    batch=2,
+)
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +94,24 @@ def test_first_touch_is_where_rays_find_it(skin, name):
     from biotac_mj.press import _rotation_from_y
 
     quat = _rotation_from_y(direction)
-    got = first_touch(Placed(name, 1), points, (point - 0.05 * direction)[None], rotation_matrices(quat)[None], direction[None])[0]
+    got = first_touch(
+        Placed(name, 1),
+        points,
+        (point - 0.05 * direction)[None],
+        rotation_matrices(quat)[None],
+        direction[None],
+    )[0]
     spec = mujoco.MjSpec()
     shape = press_indenter.make_indenter(name)
-    press_indenter.add_indenter(spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False)
+    press_indenter.add_indenter(
+        spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    assert abs(got - approach.first_touch(skin, model, data, direction)) < 1.5e-5  # samples 0.1 mm apart on a face
+    assert (
+        abs(got - approach.first_touch(skin, model, data, direction)) < 1.5e-5
+    )  # samples 0.1 mm apart on a face
 
 
 def test_motions_cover_the_surface_and_keep_off_the_core(skin):
@@ -128,7 +148,9 @@ def test_a_seed_is_a_motion(skin):
     np.testing.assert_array_equal(a[2].pos, b[0].pos)
     np.testing.assert_array_equal(a[2].mat, b[0].mat)
     assert np.abs(a[0].pos - a[1].pos).max() > 1e-4
-    np.testing.assert_allclose(np.swapaxes(a[0].mat, 1, 2) @ a[0].mat, np.tile(np.eye(3), (10, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        np.swapaxes(a[0].mat, 1, 2) @ a[0].mat, np.tile(np.eye(3), (10, 1, 1)), atol=1e-12
+    )
 
 
 def test_a_small_set_is_physics(small, skin):
@@ -146,12 +168,16 @@ def test_a_small_set_is_physics(small, skin):
             np.testing.assert_allclose(one.contact_force.sum(1), -force, atol=1e-5)
             x = data.vert_xpos(slice(data.start[i], data.stop[i])).astype(float)
             torque = np.cross(x[:, outer], one.contact_force.astype(float)).sum(1)
-            np.testing.assert_allclose(torque, -one.wrench[:, 3:], atol=3e-3 * np.abs(one.wrench[:, 3:]).max() + 1e-7)
+            np.testing.assert_allclose(
+                torque, -one.wrench[:, 3:], atol=3e-3 * np.abs(one.wrench[:, 3:]).max() + 1e-7
+            )
             # stored impedances are the film's of the stored nodes, counts their noisy 12-bit image
             k = int(np.abs(force).sum(1).argmax())
             np.testing.assert_allclose(film.impedance(x[k]), one.impedance[k], rtol=1e-4)
             still = counts_from_impedance(one.impedance)
-            moved = 0.2 * np.abs(np.diff(still, axis=0, prepend=still[:1]))  # in a frame of 10 ms, a fifth of a time step
+            moved = 0.2 * np.abs(
+                np.diff(still, axis=0, prepend=still[:1])
+            )  # in a frame of 10 ms, a fifth of a time step
             assert (np.abs(one.counts[:, :19] - still) < moved + 33).all()  # five times the noise
             assert np.abs(one.counts[:, 19] - counts_from_pressure(one.pressure)).max() < 8
             assert (one.counts == np.rint(one.counts)).all()
@@ -168,7 +194,9 @@ def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
     assert sum(ticks) == 3 * 8 and both.converged.all()
     for k, name in enumerate(names):
         alone = simulate(model, name, motions[k : k + 1])
-        assert np.abs(both.displacement[k].astype(int) - alone.displacement[0]).max() <= 1  # rounded to 0.25 um
+        assert (
+            np.abs(both.displacement[k].astype(int) - alone.displacement[0]).max() <= 1
+        )  # rounded to 0.25 um
         np.testing.assert_allclose(both.contact_force[k], alone.contact_force[0], atol=1e-6)
         np.testing.assert_allclose(both.wrench[k], alone.wrench[0], atol=1e-5)
         assert np.abs(both.wrench[k, :, :3]).max() > 0.02
@@ -180,7 +208,11 @@ def test_a_walk_ends_at_every_time_step_in_steps_of_a_tenth_of_a_millimetre(skin
     assert row[row >= 0].tolist() == list(range(10))
     np.testing.assert_array_equal(pos[row >= 0], motion.pos)
     np.testing.assert_array_equal(mat[row >= 0], motion.mat)
-    assert np.linalg.norm(np.diff(pos, axis=0), axis=1).max() < 1.01e-4 < np.linalg.norm(np.diff(motion.pos, axis=0), axis=1).max()
+    assert (
+        np.linalg.norm(np.diff(pos, axis=0), axis=1).max()
+        < 1.01e-4
+        < np.linalg.norm(np.diff(motion.pos, axis=0), axis=1).max()
+    )
 
 
 def test_several_devices_of_one_kind_only():
@@ -222,14 +254,18 @@ def test_processes_of_several_devices_make_the_same_set(small, tmp_path, monkeyp
         settings = data.attributes["settings"]
     two = dataclasses.replace(SMALL, device="cuda:0,cuda:1")
     done, told = [], []
-    seconds = making._make_on_all(tmp_path, two, settings, batches(two), 0, done.append, told.append, seen="cpu")
+    seconds = making._make_on_all(
+        tmp_path, two, settings, batches(two), 0, done.append, told.append, seen="cpu"
+    )
     assert sum(done) == 8 * 4 and seconds["skin"] > 0 and os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
     assert len(told) == 3 and "shard-00000.h5: 1 worlds" in "".join(told)
     for path in out.glob("shard-*.h5"):
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
     with pytest.raises(ValueError, match=r"cuda:\d: unknown material"):
         bad = dataclasses.replace(two, material="jelly")
-        making._make_on_all(tmp_path / "bad", bad, settings, batches(bad), 0, done.append, told.append, seen="cpu")
+        making._make_on_all(
+            tmp_path / "bad", bad, settings, batches(bad), 0, done.append, told.append, seen="cpu"
+        )
 
 
 @pytest.mark.slow
@@ -239,7 +275,11 @@ def test_recordings_keep_readings_only(tmp_path):
     assert report.interactions == 1 and report.recordings == 1 and report.made == 2
     with TactileSet(tmp_path) as data, TactileSet(tmp_path / "recordings") as recorded:
         assert len(data) == 1 and "measured_counts" not in data.columns
-        assert recorded.object.tolist() == ["table_edge"] and recorded.geometry is None and "displacement" not in recorded.columns
+        assert (
+            recorded.object.tolist() == ["table_edge"]
+            and recorded.geometry is None
+            and "displacement" not in recorded.columns
+        )
         counts = recorded["measured_counts"][:]
         assert np.isfinite(counts).all() and np.abs(counts[:, :19] - counts[0, :19]).max() > 20
 
@@ -251,14 +291,18 @@ def test_same_seed_same_file_on_cuda(tmp_path):
     options = dataclasses.replace(SMALL, count=40, labelled=24, batch=20, measured_batch=24)
     generate(tmp_path / "a", dataclasses.replace(options, device="cuda:0"), workers=0, progress=False)
     # once more, by as many devices as there are
-    report = generate(tmp_path / "b", dataclasses.replace(options, device=",".join(devices)), workers=2, progress=False)
+    report = generate(
+        tmp_path / "b", dataclasses.replace(options, device=",".join(devices)), workers=2, progress=False
+    )
     assert report.made == 3 and report.devices == len(devices)
     for path in (tmp_path / "a").glob("shard-*.h5"):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
 def test_condensed_tier(tmp_path):
-    options = dataclasses.replace(SMALL, count=1, labelled=0, objects=("sphere_7mm",), tier="condensed", kinds=("press",))
+    options = dataclasses.replace(
+        SMALL, count=1, labelled=0, objects=("sphere_7mm",), tier="condensed", kinds=("press",)
+    )
     report = generate(tmp_path, options, workers=0, progress=False)
     full = generate(tmp_path / "full", dataclasses.replace(options, tier="full"), workers=0, progress=False)
     assert report.steps == full.steps == 8
@@ -280,7 +324,9 @@ def test_all_objects_take_turns():
     assert {name for part in role["recorded"] for name in part.names} == set(OBJECTS) - set(INDENTERS)
     assert all(len(set(part.names)) == 1 for part in role["plain"])  # whatever is measured mixes its objects
     assert [len(part.members) for part in role["labelled"]] == [10, 10] and len(role["recorded"]) == 3
-    assert max(len(part.members) for part in role["plain"]) <= 3 and len({part.path for part in parts}) == len(parts)
+    assert max(len(part.members) for part in role["plain"]) <= 3 and len(
+        {part.path for part in parts}
+    ) == len(parts)
     # an interaction has the same object whatever the batches are
     other = batches(GenerateOptions(count=100, labelled=20, recordings=30))
     assert dict(sorted((i, n) for p in parts for i, n in zip(p.members, p.names))) == dict(
@@ -295,7 +341,9 @@ def test_readings_follow_a_ramp():
     counts = sample(time, impedance, pressure, seed=3)
     # what stands there was sampled within the last frame of 10 ms; five standard deviations of noise
     earliest = counts_from_impedance(np.outer(5e3 * (1 + 20 * (time - 0.0101)), np.ones(19)))
-    assert (counts[1:, :19] < earliest[1:] + 33).all() and (counts[1:, :19] > counts_from_impedance(impedance)[1:] - 33).all()
+    assert (counts[1:, :19] < earliest[1:] + 33).all() and (
+        counts[1:, :19] > counts_from_impedance(impedance)[1:] - 33
+    ).all()
     assert np.abs(counts[1:, 19] - counts_from_pressure(pressure - 100)[1:]).max() < 3 + 5
     np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3), counts)
     assert (sample(time, impedance, pressure, seed=4) != counts).any()
@@ -341,8 +389,28 @@ def test_bad_plans_are_named(skin):
 
 
 def test_the_command_reports_what_it_made(tmp_path, capsys):
-    arguments = ["generate", "--count", "1", "--steps", "8", "--labelled", "0", "--skin", "coarse", "--tier", "condensed",
-                 "--objects", "sphere_7mm", "--kinds", "tap", "--workers", "0", "--quiet", "--out", str(tmp_path / "set")]  # fmt: skip
+    arguments = [
+        "generate",
+        "--count",
+        "1",
+        "--steps",
+        "8",
+        "--labelled",
+        "0",
+        "--skin",
+        "coarse",
+        "--tier",
+        "condensed",
+        "--objects",
+        "sphere_7mm",
+        "--kinds",
+        "tap",
+        "--workers",
+        "0",
+        "--quiet",
+        "--out",
+        str(tmp_path / "set"),
+    ]
     assert cli.main(arguments) == 0
     text = capsys.readouterr().out
     assert "1 interactions, 8 time steps, 0 of them not converged" in text and "1 shards made" in text

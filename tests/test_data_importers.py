@@ -16,12 +16,19 @@ def nvidia(path, lengths=(6, 4, 5, 7), seed=0, flat=False, **changes):
     """Trajectories of 0.1 mm steps at places some millimetres apart; indenter types 0, 0, 2, 5."""
     rng = np.random.default_rng(seed)
     location = np.concatenate(
-        [rng.uniform(-5e-3, 5e-3, 3) + 5e-3 * k + 1e-4 * np.arange(n)[:, None] * [0, 1, 0] for k, n in enumerate(lengths)]
+        [
+            rng.uniform(-5e-3, 5e-3, 3) + 5e-3 * k + 1e-4 * np.arange(n)[:, None] * [0, 1, 0]
+            for k, n in enumerate(lengths)
+        ]
     )
     n = len(location)
     kind = np.repeat([0, 0, 2, 5], lengths)
-    data = dict(electrode_vals=rng.integers(1500, 3500, (n, 19)).astype(float), contact_loc=location, force_vec=rng.normal(size=(n, 3)),
-                indenter_type=kind if flat else kind[:, None])  # fmt: skip
+    data = dict(
+        electrode_vals=rng.integers(1500, 3500, (n, 19)).astype(float),
+        contact_loc=location,
+        force_vec=rng.normal(size=(n, 3)),
+        indenter_type=kind if flat else kind[:, None],
+    )
     with h5py.File(path, "w") as file:
         for name, value in (data | changes).items():
             if value is not None:
@@ -35,10 +42,17 @@ def test_nvidia(tmp_path, flat):
     ones = read_nvidia(tmp_path / "biotac1.hdf5")
     assert [len(one.time) for one in ones] == [6, 4, 5, 7]
     assert [one.object for one in ones] == ["indenter_0", "indenter_0", "indenter_2", "indenter_5"]
-    np.testing.assert_allclose(np.concatenate([one.measured_counts[:, :19] for one in ones]), data["electrode_vals"])
-    np.testing.assert_allclose(np.concatenate([one.measured_wrench[:, :3] for one in ones]), data["force_vec"], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate([one.measured_counts[:, :19] for one in ones]), data["electrode_vals"]
+    )
+    np.testing.assert_allclose(
+        np.concatenate([one.measured_wrench[:, :3] for one in ones]), data["force_vec"], rtol=1e-6
+    )
     np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), data["contact_loc"])
-    assert all(np.isnan(one.measured_wrench[:, 3:]).all() and np.isnan(one.measured_counts[:, 19:]).all() for one in ones)
+    assert all(
+        np.isnan(one.measured_wrench[:, 3:]).all() and np.isnan(one.measured_counts[:, 19:]).all()
+        for one in ones
+    )
     assert ones[2].parameters["rows"] == [10, 15] and ones[0].kind == "recorded" and ones[0].labelled
     names = [f"thing{k}" for k in range(6)]
     assert read_nvidia(tmp_path / "biotac1.hdf5", objects=names)[3].object == "thing5"
@@ -47,7 +61,11 @@ def test_nvidia(tmp_path, flat):
 def test_nvidia_trajectories_end_at_half_a_millimetre(tmp_path):
     location = np.array([0, 0.4e-3, 0.89e-3, 1.38e-3, 1.89e-3, 2.0e-3])[:, None] * [1, 0, 0]
     nvidia(
-        tmp_path / "b.hdf5", contact_loc=location, electrode_vals=np.full((6, 19), 2000.0), force_vec=np.zeros((6, 3)), indenter_type=None
+        tmp_path / "b.hdf5",
+        contact_loc=location,
+        electrode_vals=np.full((6, 19), 2000.0),
+        force_vec=np.zeros((6, 3)),
+        indenter_type=None,
     )
     assert [len(one.time) for one in read_nvidia(tmp_path / "b.hdf5")] == [4, 2]
 
@@ -96,8 +114,16 @@ def ruppel(path, header=True, order=None, n=30):
     """30 rows at 10 ms with a gap of two seconds after 12 of them."""
     rng = np.random.default_rng(3)
     time = 100.0 + 0.01 * np.arange(n) + 2.0 * (np.arange(n) >= 12)
-    value = np.column_stack([time, rng.normal(0, 5e-3, (n, 3)), rng.normal(size=(n, 3)), rng.integers(1900, 2200, (n, 2)),
-                             rng.integers(1000, 3000, (n, 3)), rng.integers(1500, 3500, (n, 19))])  # fmt: skip
+    value = np.column_stack(
+        [
+            time,
+            rng.normal(0, 5e-3, (n, 3)),
+            rng.normal(size=(n, 3)),
+            rng.integers(1900, 2200, (n, 2)),
+            rng.integers(1000, 3000, (n, 3)),
+            rng.integers(1500, 3500, (n, 19)),
+        ]
+    )
     order = list(range(len(RUPPEL_COLUMNS))) if order is None else order
     with open(path, "w", newline="") as file:
         writer = csv.writer(file)
@@ -116,7 +142,9 @@ def test_ruppel(tmp_path, header, order):
     np.testing.assert_allclose(counts[:, :19], value[:, 12:])
     for name, column in (("pac", 8), ("pdc", 9), ("tac", 10), ("tdc", 11)):
         np.testing.assert_allclose(counts[:, CHANNELS.index(name)], value[:, column])
-    np.testing.assert_allclose(np.concatenate([one.measured_wrench[:, :3] for one in ones]), value[:, 4:7], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate([one.measured_wrench[:, :3] for one in ones]), value[:, 4:7], rtol=1e-6
+    )
     np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), value[:, 1:4], rtol=1e-8)
     np.testing.assert_allclose(np.concatenate([one.time for one in ones]), value[:, 0])
 
@@ -162,7 +190,9 @@ def test_the_command(tmp_path, capsys):
     nvidia(tmp_path / "biotac1.hdf5")
     out = str(tmp_path / "set")
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0
-    assert "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in capsys.readouterr().out
+    assert (
+        "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in capsys.readouterr().out
+    )
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
     assert "holds a set already" in capsys.readouterr().err
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--force", "x", "--out", out + "2"]) == 2
@@ -171,7 +201,16 @@ def test_the_command(tmp_path, capsys):
 
 def test_real_flat_press_in_place(shared, tmp_path):
     folder = shared / "data" / "epfl_flat_press"
-    assert import_recordings([folder / "SynImpF1.txt"], tmp_path / "set", force=folder / "ForceData.txt", rate=100.0, block=10.0) == 23
+    assert (
+        import_recordings(
+            [folder / "SynImpF1.txt"],
+            tmp_path / "set",
+            force=folder / "ForceData.txt",
+            rate=100.0,
+            block=10.0,
+        )
+        == 23
+    )
     with TactileSet(tmp_path / "set") as data:
         assert data.nstep == 22508
         force = data["measured_wrench"][:][:, :3]

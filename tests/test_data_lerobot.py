@@ -1,4 +1,5 @@
-"""Export to LeRobot's layout, read back with pyarrow as its reader does; lerobot itself where it is installed."""
+"""Export to LeRobot's layout, read back with pyarrow as its reader does; lerobot itself where it is
+installed."""
 
 import json
 
@@ -21,9 +22,18 @@ def folder(tmp_path_factory):
         ones = []
         for k in numbers:
             n = 6 + k
-            label = {"measured_counts": rng.uniform(0, 4095, (n, 23)), "measured_wrench": rng.normal(size=(n, 6))} if shard else {}
-            columns = dict(wrench=rng.normal(size=(n, 6)), counts=rng.integers(0, 4096, (n, 23)), indenter_pos=rng.normal(size=(n, 3)),
-                           indenter_quat=rng.normal(size=(n, 4)), **label)  # fmt: skip
+            label = (
+                {"measured_counts": rng.uniform(0, 4095, (n, 23)), "measured_wrench": rng.normal(size=(n, 6))}
+                if shard
+                else {}
+            )
+            columns = dict(
+                wrench=rng.normal(size=(n, 6)),
+                counts=rng.integers(0, 4096, (n, 23)),
+                indenter_pos=rng.normal(size=(n, 3)),
+                indenter_quat=rng.normal(size=(n, 4)),
+                **label,
+            )
             what, kind = ["ring_7mm", "sphere_7mm"][k % 2], ["press", "tap"][k // 3]
             ones.append(Interaction(f"{k:03d}", what, kind, "train", k, {}, 0.05 * np.arange(n), **columns))
         write_shard(shard_path(out, shard), ones)
@@ -40,12 +50,20 @@ def exported(folder, tmp_path_factory):
 
 def test_the_documented_files_are_there(exported):
     files = sorted(p.relative_to(exported).as_posix() for p in exported.rglob("*") if p.is_file())
-    assert files == ["data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet", "meta/info.json", "meta/stats.json",
-                     "meta/tasks.parquet", "source.json"]  # fmt: skip
+    assert files == [
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        "source.json",
+    ]
     info = json.loads((exported / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] == 20 and info["chunks_size"] == 1000
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 40, 4)
-    assert info["data_path"].format(chunk_index=0, file_index=0) == files[0] and info["splits"] == {"train": "0:5"}
+    assert info["data_path"].format(chunk_index=0, file_index=0) == files[0] and info["splits"] == {
+        "train": "0:5"
+    }
     assert info["features"]["observation.tactile.electrodes"]["names"] == [f"e{i}" for i in range(1, 20)]
     for name in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
         assert info["features"][name]["shape"] == [1]
@@ -59,7 +77,9 @@ def test_frames_are_the_steps(exported, folder):
         kind = str(table.schema.field(name).type)
         width = feature["shape"][0]
         assert kind == (
-            {"float32": "float", "int64": "int64"}[feature["dtype"]] if width == 1 else f"fixed_size_list<element: float>[{width}]"
+            {"float32": "float", "int64": "int64"}[feature["dtype"]]
+            if width == 1
+            else f"fixed_size_list<element: float>[{width}]"
         )
     rows = table.to_pydict()
     with TactileSet(folder) as data:
@@ -86,8 +106,16 @@ def test_episodes_and_tasks_point_where_they_should(exported, folder):
         for k, row in enumerate(episodes):
             assert (row["episode_index"], row["length"]) == (k, data.stop[k] - data.start[k])
             assert (row["dataset_from_index"], row["dataset_to_index"]) == (data.start[k], data.stop[k])
-            assert (row["data/chunk_index"], row["data/file_index"], row["meta/episodes/file_index"]) == (0, 0, 0)
-            assert row["tasks"] == [f"{data.kind[k]} with {data.object[k]}"] == [names[frames["task_index"][data.start[k]]]]
+            assert (row["data/chunk_index"], row["data/file_index"], row["meta/episodes/file_index"]) == (
+                0,
+                0,
+                0,
+            )
+            assert (
+                row["tasks"]
+                == [f"{data.kind[k]} with {data.object[k]}"]
+                == [names[frames["task_index"][data.start[k]]]]
+            )
             force = data["wrench"][data.start[k] : data.stop[k]]
             np.testing.assert_allclose(row["stats/observation.force/max"], force.max(0), rtol=1e-6)
 
@@ -107,7 +135,9 @@ def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
     assert json.loads((tmp_path / "m/source.json").read_text())["interaction"] == ["003", "004"]
     rows = parquet.read_table(tmp_path / "m/data/chunk-000/file-000.parquet").to_pydict()
     with TactileSet(folder) as data:
-        np.testing.assert_array_equal(rows["observation.tactile.electrodes"], data["measured_counts"][data.steps([3, 4])][:, :19])
+        np.testing.assert_array_equal(
+            rows["observation.tactile.electrodes"], data["measured_counts"][data.steps([3, 4])][:, :19]
+        )
     assert cli.main(["export-data", str(folder), "--quiet", "--out", str(tmp_path / "m")]) == 2
     assert "is there already" in capsys.readouterr().err
 
@@ -117,8 +147,16 @@ def test_what_cannot_be_exported_is_named(tmp_path):
     write_shard(shard_path(tmp_path / "s", 0), [one])
     with TactileSet(tmp_path / "s") as data, pytest.raises(ValueError, match="no column 'counts'"):
         export_lerobot(data, tmp_path / "o", progress=False)
-    full = dict(wrench=np.zeros((3, 6)), counts=np.zeros((3, 23)), indenter_pos=np.zeros((3, 3)), indenter_quat=np.zeros((3, 4)))
-    write_shard(shard_path(tmp_path / "u", 0), [Interaction("a", "x", "press", "test", 0, {}, np.array([0, 0.1, 0.3]), **full)])
+    full = dict(
+        wrench=np.zeros((3, 6)),
+        counts=np.zeros((3, 23)),
+        indenter_pos=np.zeros((3, 3)),
+        indenter_quat=np.zeros((3, 4)),
+    )
+    write_shard(
+        shard_path(tmp_path / "u", 0),
+        [Interaction("a", "x", "press", "test", 0, {}, np.array([0, 0.1, 0.3]), **full)],
+    )
     with TactileSet(tmp_path / "u") as data:
         with pytest.raises(ValueError, match="time steps of the set are not even"):
             export_lerobot(data, tmp_path / "o", progress=False)
@@ -128,8 +166,14 @@ def test_what_cannot_be_exported_is_named(tmp_path):
 
 
 def test_lerobot_reads_it(exported, monkeypatch):
-    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot, which pins an older torch")
+    lerobot = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="needs lerobot, which pins an older torch"
+    )
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     data = lerobot.LeRobotDataset("local/biotac", root=exported)
-    assert len(data) == 40 and data.num_episodes == 5 and tuple(data[7]["observation.tactile.electrodes"].shape) == (19,)
+    assert (
+        len(data) == 40
+        and data.num_episodes == 5
+        and tuple(data[7]["observation.tactile.electrodes"].shape) == (19,)
+    )
     assert data[7]["task"] == "press with sphere_7mm"

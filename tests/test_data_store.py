@@ -7,7 +7,16 @@ import h5py
 import numpy as np
 import pytest
 
-from biotac_mj.data import COLUMNS, Interaction, TactileSet, nodes_of, shard_path, split_by_interaction, split_by_object, write_shard
+from biotac_mj.data import (
+    COLUMNS,
+    Interaction,
+    TactileSet,
+    nodes_of,
+    shard_path,
+    split_by_interaction,
+    split_by_object,
+    write_shard,
+)
 from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.data.splits import assign
 from biotac_mj.geometry import load_skin
@@ -85,15 +94,26 @@ def test_columns_index_like_numpy(folder):
     with TactileSet(out) as data:
         column = data["wrench"]
         assert column.shape == whole.shape and column.dtype == whole.dtype
-        indices = [3, -1, slice(None), slice(5, 40, 3), slice(40, 5, -2), rng.permutation(len(whole)), rng.integers(0, len(whole), 30),
-                   rng.random(len(whole)) < 0.3, np.zeros(0, int)]  # fmt: skip
+        indices = [
+            3,
+            -1,
+            slice(None),
+            slice(5, 40, 3),
+            slice(40, 5, -2),
+            rng.permutation(len(whole)),
+            rng.integers(0, len(whole), 30),
+            rng.random(len(whole)) < 0.3,
+            np.zeros(0, int),
+        ]
         for index in indices:
             np.testing.assert_array_equal(column[index], whole[index])
         with pytest.raises(IndexError):
             column[len(whole)]
         big = np.concatenate([one.displacement for one in kept])
         picked = rng.integers(0, len(big), 12)
-        np.testing.assert_allclose(data["displacement"][picked], big[picked], atol=0.501 * DISPLACEMENT_SCALE, rtol=0)
+        np.testing.assert_allclose(
+            data["displacement"][picked], big[picked], atol=0.501 * DISPLACEMENT_SCALE, rtol=0
+        )
 
 
 def test_labels_are_nan_where_nothing_was_measured(folder):
@@ -103,9 +123,13 @@ def test_labels_are_nan_where_nothing_was_measured(folder):
         measured = data["measured_counts"][:]
         has = np.isin(data.owner(), np.flatnonzero(data.labelled))
         assert np.isnan(measured[~has]).all()
-        np.testing.assert_allclose(measured[has], np.concatenate([one.measured_counts for one in kept[6:]]), rtol=1e-6)
+        np.testing.assert_allclose(
+            measured[has], np.concatenate([one.measured_counts for one in kept[6:]]), rtol=1e-6
+        )
         assert data.steps([1, 8]).tolist() == [*range(3, 7), *range(data.start[8], data.stop[8])]
-        assert data.steps(data.object == "ring_7mm").tolist() == [s for i in (1, 4, 7) for s in range(data.start[i], data.stop[i])]
+        assert data.steps(data.object == "ring_7mm").tolist() == [
+            s for i in (1, 4, 7) for s in range(data.start[i], data.stop[i])
+        ]
 
 
 def test_same_arguments_give_the_same_bytes(skin, tmp_path):
@@ -118,7 +142,9 @@ def test_same_arguments_give_the_same_bytes(skin, tmp_path):
 
 
 def test_recordings_need_no_skin(tmp_path):
-    one = Interaction("r", "plate", "recorded", "test", 0, {}, np.arange(3.0), measured_counts=np.full((3, 23), 7.0))
+    one = Interaction(
+        "r", "plate", "recorded", "test", 0, {}, np.arange(3.0), measured_counts=np.full((3, 23), 7.0)
+    )
     write_shard(shard_path(tmp_path, 0), [one])
     with TactileSet(tmp_path) as data:
         assert data.columns == ("time", "measured_counts") and data.geometry is None
@@ -193,11 +219,17 @@ def test_splits_divide_interactions_and_objects(folder):
         for part in (split.train, split.validation, split.test):
             assert data.labelled[part].any() and not data.labelled[part].all()
         again = split_by_interaction(data, seed=1, fractions=(0.5, 0.25, 0.25))
-        assert json.dumps([p.tolist() for p in dataclasses.astuple(again)]) == json.dumps([p.tolist() for p in dataclasses.astuple(split)])
+        assert json.dumps([p.tolist() for p in dataclasses.astuple(again)]) == json.dumps(
+            [p.tolist() for p in dataclasses.astuple(split)]
+        )
         unseen = split_by_object(data, "ring_7mm")
-        assert (data.object[unseen.test] == "ring_7mm").all() and (data.object == "ring_7mm").sum() == len(unseen.test)
+        assert (data.object[unseen.test] == "ring_7mm").all() and (data.object == "ring_7mm").sum() == len(
+            unseen.test
+        )
         assert "ring_7mm" not in data.object[np.concatenate([unseen.train, unseen.validation])]
-        with pytest.raises(ValueError, match="no object 'cube_14mm': it has peg_round_6mm, ring_7mm, sphere_7mm"):
+        with pytest.raises(
+            ValueError, match="no object 'cube_14mm': it has peg_round_6mm, ring_7mm, sphere_7mm"
+        ):
             split_by_object(data, "cube_14mm")
         with pytest.raises(ValueError, match="validation part of the split is empty"):
             split_by_interaction(data, fractions=(0.9, 0.0, 0.1))

@@ -1,4 +1,5 @@
-"""The synthetic measured sensor: conduction in three dimensions, drift, relaxation, noise, and that the simulator leaves it alone."""
+"""The synthetic measured sensor: conduction in three dimensions, drift, relaxation, noise, and that the
+simulator leaves it alone."""
 
 import pathlib
 
@@ -10,7 +11,12 @@ import biotac_mj
 from biotac_mj.data.liquid_conduction import LiquidConduction, column_tetrahedra
 from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, relax
 from biotac_mj.geometry import load_skin
-from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance, electrode_noise, impedance_from_counts
+from biotac_mj.sensor.channels import (
+    REST_COUNTS,
+    counts_from_impedance,
+    electrode_noise,
+    impedance_from_counts,
+)
 from biotac_mj.sensor.film import EXCITATION, FilmConduction
 
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -42,7 +48,9 @@ def test_columns_fill_prisms_conformingly():
     n = 5
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     cell = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    triangle = np.concatenate([np.stack([cell, cell + n, cell + 1], 1), np.stack([cell + n, cell + n + 1, cell + 1], 1)])
+    triangle = np.concatenate(
+        [np.stack([cell, cell + n, cell + 1], 1), np.stack([cell + n, cell + n + 1, cell + 1], 1)]
+    )
     triangle = np.array([np.roll(row, k) for row, k in zip(triangle, rng.integers(0, 3, len(triangle)))])
     new = rng.permutation(n * n)  # numbers in no order
     point = np.empty((n * n, 3))
@@ -55,7 +63,9 @@ def test_columns_fill_prisms_conformingly():
     face = np.sort(elem[:, TET_FACES].reshape(-1, 3), axis=1)
     face, count = np.unique(face, axis=0, return_counts=True)
     corner = node[face[count == 1]]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
+    area = (
+        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
+    )
     assert count.max() == 2 and abs(area - (2 * 16 + 4 * 4 * 3)) < 1e-9
 
 
@@ -76,14 +86,18 @@ def test_linear_potentials_are_exact(liquid, skin):
     corner = nodes[liquid.elem]
     volume = np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1]).sum() / 6)
     assert abs((nodes @ slope) @ current - slope @ slope * volume) < 1e-9 * slope @ slope * volume
-    face, count = np.unique(np.sort(liquid.elem[:, TET_FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
+    face, count = np.unique(
+        np.sort(liquid.elem[:, TET_FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True
+    )
     inside = np.setdiff1d(np.arange(len(nodes)), face[count == 1])
     assert len(inside) > 2000
     assert np.abs(current[inside]).max() < 1e-9 * np.abs(current).max()
 
 
 def test_it_agrees_with_the_film_about_as_well_as_another_model_may(liquid, skin):
-    film = FilmConduction(skin, sensor=None, conductivity=liquid.conductivity, residual_film=liquid.residual_film)
+    film = FilmConduction(
+        skin, sensor=None, conductivity=liquid.conductivity, residual_film=liquid.residual_film
+    )
     ratio = liquid.impedance(skin.vert) / film.impedance(skin.vert)
     assert 0.7 < ratio.min() and ratio.max() < 1.2 and ratio.std() > 0.01  # other electrodes, other equations
     for depth in (0.5e-3, 1.2e-3):
@@ -92,8 +106,12 @@ def test_it_agrees_with_the_film_about_as_well_as_another_model_may(liquid, skin
         other = np.log(film.impedance(x) / film.impedance(skin.vert))
         far = np.arange(19) != 16
         assert change.argmax() == 16 and np.corrcoef(change[far], other[far])[0, 1] > 0.99
-        assert 0.9 < (change[far] / other[far]).max() < 1.4  # beside the dent: the current's way is narrowed alike
-        assert 1.2 < change[16] / other[16] < 3.0  # under it the film is as thick as the electrode is wide: there the models part
+        assert (
+            0.9 < (change[far] / other[far]).max() < 1.4
+        )  # beside the dent: the current's way is narrowed alike
+        assert (
+            1.2 < change[16] / other[16] < 3.0
+        )  # under it the film is as thick as the electrode is wide: there the models part
 
 
 def test_finer_columns_change_little(skin, monkeypatch, liquid):
@@ -119,7 +137,14 @@ def test_relaxation_is_that_of_its_equation():
     time = np.linspace(0, 3, 61)
     signal = np.interp(time, [0, 0.5, 1.5, 1.6, 3], [0, 1, 1, 0, 0])
     share, tau = np.array([0.3, 0.1]), np.array([0.5, 4.0])
-    answer = solve_ivp(lambda t, low: (np.interp(t, time, signal) - low) / tau, (0, 3), [0.0, 0.0], t_eval=time, max_step=1e-3, rtol=1e-8)
+    answer = solve_ivp(
+        lambda t, low: (np.interp(t, time, signal) - low) / tau,
+        (0, 3),
+        [0.0, 0.0],
+        t_eval=time,
+        max_step=1e-3,
+        rtol=1e-8,
+    )
     expected = signal + (share[:, None] * (signal - answer.y)).sum(0)
     np.testing.assert_allclose(relax(time, signal, share, tau), expected, atol=1e-5)
     both = relax(time, np.stack([signal, 2 * signal], 1), share, tau)
@@ -131,7 +156,12 @@ def test_drift_is_one_gain_for_all_electrodes(meter, skin):
     time = 0.05 * np.arange(8)
     still = np.repeat(skin.vert[None], 8, 0)
     start = np.array([0.0, 60.0, 300.0, 2000.0])
-    log_z = np.array([np.log(impedance_from_counts(meter.measure(still, time, np.zeros(8), s, seed=1)[0, :19])) for s in start])
+    log_z = np.array(
+        [
+            np.log(impedance_from_counts(meter.measure(still, time, np.zeros(8), s, seed=1)[0, :19]))
+            for s in start
+        ]
+    )
     change = log_z - log_z[0]
     each = change - change.mean(1, keepdims=True)
     assert np.abs(each).max() < 0.004  # noise of a mean of 50 frames
@@ -156,7 +186,11 @@ def test_sensors_differ_as_published_ones_do():
     published = np.log([impedance_from_counts(c) for c in REST_COUNTS.values()])
     assert np.abs(patterns.mean(0) - published.mean(0)).max() < 0.2
     assert 0.5 < patterns.mean(1).std() / published.mean(1).std(ddof=1) < 1.5
-    assert SensorVariation.draw(3).youngs_modulus == SensorVariation.draw(3).youngs_modulus != SensorVariation.draw(4).youngs_modulus
+    assert (
+        SensorVariation.draw(3).youngs_modulus
+        == SensorVariation.draw(3).youngs_modulus
+        != SensorVariation.draw(4).youngs_modulus
+    )
     counts = counts_from_impedance(np.exp(patterns))
     assert counts.min() > 1000 and counts.max() < 4000
 
@@ -168,14 +202,19 @@ def test_rest_reads_the_rest_counts(meter, skin):
 
 def test_simulator_does_not_use_it():
     package = pathlib.Path(biotac_mj.__file__).parent
-    users = [p.relative_to(package).as_posix() for p in package.rglob("*.py") if "synthetic_sensor" in p.read_text() or
-             "liquid_conduction" in p.read_text()]  # fmt: skip
+    users = [
+        p.relative_to(package).as_posix()
+        for p in package.rglob("*.py")
+        if "synthetic_sensor" in p.read_text() or "liquid_conduction" in p.read_text()
+    ]
     assert {u.split("/")[0] for u in users} <= {"data"}
 
 
 def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"needs scikit-fem: pip install 'biotac-mj\[data\]', or take --labelled 0"):
+    with pytest.raises(
+        ValueError, match=r"needs scikit-fem: pip install 'biotac-mj\[data\]', or take --labelled 0"
+    ):
         SyntheticSensor(0, "coarse")
 
 

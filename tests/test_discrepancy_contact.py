@@ -1,4 +1,5 @@
-"""Adhesion and load-dependent friction of the catalogue inside the contact: what the skin becomes, and what comes out."""
+"""Adhesion and load-dependent friction of the catalogue inside the contact: what the skin becomes, and what
+comes out."""
 
 import numpy as np
 import pytest
@@ -12,28 +13,38 @@ from biotac_mj.skin import ContactLaw, SkinOptions
 
 
 def walk(depth, along=None, rows=8):
-    """A Trajectory of the 7 mm sphere over the pad through depths and places along x [m], `rows` rows between each two."""
+    """A Trajectory of the 7 mm sphere over the pad through depths and places along x [m], `rows` rows between
+    each two."""
     vert = load_skin("coarse").vert
     surface = vert[(abs(vert[:, 0] + 12e-3) < 2e-3) & (abs(vert[:, 2]) < 2e-3), 1].min()
     knots = np.arange(len(depth))
     t = np.linspace(0, knots[-1], rows * knots[-1] + 1)
     x = np.interp(t, knots, along) if along is not None else 0 * t
     pos = np.column_stack([-11e-3 + x, surface + np.interp(t, knots, depth), 0 * t])
-    return Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+    return Trajectory(
+        "a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0)
+    )
 
 
 def test_effects_become_the_contact_s_law():
-    effects = [(by_id("adhesion"), {"W": 0.05}), (by_id("friction"), {"log_mu": 0.1}), (by_id("fric_load"), {"exponent": 0.14})]
+    effects = [
+        (by_id("adhesion"), {"W": 0.05}),
+        (by_id("friction"), {"log_mu": 0.1}),
+        (by_id("fric_load"), {"exponent": 0.14}),
+    ]
     inside = memory_of(effects)
     assert [e.id for e, _ in inside.rest] == ["friction"]
     law = SkinOptions(**inside.contact).contact_law
-    assert law == ContactLaw(friction_exponent=0.14 / 0.7, friction_pressure=1.65e5, adhesion=0.05, adhesion_hysteresis=3.0)
+    assert law == ContactLaw(
+        friction_exponent=0.14 / 0.7, friction_pressure=1.65e5, adhesion=0.05, adhesion_hysteresis=3.0
+    )
     none = memory_of([(by_id("adhesion"), {"W": 0.0}), (by_id("fric_load"), {"exponent": 0.0})])
     assert none.contact == {} and not none.rest
 
 
 def test_it_sticks_to_what_is_drawn_off(tmp_path):
-    """The skin follows the object, by millinewtons (JKR: 1.5 pi W R = 2.5 mN for the work of parting); without adhesion it does not."""
+    """The skin follows the object, by millinewtons (JKR: 1.5 pi W R = 2.5 mN for the work of parting);
+    without adhesion it does not."""
     press = walk([-0.1e-3, 0.1e-3, -0.1e-3], rows=16)
     sim = InSkinSimulator(effects=[(by_id("adhesion"), {"W": 0.05})])
     sim.save(tmp_path / "s.yaml")

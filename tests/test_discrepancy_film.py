@@ -30,15 +30,21 @@ def thinner(film, share):
 
 
 def test_a_rough_film_conducts_as_a_power_of_its_thickness(film):
-    """A film 0.8 times as thick with power 2 is one 0.64 times as thick, but for where its middle lies; at rest nothing changes."""
+    """A film 0.8 times as thick with power 2 is one 0.64 times as thick, but for where its middle lies; at
+    rest nothing changes."""
     rough, rest = RoughFilm(film, 2.0), film.geometry.vert
     np.testing.assert_allclose(rough.impedance(rest), film.impedance(rest), rtol=1e-12)
-    np.testing.assert_array_equal(RoughFilm(film, 1.0).film(thinner(film, 0.8))[1].round(12), film.film(thinner(film, 0.8))[1].round(12))
-    np.testing.assert_allclose(rough.impedance(thinner(film, 0.8)), film.impedance(thinner(film, 0.64)), rtol=0.03)
+    np.testing.assert_array_equal(
+        RoughFilm(film, 1.0).film(thinner(film, 0.8))[1].round(12), film.film(thinner(film, 0.8))[1].round(12)
+    )
+    np.testing.assert_allclose(
+        rough.impedance(thinner(film, 0.8)), film.impedance(thinner(film, 0.64)), rtol=0.03
+    )
 
 
 def test_a_drained_skin_holds_what_is_left():
-    """Its liquid's volume, counted by the divergence theorem, and suction; the share of the session's clock."""
+    """Its liquid's volume, counted by the divergence theorem, and suction; the share of the session's
+    clock."""
     model = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True))
     data = SkinData(model)
     drain(model, data, 0.95)
@@ -55,7 +61,9 @@ def test_effects_become_the_film():
         (by_id("asper"), {"log_p": -0.1}),
     ]
     inside = memory_of(effects)
-    assert inside.film == {"loss": 0.1, "power": pytest.approx(np.exp(0.1))} and [e.id for e, _ in inside.rest] == ["gain"]
+    assert inside.film == {"loss": 0.1, "power": pytest.approx(np.exp(0.1))} and [
+        e.id for e, _ in inside.rest
+    ] == ["gain"]
     assert memory_of([(by_id("fluidloss"), {"rate": 0.0}), (by_id("asper"), {"log_p": 0.0})]).film == {}
 
 

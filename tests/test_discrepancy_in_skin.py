@@ -1,4 +1,5 @@
-"""Constitutive effects inside the finite elements: what goes into the material, and agreement with the reduced form where that is exact."""
+"""Constitutive effects inside the finite elements: what goes into the material, and agreement with the
+reduced form where that is exact."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -15,9 +16,15 @@ from biotac_mj.skin import Material
 
 
 def test_effects_become_what_the_material_remembers():
-    effects = [(by_id("relax"), {"g": 0.2, "tau": 3.0}), (by_id("gain"), {}), (by_id("mullins"), {"softening": 0.25, "width": 0.7})]
+    effects = [
+        (by_id("relax"), {"g": 0.2, "tau": 3.0}),
+        (by_id("gain"), {}),
+        (by_id("mullins"), {"softening": 0.25, "width": 0.7}),
+    ]
     inside = memory_of(effects)
-    assert inside.material == {"prony": ((0.2, 3.0),), "mullins": (4.0, 1.0, 0.7)} and [e.id for e, _ in inside.rest] == ["gain"]
+    assert inside.material == {"prony": ((0.2, 3.0),), "mullins": (4.0, 1.0, 0.7)} and [
+        e.id for e, _ in inside.rest
+    ] == ["gain"]
     assert inside.contact == inside.model == {}
     # a power law of slope -n between the shortest and the longest of its times
     g, tau = np.array(memory_of([(by_id("creep"), {"n": 0.05})]).material["prony"]).T
@@ -28,7 +35,8 @@ def test_effects_become_what_the_material_remembers():
 
 
 def test_effects_become_what_the_rubber_is():
-    """The maps of stiffen and hyster are those measured; what has no size changes nothing; several of a kind add up."""
+    """The maps of stiffen and hyster are those measured; what has no size changes nothing; several of a kind
+    add up."""
     effects = [(by_id("stiffen"), {"c2": 0.1197}), (by_id("hyster"), {"fraction": 0.1, "width": 0.2e-3})]
     inside = memory_of([*effects, (by_id("inhomog"), {"along": 0.2, "across": -0.1})])
     assert inside.material["stiffening"] == pytest.approx(12) and inside.rest == []
@@ -37,11 +45,24 @@ def test_effects_become_what_the_rubber_is():
     factors = inside.model["modulus"](at)
     run = SimpleNamespace()
     for place, factor in zip(at, factors):
-        run.place, run.scale_load = place, lambda reduced, factor=factor: np.testing.assert_allclose(factor, reduced)
+        run.place, run.scale_load = (
+            place,
+            lambda reduced, factor=factor: np.testing.assert_allclose(factor, reduced),
+        )
         by_id("inhomog").apply(run, {"along": 0.2, "across": -0.1})
-    nothing = memory_of([(by_id("stiffen"), {"c2": 0.0}), (by_id("hyster"), {"fraction": 0.0, "width": 0.2e-3})])
+    nothing = memory_of(
+        [(by_id("stiffen"), {"c2": 0.0}), (by_id("hyster"), {"fraction": 0.0, "width": 0.2e-3})]
+    )
     assert Material(**nothing.material) == Material()
-    twice = memory_of([effects[0], effects[0], effects[1], effects[1], *[(by_id("inhomog"), {"along": 0.2, "across": -0.1})] * 2])
+    twice = memory_of(
+        [
+            effects[0],
+            effects[0],
+            effects[1],
+            effects[1],
+            *[(by_id("inhomog"), {"along": 0.2, "across": -0.1})] * 2,
+        ]
+    )
     assert twice.material["stiffening"] == pytest.approx(np.interp(0.2394, [0.1197, 0.2990], [12, 40]))
     assert len(twice.material["hysteresis"]) == 2
     np.testing.assert_allclose(twice.model["modulus"](at), factors**2)
@@ -53,7 +74,9 @@ def test_it_is_run_as_any_simulator(monkeypatch):
     monkeypatch.setattr(Simulator, "run", lambda self, *args, **kw: seen.append((args, kw)) or ["run"])
     gain, relax = (by_id("gain"), {}), (by_id("relax"), {"g": 0.2, "tau": 1.0})
     for effects in ([gain], [relax, gain]):
-        assert InSkinSimulator().run(["press"], None, True, effects, 1.1, ["slip"], nuisance="known") == ["run"]
+        assert InSkinSimulator().run(["press"], None, True, effects, 1.1, ["slip"], nuisance="known") == [
+            "run"
+        ]
     assert seen == [((["press"], None, True, [gain], 1.1, ["slip"]), {"nuisance": "known"})] * 2
 
 
@@ -63,7 +86,9 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
     assert type(again) is InSkinSimulator and again.effects[0][1] == {"g": 0.3, "tau": 2.0}
     Simulator().save(tmp_path / "r.yaml")
     assert type(load_simulator(tmp_path / "r.yaml")) is Simulator
-    (tmp_path / "x.yaml").write_text((tmp_path / "r.yaml").read_text().replace("constitutive: reduced", "constitutive: elsewhere"))
+    (tmp_path / "x.yaml").write_text(
+        (tmp_path / "r.yaml").read_text().replace("constitutive: reduced", "constitutive: elsewhere")
+    )
     with pytest.raises(ValueError, match="constitutive 'elsewhere' is none of reduced, in_skin"):
         load_simulator(tmp_path / "x.yaml")
 
@@ -91,7 +116,8 @@ def test_the_condensed_tier_is_refused():
 
 @pytest.mark.slow
 def test_stiffening_hysteresis_and_place_as_the_reduced_forms_say():
-    """Force of a press and a retreat: same sign and about the size of the reduced form, which docs/memory.md has the misses of."""
+    """Force of a press and a retreat: same sign and about the size of the reduced form, which docs/memory.md
+    has the misses of."""
     depth = np.array([-0.1, 0.2, 0.4, 0.55, 0.7, 0.85, 1.0, 0.85, 0.7, 0.55, 0.4]) * 1e-3
     t = np.arange(len(depth)) * 0.5
     from biotac_mj.geometry import load_skin
@@ -99,7 +125,9 @@ def test_stiffening_hysteresis_and_place_as_the_reduced_forms_say():
     vert = load_skin("coarse").vert
     surface = vert[(abs(vert[:, 0] + 14e-3) < 2e-3) & (abs(vert[:, 2]) < 2e-3), 1].min()
     pos = np.column_stack([np.full(len(t), -14e-3), surface + depth, np.zeros(len(t))])
-    press = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+    press = Trajectory(
+        "a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0)
+    )
     sim = InSkinSimulator()
     plain = sim.run([press], effects=[])[0].normal_force
     assert plain[-1] > 0.05
@@ -125,7 +153,9 @@ def test_held_skin_relaxes_as_the_reduced_form_and_keeps_a_dent_after_release():
     vert = load_skin("coarse").vert
     surface = vert[(abs(vert[:, 0] + 12e-3) < 2e-3) & (abs(vert[:, 2]) < 2e-3), 1].min()
     pos = np.column_stack([np.full(len(t), -12e-3), surface + depth, np.zeros(len(t))])
-    press = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0))
+    press = Trajectory(
+        "a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (len(t), 1, 1)), np.full((len(t), 19), 2500.0)
+    )
     sim = InSkinSimulator()
     effects = [(by_id("relax"), {"g": 0.4, "tau": 0.8})]
     plain, inside = sim.run([press], effects=[])[0], sim.run([press], effects=effects)[0]
@@ -136,5 +166,7 @@ def test_held_skin_relaxes_as_the_reduced_form_and_keeps_a_dent_after_release():
     np.testing.assert_allclose(inside.normal_force[held], reduced.normal_force[held], rtol=0.02)
     assert inside.normal_force[4] > 1.1 * plain.normal_force[4]
     np.testing.assert_allclose(inside.counts[held], plain.counts[held], atol=2)
-    assert plain.normal_force[-2] == 0 and abs(inside.counts[-2] - plain.counts[-2]).max() > 5  # the dent heals after the object has gone
+    assert (
+        plain.normal_force[-2] == 0 and abs(inside.counts[-2] - plain.counts[-2]).max() > 5
+    )  # the dent heals after the object has gone
     assert abs(inside.counts[-1] - plain.counts[-1]).max() < abs(inside.counts[-2] - plain.counts[-2]).max()

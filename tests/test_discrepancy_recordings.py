@@ -15,7 +15,9 @@ from biotac_mj.discrepancy.recorded_report import summary, verdict_dict, write_r
 from biotac_mj.discrepancy.shapes import fit_shapes
 
 REAL = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
-real = pytest.mark.skipif(not REAL.exists(), reason="../shared/data/epfl_flat_press (real recordings, evaluation only) is not here")
+real = pytest.mark.skipif(
+    not REAL.exists(), reason="../shared/data/epfl_flat_press (real recordings, evaluation only) is not here"
+)
 RATE = 100.0
 
 
@@ -29,7 +31,8 @@ def noisy(counts, rng, size=4.0):
 
 
 def pressed(seed=0, seconds=80):
-    """Counts and force of a synthetic hand: three force components and a place, all changing in holds and ramps."""
+    """Counts and force of a synthetic hand: three force components and a place, all changing in holds and
+    ramps."""
     rng = np.random.default_rng(seed)
     n = int(seconds * RATE)
     kernel = np.hanning(31) / np.hanning(31).sum()
@@ -52,12 +55,14 @@ def ids(diagnosis):
     return [f.id for f in diagnosis.findings]
 
 
-# --- statistics ----------------------------------------------------------------------------------------------------------------------
+# --- statistics  ---
 
 
 def test_sign_flip_is_the_exact_permutation_test():
     gain = np.array([0.5, -0.1, 0.9, 0.4, 0.2])
-    count = sum(np.mean(np.array(s) * gain) >= gain.mean() - 1e-12 for s in itertools.product([-1, 1], repeat=5))
+    count = sum(
+        np.mean(np.array(s) * gain) >= gain.mean() - 1e-12 for s in itertools.product([-1, 1], repeat=5)
+    )
     assert sign_flip(gain) == count / 32
     assert sign_flip(np.ones(30)) < 0.001
 
@@ -100,7 +105,7 @@ def test_colour_of_noise_is_told_from_differences():
     assert abs(pole_of(measured) - 0.6) < 0.03
 
 
-# --- reading -------------------------------------------------------------------------------------------------------------------------
+# --- reading  ---
 
 
 @pytest.mark.parametrize(
@@ -108,7 +113,10 @@ def test_colour_of_noise_is_told_from_differences():
     [
         ("1 2 3\n", "3 columns, 19 are needed"),
         ("", "is empty: 19 columns of numbers"),
-        (" ".join(["x1"] + ["5"] * 18) + "\n" + " ".join(["5"] * 18 + ["oops"]) + "\n", "line 1: e1 is 'x1', not a finite number"),
+        (
+            " ".join(["x1"] + ["5"] * 18) + "\n" + " ".join(["5"] * 18 + ["oops"]) + "\n",
+            "line 1: e1 is 'x1', not a finite number",
+        ),
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like volts"),
         ((" ".join(["-40"] * 19) + "\n") * 500, "give the raw values, not tared"),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
@@ -142,7 +150,7 @@ def test_rate_is_guessed_from_repeated_rows():
     assert Recording(x).rate == 100 and "assumed" in Recording(x).rate_source
 
 
-# --- effects -------------------------------------------------------------------------------------------------------------------------
+# --- effects  ---
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -178,7 +186,9 @@ def test_one_channel_drifts_jumps_sticks_or_is_swapped():
     swap = noisy(e, rng)
     swap[2000:, [2, 11]] = swap[2000:, [11, 2]]
     d = diagnose_recording(Recording(swap))
-    assert ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 11} and abs(d.findings[0].start - 20) < 0.5
+    assert (
+        ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 11} and abs(d.findings[0].start - 20) < 0.5
+    )
 
 
 def test_electronics_show_in_the_noise():
@@ -193,7 +203,9 @@ def test_electronics_show_in_the_noise():
     d = diagnose_recording(Recording(np.rint(y)))
     assert ids(d) == ["lowpass"] and abs(d.findings[0].theta["tau"] - 0.03) < 0.006
     near = np.abs(np.subtract.outer(np.arange(19), np.arange(19))) == 1
-    d = diagnose_recording(Recording(np.rint(e + 6 * rng.standard_normal(e.shape) @ (np.eye(19) + 0.15 * near))))
+    d = diagnose_recording(
+        Recording(np.rint(e + 6 * rng.standard_normal(e.shape) @ (np.eye(19) + 0.15 * near)))
+    )
     assert ids(d) == ["crosstalk"] and abs(d.findings[0].theta["kappa"] - 0.15) < 0.04
     d = diagnose_recording(Recording(8 * np.rint(noisy(e, rng) / 8)))
     assert ids(d) == ["quantise"] and d.findings[0].theta["step"] == 8
@@ -209,7 +221,8 @@ def test_latency_against_the_force_is_measured():
 
 
 def test_memory_between_force_and_electrodes_is_named_and_measured():
-    """Relaxation by its differential equation, a loop by friction elements in parallel with a spring: neither is a low-pass nor a delay."""
+    """Relaxation by its differential equation, a loop by friction elements in parallel with a spring: neither
+    is a low-pass nor a delay."""
     e, force, rng = pressed(10)
     slow, relaxed = force[0].copy(), np.empty_like(force)
     for i, f in enumerate(force):
@@ -220,7 +233,9 @@ def test_memory_between_force_and_electrodes_is_named_and_measured():
     assert found.id == "relax" and found.verified and not found.ties
     assert abs(found.theta["fraction"] - 0.3) < 0.06 and abs(found.theta["tau"] - 1.2) < 0.3
     spring, kernel = np.zeros(3), np.hanning(23)[1:-1]
-    clean = np.stack([np.convolve(np.pad(x, 10, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1)
+    clean = np.stack(
+        [np.convolve(np.pad(x, 10, mode="edge"), kernel / kernel.sum(), "valid") for x in force.T], axis=1
+    )
     width, loop = 0.3 * force.std(0), np.zeros_like(force)
     for i in range(1, len(force)):
         spring = np.maximum(np.minimum(spring + clean[i] - clean[i - 1], width), -width)
@@ -232,7 +247,8 @@ def test_memory_between_force_and_electrodes_is_named_and_measured():
 
 
 def test_a_tie_says_what_would_tell_it_apart():
-    """A memory shorter than the movements: the relaxation is tied with hysteresis, and the summary gives the experiment."""
+    """A memory shorter than the movements: the relaxation is tied with hysteresis, and the summary gives the
+    experiment."""
     e, force, rng = pressed(13)
     slow, relaxed = force[0].copy(), np.empty_like(force)
     for i, f in enumerate(force):
@@ -256,7 +272,9 @@ def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
     A = np.concatenate([np.ones((len(x), 1)), x], axis=1)
     ridge = np.sqrt(np.r_[0, 1e-4 * (x**2).sum(0)])
     w = np.linalg.lstsq(
-        np.concatenate([A[train], np.diag(ridge)]), np.concatenate([view.target[train], np.zeros((A.shape[1], 3))]), rcond=None
+        np.concatenate([A[train], np.diag(ridge)]),
+        np.concatenate([view.target[train], np.zeros((A.shape[1], 3))]),
+        rcond=None,
     )[0]
     expected = np.log(((view.target[a:b] - A[a:b] @ w) ** 2).mean(0))
     np.testing.assert_allclose(view.errors([(relax, theta)])[4], expected, rtol=1e-4)
@@ -273,7 +291,8 @@ def test_gain_of_one_electrode_under_load():
 
 
 def test_a_channel_that_comes_back_is_an_event_and_no_fault():
-    """Two seconds away from the others name nothing, but are noted; the same step for good is a jump of the channel."""
+    """Two seconds away from the others name nothing, but are noted; the same step for good is a jump of the
+    channel."""
     e, _, rng = pressed(12)
     counts = noisy(e, rng)
     movement = np.convolve(np.abs(np.diff(np.log(4095 / e - 1), axis=0)).sum(1), np.ones(160), "same")
@@ -282,7 +301,9 @@ def test_a_channel_that_comes_back_is_an_event_and_no_fault():
         moved = counts.copy()
         moved[first:last, 8] = np.clip(moved[first:last, 8] - 350, 0, 4095)
         d = diagnose_recording(Recording(moved))
-        assert ids(d) == named and any("e9 leaves the others" in n and "comes back" in n for n in d.notes) == (not named), d.verdict
+        assert ids(d) == named and any(
+            "e9 leaves the others" in n and "comes back" in n for n in d.notes
+        ) == (not named), d.verdict
 
 
 def test_what_has_no_name_is_called_unknown():
@@ -310,7 +331,10 @@ def test_the_verb_writes_a_verdict(tmp_path, capsys):
 
     e, rng = unloaded(9)
     np.savetxt(tmp_path / "e.txt", noisy(e, rng), fmt="%d")
-    assert main(["diagnose", "--electrodes", str(tmp_path / "e.txt"), "--out", str(tmp_path / "r"), "--quiet"]) == 0
+    assert (
+        main(["diagnose", "--electrodes", str(tmp_path / "e.txt"), "--out", str(tmp_path / "r"), "--quiet"])
+        == 0
+    )
     assert "verdict: no significant disagreement" in capsys.readouterr().out
     assert (tmp_path / "r" / "report.html").exists()
     assert main(["diagnose"]) == 2
@@ -334,7 +358,7 @@ def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
         assert view["after"] < view["before"]
 
 
-# --- which amendments a view takes ---------------------------------------------------------------------------------------------------
+# --- which amendments a view takes  ---
 
 
 def test_what_is_seen_of_a_force_is_undone():
@@ -348,7 +372,10 @@ def test_what_is_seen_of_a_force_is_undone():
         (Latency(), {"delay": 0.073, "start": 20.0, "end": 50.0}),
         (LoadLowPass(), {"tau": 0.04}),
         (Relaxation(), {"fraction": 0.3, "tau": 1.5}),
-        (Hysteresis(), {"fraction": 0.2, "width": np.full(3, 0.1)}),  # its loop follows the force that is asked for: the least exact
+        (
+            Hysteresis(),
+            {"fraction": 0.2, "width": np.full(3, 0.1)},
+        ),  # its loop follows the force that is asked for: the least exact
     ):
         seen = effect.see(force, RATE, theta)
         left = (effect.unsee(seen, RATE, theta) - force)[100:-100].std()
@@ -372,11 +399,16 @@ def test_the_part_kept_aside_does_not_choose():
     again = choose(other, d.session.findings, views)
     assert chosen == again and any(c.time != "none" for v in views for c in chosen[v][0])
     for name, view in d.gap.items():
-        assert view["after"] < view["before"] or name == "force from electrodes" and view["after"] == view["before"]
+        assert (
+            view["after"] < view["before"]
+            or name == "force from electrodes"
+            and view["after"] == view["before"]
+        )
 
 
 def test_a_channel_that_is_stuck_in_a_trial_alone_is_left_out_of_it():
-    """Masked for most of the first rows, usable on the whole: trials have one electrode less than the report."""
+    """Masked for most of the first rows, usable on the whole: trials have one electrode less than the
+    report."""
     e, force, rng = pressed(9)
     z = (4095 / e - 1) * np.exp(-0.4 * np.arange(len(e)) / len(e))[:, None]
     counts = noisy(4095 / (z + 1), rng)
@@ -388,17 +420,22 @@ def test_a_channel_that_is_stuck_in_a_trial_alone_is_left_out_of_it():
 
 
 def test_a_trend_that_turns_round_is_not_carried_on():
-    """A gain that comes and goes: carried on it would be wrong, and earlier turns inside the part fitted say so."""
+    """A gain that comes and goes: carried on it would be wrong, and earlier turns inside the part fitted say
+    so."""
     from biotac_mj.discrepancy.recorded_views import Choice, _best
 
     asked = [Choice("carried on"), Choice("held"), Choice("none")]
     trials = np.array([[0.0, 0, 0], [0.3, 0.2, 0], [-0.2, -0.2, 0], [0.1, -0.05, 0]])
     assert asked[_best(asked, trials, trials[1:].mean(0), wary=True)].time == "held"
     assert asked[_best(asked, trials[:3], trials[:3].mean(0), wary=True)].time == "none"
-    assert asked[_best(asked, trials[:1] - [0.5, 0.6, 0], np.array([-0.5, -0.6, 0]), wary=True)].time == "none"
+    assert (
+        asked[_best(asked, trials[:1] - [0.5, 0.6, 0], np.array([-0.5, -0.6, 0]), wary=True)].time == "none"
+    )
     assert asked[_best(asked, 0 * trials, np.zeros(3), wary=False)].time == "carried on"
 
 
 def test_the_benchmarks_generator_shares_no_code_with_what_it_judges():
-    source = (pathlib.Path(__file__).parents[1] / "benchmarks/discrepancy_recordings_generator.py").read_text()
+    source = (
+        pathlib.Path(__file__).parents[1] / "benchmarks/discrepancy_recordings_generator.py"
+    ).read_text()
     assert "biotac_mj" not in source and "import numpy" in source

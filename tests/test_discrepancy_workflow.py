@@ -1,4 +1,5 @@
-"""The full workflow: effects against closed forms, statistics, YAML, and diagnoses on a sensor of springs that costs nothing."""
+"""The full workflow: effects against closed forms, statistics, YAML, and diagnoses on a sensor of springs
+that costs nothing."""
 
 import ast
 import pathlib
@@ -17,13 +18,16 @@ WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)
 
 
 class Springs(Simulator):
-    """A sensor whose skin is F = 600 d + 2e5 d^2 [N] and whose electrodes follow depth and place: the workflow without finite elements."""
+    """A sensor whose skin is F = 600 d + 2e5 d^2 [N] and whose electrodes follow depth and place: the
+    workflow without finite elements."""
 
     def solve(self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None):
         out = []
         for i, t in enumerate(trajectories):
             pos = t.pos + (0 if offset is None else offset[i])
-            d = np.maximum((pos - t.pos[0]) @ t.heading - 20e-6, 0) * np.exp(0.5 * (0 if log_radius is None else log_radius[i]))
+            d = np.maximum((pos - t.pos[0]) @ t.heading - 20e-6, 0) * np.exp(
+                0.5 * (0 if log_radius is None else log_radius[i])
+            )
             side = pos[:, 0] - t.pos[0, 0]
             force = -np.outer(600 * d + 2e5 * d**2, t.heading)
             place = np.cos(np.arange(19) + 300 * t.pos[0, 0])
@@ -43,42 +47,91 @@ def plans(n=14, seed=0, unload=True):
     rng = np.random.default_rng(seed)
     out, clock = [], 0.0
     for i in range(n):
-        depth, speed, hold = rng.uniform(0.4e-3, 1.6e-3), np.exp(rng.uniform(np.log(0.5e-3), np.log(15e-3))), np.exp(rng.uniform(-1.5, 1.7))
-        d = np.concatenate([[0, 0, 0], np.linspace(0, depth, 8)[1:], np.full(6, depth), np.linspace(depth, -1e-5, 7)[1:] if unload else []])
+        depth, speed, hold = (
+            rng.uniform(0.4e-3, 1.6e-3),
+            np.exp(rng.uniform(np.log(0.5e-3), np.log(15e-3))),
+            np.exp(rng.uniform(-1.5, 1.7)),
+        )
+        d = np.concatenate(
+            [
+                [0, 0, 0],
+                np.linspace(0, depth, 8)[1:],
+                np.full(6, depth),
+                np.linspace(depth, -1e-5, 7)[1:] if unload else [],
+            ]
+        )
         t = np.concatenate([[0, 0.1, 0.2], 0.2 + depth / speed * np.arange(1, 8) / 7])
         t = np.concatenate([t, t[-1] + hold * np.arange(1, 7) / 6])
         t = np.concatenate([t, t[-1] + depth / speed * np.arange(1, 7) / 6]) if unload else t
         pos = np.array([rng.uniform(-0.012, -0.006), -0.008, 0]) + np.outer(d, [0.0, 1.0, 0.0])
         n_rows = len(t)
-        out.append(Trajectory(f"t{i}", "sphere_7mm", clock, t, pos, np.tile(np.eye(3), (n_rows, 1, 1)), np.full((n_rows, 19), 2500.0),
-                              np.full(n_rows, 2000.0), None, np.zeros((n_rows, 3))))  # fmt: skip
+        out.append(
+            Trajectory(
+                f"t{i}",
+                "sphere_7mm",
+                clock,
+                t,
+                pos,
+                np.tile(np.eye(3), (n_rows, 1, 1)),
+                np.full((n_rows, 19), 2500.0),
+                np.full(n_rows, 2000.0),
+                None,
+                np.zeros((n_rows, 3)),
+            )
+        )
         clock += t[-1] + 4
     return out
 
 
 def measured(effects, seed=1, **kw):
-    """What the springs with effects would read, with noise, slips of the pose and another modulus (synthetic)."""
+    """What the springs with effects would read, with noise, slips of the pose and another modulus
+    (synthetic)."""
     rng = np.random.default_rng(seed)
     data = plans(**kw)
     slips = [rng.normal(0, 15e-6, 3) for _ in data]
     runs = Springs().run(data, None, True, effects, 1.07, slips)
     return [
-        Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),  # noqa: E501
-                   np.rint(r.pdc + rng.standard_normal(len(t.time))), None, r.force + 0.005 * rng.standard_normal(r.force.shape))
+        Trajectory(
+            t.id,
+            t.tool,
+            t.clock,
+            t.time,
+            t.pos,
+            t.mat,
+            np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),  # noqa: E501
+            np.rint(r.pdc + rng.standard_normal(len(t.time))),
+            None,
+            r.force + 0.005 * rng.standard_normal(r.force.shape),
+        )
         for t, r in zip(data, runs)
-    ]  # fmt: skip
+    ]
 
 
 def run_of(n=40):
     t = np.linspace(0, 4, n)
     d = 1e-3 * np.clip(t, 0, 1) * np.clip(4 - t, 0, 1)
     z = np.tile(np.linspace(8.5, 9.0, 19), (n, 1)) + np.outer(d / 1e-3, WEIGHT)
-    return Run(time=t, clock=10 + t, tool="sphere_7mm", heading=np.array([0, 1.0, 0]), depth=d, place=np.array([-0.01, -0.008, 0.001]), order=0,  # noqa: E501
-               offset=np.zeros((n, 3)), force=-np.outer(800 * d, [0, 1.0, 0.2]), pressure=3e6 * d, log_z=z, temperature=np.linspace(0, 1, n), session={},  # noqa: E501
-               rest_log_z=z[0], counts=4095 / (np.exp(z) / 1e4 + 1), pdc=2000 + 3e6 * d / 36.5)  # fmt: skip
+    return Run(
+        time=t,
+        clock=10 + t,
+        tool="sphere_7mm",
+        heading=np.array([0, 1.0, 0]),
+        depth=d,
+        place=np.array([-0.01, -0.008, 0.001]),
+        order=0,  # noqa: E501
+        offset=np.zeros((n, 3)),
+        force=-np.outer(800 * d, [0, 1.0, 0.2]),
+        pressure=3e6 * d,
+        log_z=z,
+        temperature=np.linspace(0, 1, n),
+        session={},  # noqa: E501
+        rest_log_z=z[0],
+        counts=4095 / (np.exp(z) / 1e4 + 1),
+        pdc=2000 + 3e6 * d / 36.5,
+    )
 
 
-# --- effects -------------------------------------------------------------------------------------------------------------------------
+# --- effects  ---
 
 
 def test_every_effect_says_what_it_is():
@@ -98,16 +151,26 @@ def test_an_effect_of_size_zero_changes_nothing_and_of_its_own_size_something(ef
         theta = effect.default()
         theta.update({n: effect.params[n].start + size * effect.params[n].scale for n in effect.free})
         effect.apply(run, theta)
-        unchanged = all(np.allclose(getattr(run, n), getattr(before, n), rtol=1e-12, atol=1e-15) for n in names)
+        unchanged = all(
+            np.allclose(getattr(run, n), getattr(before, n), rtol=1e-12, atol=1e-15) for n in names
+        )
         assert unchanged == same
 
 
 def test_memory_is_the_solution_of_its_equation():
     run = run_of()
     x = 3 * run.depth / 1e-3
-    exact = solve_ivp(lambda t, q: np.interp(t, run.time[:-1] + np.diff(run.time) / 2, np.diff(x) / np.diff(run.time)) * 0
-                      + (np.diff(x) / np.diff(run.time))[min(np.searchsorted(run.time, t, "right") - 1, len(x) - 2)] - q / 0.4,
-                      (0, 4), [0.0], t_eval=run.time, max_step=0.002)  # fmt: skip
+    exact = solve_ivp(
+        lambda t, q: (
+            np.interp(t, run.time[:-1] + np.diff(run.time) / 2, np.diff(x) / np.diff(run.time)) * 0
+            + (np.diff(x) / np.diff(run.time))[min(np.searchsorted(run.time, t, "right") - 1, len(x) - 2)]
+            - q / 0.4
+        ),
+        (0, 4),
+        [0.0],
+        t_eval=run.time,
+        max_step=0.002,
+    )
     np.testing.assert_allclose(memory(run, x, 0.4), exact.y[0], atol=2e-3)
 
 
@@ -120,17 +183,26 @@ def test_relaxation_of_a_step_is_the_prony_series():
     np.testing.assert_allclose(run.force[1:, 1], -2 * (1 + 0.3 * np.exp(-run.time[1:] / 0.7)), rtol=1e-6)
 
 
-# --- files ---------------------------------------------------------------------------------------------------------------------------
+# --- files  ---
 
 
 def test_a_simulator_is_the_same_after_saving(tmp_path):
     effect = by_id("mount")
-    sim = Simulator(skin="coarse", effects=[(effect, {"compliance": 5e-5})], modulus=1.1, intervals={"mount": {"compliance": (4e-5, 6e-5)}})
+    sim = Simulator(
+        skin="coarse",
+        effects=[(effect, {"compliance": 5e-5})],
+        modulus=1.1,
+        intervals={"mount": {"compliance": (4e-5, 6e-5)}},
+    )
     sim.save(tmp_path / "s.yaml")
     text = (tmp_path / "s.yaml").read_text()
     assert "m/N" in text and "boundary" in text and "biotac_mj.sensor/1" in text
     again = load_simulator(tmp_path / "s.yaml")
-    assert again.modulus == 1.1 and again.effects[0][0].id == "mount" and again.effects[0][1] == {"compliance": 5e-5}
+    assert (
+        again.modulus == 1.1
+        and again.effects[0][0].id == "mount"
+        and again.effects[0][1] == {"compliance": 5e-5}
+    )
     assert again.intervals == sim.intervals
 
 
@@ -140,7 +212,9 @@ def test_bad_sensor_files_are_refused(tmp_path):
     (tmp_path / "a.yaml").write_text("schema: other/9\n")
     with pytest.raises(ValueError, match="schema 'other/9'"):
         load_simulator(tmp_path / "a.yaml")
-    (tmp_path / "b.yaml").write_text("schema: biotac_mj.sensor/1\nstages:\n  set-up:\n  - effect: wobble\n    parameters: {}\n")
+    (tmp_path / "b.yaml").write_text(
+        "schema: biotac_mj.sensor/1\nstages:\n  set-up:\n  - effect: wobble\n    parameters: {}\n"
+    )
     with pytest.raises(ValueError, match="unknown effect 'wobble'"):
         load_simulator(tmp_path / "b.yaml")
 
@@ -163,7 +237,7 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
         Trajectory(**values)
 
 
-# --- diagnosis -----------------------------------------------------------------------------------------------------------------------
+# --- diagnosis  ---
 
 
 def test_nothing_is_named_where_nothing_is():
@@ -177,17 +251,28 @@ def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
     data = [
-        Trajectory(t.id, t.tool, t.clock, t.time, t.pos, t.mat, np.rint(r.counts + 3 * rng.standard_normal(r.counts.shape)),
-                   np.rint(r.pdc), None, r.force + 0.005 * rng.standard_normal(r.force.shape))
+        Trajectory(
+            t.id,
+            t.tool,
+            t.clock,
+            t.time,
+            t.pos,
+            t.mat,
+            np.rint(r.counts + 3 * rng.standard_normal(r.counts.shape)),
+            np.rint(r.pdc),
+            None,
+            r.force + 0.005 * rng.standard_normal(r.force.shape),
+        )
         for t, r in zip(data, runs)
-    ]  # fmt: skip
+    ]
     report = diagnose(Springs(), data, progress=False)
     assert not report.effects and abs(report.fit.nuisance.footprint - 0.06) < 0.015
     assert any("footprint is +" in note for note in report.notes)
 
 
 @pytest.mark.parametrize(
-    "name, size", [("latency", {"delay": 0.06}), ("relax", {"g": 0.25, "tau": 0.5}), ("mount", {"compliance": 1.2e-4})]
+    "name, size",
+    [("latency", {"delay": 0.06}), ("relax", {"g": 0.25, "tau": 0.5}), ("mount", {"compliance": 1.2e-4})],
 )
 def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path):
     effect = by_id(name)
@@ -197,7 +282,9 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     parameter = report.effects[0]["parameters"][0]
     assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
     assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
-    assert report.ranking[0][0] == name and any(c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where)
+    assert report.ranking[0][0] == name and any(
+        c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where
+    )
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
     from biotac_mj.discrepancy.workflow_verb import summary, write_report
@@ -234,7 +321,10 @@ def test_what_the_data_cannot_tell_is_said():
     assert "no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known" in text
     assert "8 trajectories: p-values cannot fall below" in text and "no slides" in text and "no TDC" in text
     data = [Trajectory(**{**t.__dict__, "force": None}) for t in measured([], n=8)]
-    assert "no force: the rubber's modulus shows in the liquid's pressure alone" in diagnose(Springs(), data, progress=False).notes
+    assert (
+        "no force: the rubber's modulus shows in the liquid's pressure alone"
+        in diagnose(Springs(), data, progress=False).notes
+    )
 
 
 def test_phases_are_told_apart():
@@ -252,7 +342,9 @@ def test_where_knows_a_trend_over_the_session_from_a_place_and_a_load():
 
     def cells(effects):
         data = measured(effects)
-        comparison = Comparison(Springs(), data, Springs().fields(data, progress=False), measurement_noise(data))
+        comparison = Comparison(
+            Springs(), data, Springs().fields(data, progress=False), measurement_noise(data)
+        )
         chosen = np.arange(len(data))
         return where(comparison, fit_effects(comparison, [], chosen), chosen)
 
@@ -260,10 +352,12 @@ def test_where_knows_a_trend_over_the_session_from_a_place_and_a_load():
     warm = cells([(by_id("warmup"), {"a": -0.3, "tau": 60.0})])
     assert sum(c["condition"] == "clock" and c["channel"].startswith("e") for c in warm) >= 10
     soft = cells([(by_id("relax"), {"g": 0.4, "tau": 0.3})])
-    assert soft[0]["channel"] in ("force", "pdc") and not any(c["channel"] == "e1" and c["condition"] == "clock" for c in soft)
+    assert soft[0]["channel"] in ("force", "pdc") and not any(
+        c["channel"] == "e1" and c["condition"] == "clock" for c in soft
+    )
 
 
-# --- independence of the benchmark ---------------------------------------------------------------------------------------------------
+# --- independence of the benchmark  ---
 
 
 def imports(path):
@@ -286,7 +380,9 @@ def test_trajectories_are_read_from_a_data_set(tmp_path):
     from biotac_mj.discrepancy import read_trajectories, write_trajectories
 
     data = measured([], n=2)
-    data[1] = Trajectory(**{**data[1].__dict__, "tdc": np.linspace(1800, 1812, len(data[1].time)), "force": None})
+    data[1] = Trajectory(
+        **{**data[1].__dict__, "tdc": np.linspace(1800, 1812, len(data[1].time)), "force": None}
+    )
     write_trajectories(tmp_path / "measured.h5", data)
     again = read_trajectories(tmp_path / "measured.h5")
     for a, b in zip(again, data):
@@ -316,12 +412,16 @@ def test_trajectories_solved_together_are_those_solved_alone():
     for a, b in zip(together, alone):
         for key in ("force", "pressure", "log_z"):
             np.testing.assert_allclose(a[key], b[key], rtol=1e-9, atol=1e-9)
-    assert together[0]["force"].shape == (len(data[0].time), 3) and np.linalg.norm(together[0]["force"], axis=1).max() > 0.1
+    assert (
+        together[0]["force"].shape == (len(data[0].time), 3)
+        and np.linalg.norm(together[0]["force"], axis=1).max() > 0.1
+    )
 
 
 @pytest.mark.slow
 def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
-    """From measured.h5 (synthetic: this project's skin, a hidden low-pass, another modulus) to the amended sensor."""
+    """From measured.h5 (synthetic: this project's skin, a hidden low-pass, another modulus) to the amended
+    sensor."""
     import json
     import sys
 

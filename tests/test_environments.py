@@ -1,4 +1,5 @@
-"""The tasks in Gymnasium: its own checker is content, episodes repeat with their seed, several run side by side."""
+"""The tasks in Gymnasium: its own checker is content, episodes repeat with their seed, several run side by
+side."""
 
 import warnings
 
@@ -69,7 +70,10 @@ def test_episode_ends_with_its_time_and_repeats_with_its_seed():
 def test_several_side_by_side():
     envs = gymnasium.make_vec("BioTac/Press-v0", num_envs=2, vectorization_mode="sync", time_limit=0.05)
     observation, _ = envs.reset(seed=1)
-    assert observation["finger/biotac/electrodes"].shape == (2, 19) and observation["target"][0] != observation["target"][1]
+    assert (
+        observation["finger/biotac/electrodes"].shape == (2, 19)
+        and observation["target"][0] != observation["target"][1]
+    )
     for _ in range(6):
         observation, reward, terminated, truncated, _ = envs.step(np.zeros((2, 3), np.float32))
     assert reward.shape == (2,)
@@ -89,7 +93,8 @@ def test_bad_input():
 
 
 def test_training_example_learns_from_touch_interface(repo, tmp_path):
-    """The example's wrapper gives finite, scaled features, with touch and without; a training of a few steps runs to its end."""
+    """The example's wrapper gives finite, scaled features, with touch and without; a training of a few steps
+    runs to its end."""
     pytest.importorskip("stable_baselines3", reason="needs stable-baselines3 (extra examples)")
     from test_examples import load
 

@@ -17,7 +17,12 @@ def test_quickstart_ball_rests_on_the_pad(repo):
     # a ball at rest: the skin carries its weight, 0.1 kg x 9.81 m/s^2; the pad is -y of the BioTac
     assert np.allclose(data.sensor("biotac_contact_force").data[1], 0.981, rtol=0.01)
     electrodes = data.sensor("biotac_electrodes").data
-    assert electrodes.shape == (19,) and (electrodes == electrodes.round()).all() and (electrodes > 0).all() and (electrodes < 4096).all()
+    assert (
+        electrodes.shape == (19,)
+        and (electrodes == electrodes.round()).all()
+        and (electrodes > 0).all()
+        and (electrodes < 4096).all()
+    )
 
 
 def test_press_example(repo):
@@ -33,7 +38,11 @@ def test_press_example(repo):
 def test_readme_shows_the_quickstart(repo):
     readme = (repo / "README.md").read_text()
     code = readme.split("```python\n")[1].split("```")[0]
-    lines = [line.strip().split("  #")[0] for line in code.splitlines() if line.strip() and not line.startswith("import")]
+    lines = [
+        line.strip().split("  #")[0]
+        for line in code.splitlines()
+        if line.strip() and not line.startswith("import")
+    ]
     source = (repo / "examples" / "quickstart.py").read_text()
     shown = [line for line in lines if line in source]
     assert len(shown) >= 6, f"the README's example drifted from examples/quickstart.py: only {shown} is in it"

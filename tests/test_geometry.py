@@ -1,4 +1,5 @@
-"""Shipped skins, the parametric BioTac, tetrahedral meshes and indenters, against closed forms, trimesh and the paper's mesh."""
+"""Shipped skins, the parametric BioTac, tetrahedral meshes and indenters, against closed forms, trimesh and
+the paper's mesh."""
 
 import pathlib
 
@@ -6,7 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from biotac_mj.geometry import INDENTERS, SKINS, BioTacDimensions, SkinGeometry, TetMesh, asset_path, import_mesh, indenter, load_skin
+from biotac_mj.geometry import (
+    INDENTERS,
+    SKINS,
+    BioTacDimensions,
+    SkinGeometry,
+    TetMesh,
+    asset_path,
+    import_mesh,
+    indenter,
+    load_skin,
+)
 from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.importing import read_obj
 from biotac_mj.geometry.parametric import LIN_ELECTRODES, biotac_bodies, clamp_plate, nail_plate
@@ -14,10 +25,13 @@ from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
 needs_paper = pytest.mark.skipif(
-    not PAPER.is_dir(), reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project"
+    not PAPER.is_dir(),
+    reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project",
 )
 
-REGULAR = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])  # edge 2 sqrt 2, positive in this order
+REGULAR = np.array(
+    [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]
+)  # edge 2 sqrt 2, positive in this order
 
 
 @pytest.fixture(scope="module", params=SKINS)
@@ -26,10 +40,14 @@ def skin(request):
 
 
 def test_regular_tetrahedron():
-    mesh = TetMesh(REGULAR, [[0, 1, 3, 2]] if np.linalg.det(REGULAR[1:] - REGULAR[0]) < 0 else [[0, 1, 2, 3]]).check()
+    mesh = TetMesh(
+        REGULAR, [[0, 1, 3, 2]] if np.linalg.det(REGULAR[1:] - REGULAR[0]) < 0 else [[0, 1, 2, 3]]
+    ).check()
     np.testing.assert_allclose(mesh.volumes, 8 / 3)  # edge^3 / (6 sqrt 2)
     np.testing.assert_allclose(mesh.dihedral_angles, np.arccos(1 / 3))
-    np.testing.assert_allclose(enclosed_volume(mesh.vert, mesh.boundary), 8 / 3)  # so the faces point outwards
+    np.testing.assert_allclose(
+        enclosed_volume(mesh.vert, mesh.boundary), 8 / 3
+    )  # so the faces point outwards
 
 
 def cube_mesh(n=2):
@@ -38,7 +56,14 @@ def cube_mesh(n=2):
     index = {tuple(p): i for i, p in enumerate(grid)}
     elem = []
     for cell in np.ndindex(n, n, n):
-        for order, even in (((0, 1, 2), 1), ((1, 2, 0), 1), ((2, 0, 1), 1), ((0, 2, 1), 0), ((2, 1, 0), 0), ((1, 0, 2), 0)):
+        for order, even in (
+            ((0, 1, 2), 1),
+            ((1, 2, 0), 1),
+            ((2, 0, 1), 1),
+            ((0, 2, 1), 0),
+            ((2, 1, 0), 0),
+            ((1, 0, 2), 0),
+        ):
             path = [np.array(cell)]
             for axis in order:
                 path.append(path[-1] + np.eye(3, dtype=int)[axis])
@@ -51,25 +76,39 @@ def test_cube_boundary():
     mesh = cube_mesh().check()
     (part,) = mesh.boundary_components()
     np.testing.assert_allclose([mesh.volumes.sum(), enclosed_volume(mesh.vert, part)], 1.0)
-    normal = np.cross(mesh.vert[part[:, 1]] - mesh.vert[part[:, 0]], mesh.vert[part[:, 2]] - mesh.vert[part[:, 0]])
+    normal = np.cross(
+        mesh.vert[part[:, 1]] - mesh.vert[part[:, 0]], mesh.vert[part[:, 2]] - mesh.vert[part[:, 0]]
+    )
     assert np.linalg.norm(normal, axis=1).sum() / 2 == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda v, e: (np.where(np.arange(len(v))[:, None] == 5, np.nan, v), e), r"1 vertices are NaN or infinite, the first is vertex 5"),
+        (
+            lambda v, e: (np.where(np.arange(len(v))[:, None] == 5, np.nan, v), e),
+            r"1 vertices are NaN or infinite, the first is vertex 5",
+        ),
         (lambda v, e: (v, e + 1), r"name vertices outside 0\.\.26.*subtract 1"),
         (
             lambda v, e: (v, np.vstack([e[:3, [1, 0, 2, 3]], e[3:]])),
             r"3 tetrahedra are inverted \(negative volume\), the first is tetrahedron 0",
         ),
         (lambda v, e: (v, e[:, [1, 0, 2, 3]]), r"48 tetrahedra are inverted.*every tetrahedron"),
-        (lambda v, e: (np.where(np.arange(len(v))[:, None] == e[7, 0], v[e[7, 1]], v), e), r"degenerate \(no volume\).*mesh again"),
-        (lambda v, e: (np.vstack([v, [[2.0, 2.0, 2.0]]]), e), r"1 vertices belong to no tetrahedron, the first is vertex 27"),
+        (
+            lambda v, e: (np.where(np.arange(len(v))[:, None] == e[7, 0], v[e[7, 1]], v), e),
+            r"degenerate \(no volume\).*mesh again",
+        ),
+        (
+            lambda v, e: (np.vstack([v, [[2.0, 2.0, 2.0]]]), e),
+            r"1 vertices belong to no tetrahedron, the first is vertex 27",
+        ),
         (lambda v, e: (v, np.vstack([e, e[:1]])), r"3 faces belong to more than two tetrahedra"),
         (
-            lambda v, e: (np.vstack([v, v[0] + [[-1.0, 0, 0], [-1.0, -1, 0]]]), np.vstack([e, [[0, 1, 27, 28]]])),
+            lambda v, e: (
+                np.vstack([v, v[0] + [[-1.0, 0, 0], [-1.0, -1, 0]]]),
+                np.vstack([e, [[0, 1, 27, 28]]]),
+            ),
             r"edges have more than two faces",
         ),
     ],
@@ -100,7 +139,9 @@ def test_open_surface():
 
 def test_shipped_skin_is_sound(skin):
     mesh = TetMesh(skin.vert, skin.tets).check()
-    assert np.degrees(mesh.dihedral_angles.min()) > 10.0  # of the eight parts of curved ones; the paper's mesh: 11.6
+    assert (
+        np.degrees(mesh.dihedral_angles.min()) > 10.0
+    )  # of the eight parts of curved ones; the paper's mesh: 11.6
     assert np.degrees(TetMesh(skin.vert, skin.elem[:, :4]).dihedral_angles.min()) > 20.0
     parts = (skin.outer_face, skin.inner_face)
     for face in parts:
@@ -125,7 +166,11 @@ def test_boundary_lies_on_the_parametric_surfaces(skin):
 
 
 def test_rigid_bodies(skin):
-    for vert, face in ((skin.core_vert, skin.core_face), (skin.nail_vert, skin.nail_face), (skin.clamp_vert, skin.clamp_face)):
+    for vert, face in (
+        (skin.core_vert, skin.core_face),
+        (skin.nail_vert, skin.nail_face),
+        (skin.clamp_vert, skin.clamp_face),
+    ):
         check_closed(face)
         assert trimesh.Trimesh(vert * 1e3, face, process=False).volume > 0
     for name in ("core", "nail", "clamp"):
@@ -140,17 +185,24 @@ def test_plates_have_their_closed_form_volume():
     straight = d.nail_x[1] - d.nail_x[0] - d.nail_half_width
     # the round ends are polygons: 24 chords of a half circle, 48 of a circle
     half_disc = 24 * 0.5 * d.nail_half_width**2 * np.sin(np.pi / 24)
-    assert enclosed_volume(vert, face) == pytest.approx((2 * d.nail_half_width * straight + half_disc) * d.nail_thickness)
+    assert enclosed_volume(vert, face) == pytest.approx(
+        (2 * d.nail_half_width * straight + half_disc) * d.nail_thickness
+    )
     vert, face = clamp_plate()
-    assert enclosed_volume(vert, face) == pytest.approx(48 * 0.5 * d.clamp_radius**2 * np.sin(2 * np.pi / 48) * d.clamp_thickness)
+    assert enclosed_volume(vert, face) == pytest.approx(
+        48 * 0.5 * d.clamp_radius**2 * np.sin(2 * np.pi / 48) * d.clamp_thickness
+    )
 
 
 def test_held_nodes_are_those_on_rigid_bodies(skin):
-    """Against trimesh's signed distance, which the module does not use; all held nodes and some of the others."""
+    """Against trimesh's signed distance, which the module does not use; all held nodes and some of the
+    others."""
     some = np.union1d(skin.fixed, np.random.default_rng(0).choice(skin.nvert, 400, replace=False))
     near = np.zeros(len(some), dtype=bool)
     for part in ("nail", "clamp", "core"):
-        body = trimesh.Trimesh(getattr(skin, f"{part}_vert") * 1e3, getattr(skin, f"{part}_face"), process=False)
+        body = trimesh.Trimesh(
+            getattr(skin, f"{part}_vert") * 1e3, getattr(skin, f"{part}_face"), process=False
+        )
         close = np.abs(trimesh.proximity.signed_distance(body, skin.vert[some] * 1e3)) < 1e-2
         assert close.sum() >= 8  # the skin hangs on all three
         near |= close
@@ -165,23 +217,31 @@ def test_electrodes(skin):
     assert distance.max() < 0.02
     np.testing.assert_allclose(np.linalg.norm(skin.electrode_normal, axis=1), 1.0, atol=1e-12)
     assert np.min(np.sum(core.face_normals[face] * skin.electrode_normal, axis=1)) > np.cos(np.radians(10))
-    np.testing.assert_allclose(skin.electrode_normal[6:10], [[-0.5, -np.sqrt(0.75), 0.0]] * 4, atol=1e-6)  # E7-E10 on the facet
+    np.testing.assert_allclose(
+        skin.electrode_normal[6:10], [[-0.5, -np.sqrt(0.75), 0.0]] * 4, atol=1e-6
+    )  # E7-E10 on the facet
     # E11..E16 mirror E1..E6
     np.testing.assert_allclose(skin.electrode_pos[10:16], skin.electrode_pos[:6] * [1, 1, -1], atol=1e-9)
-    # Lin's table lies 0.245 mm below the surface of the cylinder; E1, E6 and their mirror images sit at its tapering ends
+    # Lin's table lies 0.245 mm below the surface of the cylinder; E1, E6 and their mirror images sit at its
+    # tapering ends
     x, y, z = LIN_ELECTRODES.T
     depth = np.linalg.norm(skin.electrode_pos * 1e3 - np.stack([-12.3 - x, z, y], axis=1), axis=1)
-    assert np.abs(np.delete(depth, [0, 5, 10, 15]) - 0.245).max() < 0.03 and np.abs(depth - 0.245).max() < 0.12
+    assert (
+        np.abs(np.delete(depth, [0, 5, 10, 15]) - 0.245).max() < 0.03 and np.abs(depth - 0.245).max() < 0.12
+    )
 
 
 def test_core_stays_inside_the_cavity():
-    """Contact with the core does not begin in overlap: exactly for the surfaces, to the sag of chords (edge^2 / 8 radius) for meshes."""
+    """Contact with the core does not begin in overlap: exactly for the surfaces, to the sag of chords (edge^2
+    / 8 radius) for meshes."""
     bodies, skin = biotac_bodies(), load_skin("default")
     assert bodies["cavity"].distance(bodies["core"].project(skin.core_vert * 1e3)).max() < 0.005
     cavity = trimesh.Trimesh(skin.vert * 1e3, skin.inner_face[:, ::-1], process=False)
     overlap = -trimesh.proximity.signed_distance(cavity, skin.core_vert * 1e3)
     assert overlap[skin.core_vert[:, 0] < 4e-3].max() < 0.1
-    assert overlap.max() < 0.25 and (overlap > 0.05).mean() < 0.02  # in the tight corner at the clamp curved tetrahedra would fold
+    assert (
+        overlap.max() < 0.25 and (overlap > 0.05).mean() < 0.02
+    )  # in the tight corner at the clamp curved tetrahedra would fold
 
 
 def test_surfaces_are_mirror_symmetric():
@@ -256,9 +316,12 @@ VOLUMES = {  # closed forms [mm^3]; solids with rounded edges by Pappus and Stei
 
 
 def rounded_cylinder(radius, length, edge=1.0):
-    """A fillet cuts (1 - pi/4) edge^2 off the rim's section; that piece's centroid (square less quarter disc) gives its volume (Pappus)."""
+    """A fillet cuts (1 - pi/4) edge^2 off the rim's section; that piece's centroid (square less quarter disc)
+    gives its volume (Pappus)."""
     area = (1 - np.pi / 4) * edge**2
-    centroid = (0.5 * edge**3 - (np.pi / 4) * edge**2 * (edge - 4 * edge / (3 * np.pi))) / area  # from the corner's side, by first moments
+    centroid = (
+        0.5 * edge**3 - (np.pi / 4) * edge**2 * (edge - 4 * edge / (3 * np.pi))
+    ) / area  # from the corner's side, by first moments
     return np.pi * radius**2 * length - 2 * area * 2 * np.pi * (radius - centroid)
 
 
@@ -295,12 +358,15 @@ def test_ring_is_a_ring():
     assert len(vert) - len(face) / 2 == 0  # Euler number of a torus
     top = vert[vert[:, 1] > -1e-9]
     np.testing.assert_allclose(
-        [np.hypot(top[:, 0], top[:, 2]).min(), np.hypot(top[:, 0], top[:, 2]).max()], [0.0045, 0.006], rtol=1e-6
+        [np.hypot(top[:, 0], top[:, 2]).min(), np.hypot(top[:, 0], top[:, 2]).max()],
+        [0.0045, 0.006],
+        rtol=1e-6,
     )  # flat between 1 mm rims
 
 
 def test_indenters_in_mujoco():
-    """Each shape as a MuJoCo geom occupies the box of its mesh (MuJoCo's sizes are half sizes, its cylinders lie along z)."""
+    """Each shape as a MuJoCo geom occupies the box of its mesh (MuJoCo's sizes are half sizes, its cylinders
+    lie along z)."""
     mujoco = pytest.importorskip("mujoco")
     for name in INDENTERS:
         shape = indenter(name)
@@ -309,7 +375,10 @@ def test_indenters_in_mujoco():
         spec = mujoco.MjSpec()
         size = list(shape.size) + [0.0] * (3 - len(shape.size))
         spec.worldbody.add_geom(
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.geom_type.upper()}"), size=size, pos=shape.pos, quat=shape.quat
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.geom_type.upper()}"),
+            size=size,
+            pos=shape.pos,
+            quat=shape.quat,
         )
         model = spec.compile()
         data = mujoco.MjData(model)
@@ -340,5 +409,7 @@ def test_meshes_in_mujoco():
 
 
 def test_unknown_indenter():
-    with pytest.raises(ValueError, match="unknown indenter 'sphere_9mm': choose one of sphere_3-5mm, .*ring_7mm"):
+    with pytest.raises(
+        ValueError, match="unknown indenter 'sphere_9mm': choose one of sphere_3-5mm, .*ring_7mm"
+    ):
         indenter("sphere_9mm")

@@ -13,13 +13,15 @@ from biotac_mj.geometry.importing import read_obj, read_tet_mesh, write_obj
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
 TABLE = PAPER.parent / "electrodes_nv_frame_mm.csv"
 needs_paper = pytest.mark.skipif(
-    not PAPER.is_dir(), reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project"
+    not PAPER.is_dir(),
+    reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project",
 )
 
 
 def write_tet(path, vert, elem):
     path.write_text(
-        "".join(f"v {x:.17g} {y:.17g} {z:.17g} 1\n" for x, y, z in vert) + "".join("t " + " ".join(map(str, t)) + "\n" for t in elem)
+        "".join(f"v {x:.17g} {y:.17g} {z:.17g} 1\n" for x, y, z in vert)
+        + "".join("t " + " ".join(map(str, t)) + "\n" for t in elem)
     )
     return path
 
@@ -31,11 +33,16 @@ def coarse():
 
 @pytest.fixture
 def folder(tmp_path, coarse):
-    """The coarse skin as somebody else would hand it over: a .tet and one .obj with the three bodies, one of them inside out."""
+    """The coarse skin as somebody else would hand it over: a .tet and one .obj with the three bodies, one of
+    them inside out."""
     write_tet(tmp_path / "skin.tet", coarse.vert, coarse.elem)
     write_obj(tmp_path / "core.obj", coarse.core_vert, coarse.core_face[:, ::-1])
     vert = np.vstack([coarse.nail_vert, coarse.clamp_vert])
-    write_obj(tmp_path / "plates.obj", vert, np.vstack([coarse.nail_face, coarse.clamp_face + len(coarse.nail_vert)]))
+    write_obj(
+        tmp_path / "plates.obj",
+        vert,
+        np.vstack([coarse.nail_face, coarse.clamp_face + len(coarse.nail_vert)]),
+    )
     return tmp_path
 
 
@@ -122,13 +129,18 @@ def test_bad_tetrahedra(folder, coarse):
 @pytest.mark.parametrize(("factor", "size"), [(1e3, "27.9"), (1e-3, "2.79")])
 def test_wrong_units(folder, coarse, factor, size):
     write_tet(folder / "skin.tet", coarse.vert * factor, coarse.elem)
-    with pytest.raises(ValueError, match=rf"largest dimension is {size}.* not between 0.005 and 0.1 m .*scale the file to metres"):
+    with pytest.raises(
+        ValueError,
+        match=rf"largest dimension is {size}.* not between 0.005 and 0.1 m .*scale the file to metres",
+    ):
         import_mesh(folder)
 
 
 def test_missing_rigid_bodies(folder):
     (folder / "core.obj").unlink()
-    with pytest.raises(ValueError, match=r"found 2 rigid bodies .*plates.obj.* need three: core, nail plate and clamp plate"):
+    with pytest.raises(
+        ValueError, match=r"found 2 rigid bodies .*plates.obj.* need three: core, nail plate and clamp plate"
+    ):
         import_mesh(folder)
 
 
@@ -148,7 +160,9 @@ def test_rigid_bodies_elsewhere(folder, coarse):
 def _shifted(path):
     bodies = read_obj(path)
     start = np.cumsum([0] + [len(vert) for vert, _ in bodies])
-    return np.vstack([vert for vert, _ in bodies]) + 0.1, np.vstack([face + s for (_, face), s in zip(bodies, start)])
+    return np.vstack([vert for vert, _ in bodies]) + 0.1, np.vstack(
+        [face + s for (_, face), s in zip(bodies, start)]
+    )
 
 
 def test_a_solid_is_no_skin():
@@ -164,7 +178,8 @@ def test_two_solids_are_no_shell():
 
 
 def test_held_nodes_against_a_plane():
-    """A square of tiny triangles in metres, which trimesh would drop: a node is held when it is within 1e-5 m of the plane."""
+    """A square of tiny triangles in metres, which trimesh would drop: a node is held when it is within 1e-5 m
+    of the plane."""
     n = 41
     x, z = (g.ravel() for g in np.meshgrid(np.linspace(0, 4e-4, n), np.linspace(0, 4e-4, n), indexing="ij"))
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -184,7 +199,9 @@ def test_papers_mesh():
     counts = [len(held_nodes(skin.vert, [body])) for body in _parts(skin)]
     assert counts == [145, 30, 225] and len(skin.fixed) == 400
     np.testing.assert_allclose(
-        np.array([skin.core_vert.min(0), skin.core_vert.max(0)]) * 1e3, [[-19.324, -5.362, -5.332], [5.105, 3.652, 5.335]], atol=2e-3
+        np.array([skin.core_vert.min(0), skin.core_vert.max(0)]) * 1e3,
+        [[-19.324, -5.362, -5.332], [5.105, 3.652, 5.335]],
+        atol=2e-3,
     )
 
 
@@ -199,11 +216,16 @@ def test_papers_fixed_nodes_are_the_references():
 
 @needs_paper
 def test_papers_electrodes():
-    """Against the table projected by ray casting: positions to 0.1 mm (E1 and E11 slide along the tip's edge), normals to 12 degrees."""
+    """Against the table projected by ray casting: positions to 0.1 mm (E1 and E11 slide along the tip's
+    edge), normals to 12 degrees."""
     skin, table = import_mesh(PAPER), np.loadtxt(TABLE, delimiter=",")
     assert np.linalg.norm(skin.electrode_pos * 1e3 - table[:, 4:7], axis=1).max() < 0.1
     assert np.sum(skin.electrode_normal * table[:, 7:10], axis=1).min() > np.cos(np.radians(12))
 
 
 def _parts(skin):
-    return (skin.nail_vert, skin.nail_face), (skin.clamp_vert, skin.clamp_face), (skin.core_vert, skin.core_face)
+    return (
+        (skin.nail_vert, skin.nail_face),
+        (skin.clamp_vert, skin.clamp_face),
+        (skin.core_vert, skin.core_face),
+    )

@@ -1,4 +1,5 @@
-"""BioTacs on hands: frames, freedoms, exclusions; the Menagerie's Shadow Hand where it is, else a small hand of our own."""
+"""BioTacs on hands: frames, freedoms, exclusions; the Menagerie's Shadow Hand where it is, else a small hand
+of our own."""
 
 import os
 import pathlib
@@ -24,7 +25,9 @@ FINGER = """<body name="my_{n}middle" pos="{x} 0 .04" gravcomp="1"><joint name="
 
 
 def small_hand():
-    return mujoco.MjSpec.from_string(HAND.format(fingers="".join(FINGER.format(n=n, x=x) for n, x in (("a", -0.02), ("b", 0.02)))))
+    return mujoco.MjSpec.from_string(
+        HAND.format(fingers="".join(FINGER.format(n=n, x=x) for n, x in (("a", -0.02), ("b", 0.02))))
+    )
 
 
 def mounts():
@@ -32,7 +35,10 @@ def mounts():
 
 
 def shadow_folder():
-    root = os.environ.get("MENAGERIE_ROOT") or pathlib.Path(__file__).resolve().parents[2] / "shared" / "menagerie"
+    root = (
+        os.environ.get("MENAGERIE_ROOT")
+        or pathlib.Path(__file__).resolve().parents[2] / "shared" / "menagerie"
+    )
     folder = pathlib.Path(root) / "shadow_hand"
     if not folder.is_dir():
         pytest.skip("needs the Menagerie's shadow_hand: set MENAGERIE_ROOT")
@@ -81,7 +87,9 @@ def test_a_hand_by_body_names():
     for name, handle in handles.items():
         body = data.body(handle.body)
         mat = body.xmat.reshape(3, 3)
-        np.testing.assert_allclose(body.xpos + mat @ [-21.3e-3, 0, 0], data.body(f"my_{name}distal").xpos + [0, 0, 0.032], atol=1e-6)
+        np.testing.assert_allclose(
+            body.xpos + mat @ [-21.3e-3, 0, 0], data.body(f"my_{name}distal").xpos + [0, 0, 0.032], atol=1e-6
+        )
         np.testing.assert_allclose(mat, [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-12)
         assert_pad_leads(model, data, handle, f"{name}J1")
     assert not any(model.geom(i).name.endswith("tip") for i in range(model.ngeom))
@@ -104,13 +112,16 @@ def test_links_of_the_hand_can_touch_if_asked():
 
 
 def test_a_ball_between_two_fingers_feels_both():
-    """Fingers that bend onto a ball hold it: equal and opposite forces, from mj_step alone, with the FEM skin."""
+    """Fingers that bend onto a ball hold it: equal and opposite forces, from mj_step alone, with the FEM
+    skin."""
     text = """<mujoco><option timestep="0.004" integrator="implicitfast" gravity="0 0 0"/><worldbody>
       <body name="ball"><freejoint/><geom name="ball" size="0.01" mass="0.02"/></body>
       {}</worldbody></mujoco>"""
     finger = """<body name="{n}" pos="0 {y} -.012" euler="0 0 {turn}"><joint name="{n}" type="slide" axis="0 -1 0" damping="20"/>
       <geom type="box" size=".002 .002 .002" pos="0 .01 -.02" mass=".05"/></body>"""
-    spec = mujoco.MjSpec.from_string(text.format(finger.format(n="l", y=0.0185, turn=0) + finger.format(n="r", y=-0.0185, turn=180)))
+    spec = mujoco.MjSpec.from_string(
+        text.format(finger.format(n="l", y=0.0185, turn=0) + finger.format(n="r", y=-0.0185, turn=180))
+    )
     hand = {n: Mount(n, (0, 0, 0.002), replaces=()) for n in "lr"}
     handles = {n: attach_to_hand(spec, {n: hand[n]}, skin="coarse", tier="condensed")[n] for n in "lr"}
     model = spec.compile()
@@ -124,7 +135,8 @@ def test_a_ball_between_two_fingers_feels_both():
 
 
 def test_shadow_hand_both_variants():
-    """24 freedoms with the tip replaced, 19 with Shadow's own BioTac fingers; pads look where fingers bend, left and right."""
+    """24 freedoms with the tip replaced, 19 with Shadow's own BioTac fingers; pads look where fingers bend,
+    left and right."""
     folder = shadow_folder()
     for side in ("right", "left"):
         for variant, nv, nu in (("replace", 24, 20), ("authentic", 19, 19)):
@@ -138,18 +150,26 @@ def test_shadow_hand_both_variants():
                 joint = f"{side[0]}h_{finger.upper()}J{'1' if variant == 'replace' else '2'}"
                 if variant == "replace" or finger != "th":  # the thumb's joint before the last turns across
                     assert_pad_leads(model, data, handle, joint)
-                mass = model.body_mass[model.body_parentid[model.body(handle.body).id]] + model.body(handle.body).mass[0]
-                assert mass == pytest.approx(0.017 if finger == "th" else 0.013, abs=1e-4)  # as without BioTacs
+                mass = (
+                    model.body_mass[model.body_parentid[model.body(handle.body).id]]
+                    + model.body(handle.body).mass[0]
+                )
+                assert mass == pytest.approx(
+                    0.017 if finger == "th" else 0.013, abs=1e-4
+                )  # as without BioTacs
             if variant == "authentic":  # the tendon's servo drives what is left of the pair
                 servo = model.actuator(f"{side[0]}h_A_FFJ0")
-                assert model.joint(servo.trnid[0]).name == f"{side[0]}h_FFJ2" and servo.ctrlrange[1] == pytest.approx(1.5708)
+                assert model.joint(servo.trnid[0]).name == f"{side[0]}h_FFJ2" and servo.ctrlrange[
+                    1
+                ] == pytest.approx(1.5708)
             mujoco.mj_step(model, data, 2)
             assert all(h.read(data, "status")[0] == 1 for h in handles.values())
 
 
 def test_shadow_hand_with_some_fingers_inside_a_scene():
     scene = mujoco.MjSpec.from_string(
-        '<mujoco><worldbody><body name="ball" pos="0 0 .5"><freejoint/><geom size=".02"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body name="ball" pos="0 0 .5"><freejoint/><geom '
+        'size=".02"/></body></worldbody></mujoco>'
     )
     hand = mujoco.MjSpec.from_file(str(shadow_folder() / "right_hand.xml"))
     scene.attach(hand, frame=scene.worldbody.add_frame(pos=[0, 0, 1]), prefix="robot_")
@@ -174,12 +194,21 @@ def test_mounting_frames_point_as_the_hands_do():
     "settings, text",
     [
         (dict(hand="barrett"), r"unknown hand 'barrett': choose one of shadow_hand.*or give \{finger: Mount"),
-        (dict(hand="allegro_hand", variant="authentic"), r"only the shadow_hand comes with authentic BioTac fingers, not 'allegro_hand'"),
+        (
+            dict(hand="allegro_hand", variant="authentic"),
+            r"only the shadow_hand comes with authentic BioTac fingers, not 'allegro_hand'",
+        ),
         (dict(variant="new"), r"unknown variant 'new': choose replace or authentic"),
         (dict(fingers=("ff", "pinky")), r"the hand has no finger 'pinky': choose from ff, mf, rf, lf, th"),
         (dict(fingers=("ff",)), r"no link ends with 'ffdistal': the model has world, ball, my_palm"),
-        (dict(hand={"x": Mount("distal", (0, 0, 0))}), r"several links end with 'distal': the model has my_adistal, my_bdistal"),
-        (dict(hand={"a": Mount("adistal", (0, 0, 0), tip=(0, 0, 1), pad=(0, 0, 1))}), r"of link 'adistal' must be at right angles"),
+        (
+            dict(hand={"x": Mount("distal", (0, 0, 0))}),
+            r"several links end with 'distal': the model has my_adistal, my_bdistal",
+        ),
+        (
+            dict(hand={"a": Mount("adistal", (0, 0, 0), tip=(0, 0, 1), pad=(0, 0, 1))}),
+            r"of link 'adistal' must be at right angles",
+        ),
     ],
 )
 def test_bad_hands(settings, text):
@@ -190,7 +219,8 @@ def test_bad_hands(settings, text):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "cube", "can"])
 def test_shadow_hand_lifts(name, monkeypatch, repo):
-    """The example's hand lifts each object by most of its own lift, held by all five fingertips nearly all the way."""
+    """The example's hand lifts each object by most of its own lift, held by all five fingertips nearly all
+    the way."""
     from test_examples import load
 
     monkeypatch.setenv("MENAGERIE_ROOT", str(shadow_folder().parent))
@@ -198,5 +228,7 @@ def test_shadow_hand_lifts(name, monkeypatch, repo):
     result = example.run(name, progress=False)
     assert result["height"][-1] > 0.07
     lifting = result["time"] > example.CLOSE + example.SQUEEZE
-    assert (result["force"] > example.HELD).all(axis=1)[lifting].mean() > 0.9 and (result["force"][-1] > 0.1).all()
+    assert (result["force"] > example.HELD).all(axis=1)[lifting].mean() > 0.9 and (
+        result["force"][-1] > 0.1
+    ).all()
     assert (np.abs(result["counts"] - result["counts"][0]).max(axis=(0, 2)) > 20).sum() >= 4

@@ -1,4 +1,5 @@
-"""Graph convolutions, hierarchy, VAEs, PointNet++, features: against dense algebra, closed forms and finite differences."""
+"""Graph convolutions, hierarchy, VAEs, PointNet++, features: against dense algebra, closed forms and finite
+differences."""
 
 import numpy as np
 import pytest
@@ -64,7 +65,9 @@ def test_dense_matrices_of_a_gpu_are_the_recurrence(inputs, outputs, way):
     conv = ChebConv(SparseMatrix(matrix, symmetric=True), inputs, outputs, order=6, bias=False, **change)
     found = []
     for product in (conv, conv.dense):
-        x = torch.randn(23 if way == "coarser" else 6, 4, inputs, generator=torch.Generator().manual_seed(1)).requires_grad_()
+        x = torch.randn(
+            23 if way == "coarser" else 6, 4, inputs, generator=torch.Generator().manual_seed(1)
+        ).requires_grad_()
         conv.weight.grad = None
         y = product(x)
         (y * torch.linspace(-1, 1, y.numel()).view_as(y)).sum().backward()
@@ -75,7 +78,9 @@ def test_dense_matrices_of_a_gpu_are_the_recurrence(inputs, outputs, way):
 
 
 def test_sparse_product_has_the_right_gradient():
-    matrix = csr_matrix(np.random.default_rng(1).normal(size=(5, 8)) * (np.random.default_rng(2).random((5, 8)) < 0.5))
+    matrix = csr_matrix(
+        np.random.default_rng(1).normal(size=(5, 8)) * (np.random.default_rng(2).random((5, 8)) < 0.5)
+    )
     x = torch.randn(8, 3, requires_grad=True)
     weight = torch.randn(5, 3)
     (SparseMatrix(matrix)(x) * weight).sum().backward()
@@ -88,7 +93,9 @@ def test_hierarchy_reproduces_linear_fields_and_keeps_the_walls_apart(skin, leve
     here = skin.vert
     for level in levels[:-1]:
         np.testing.assert_allclose(level.up @ np.ones(len(level.keep)), 1, atol=1e-12)
-        np.testing.assert_allclose(level.up @ here[level.keep], here, atol=2e-6)  # [m], from a small ridge where neighbours lie in a plane
+        np.testing.assert_allclose(
+            level.up @ here[level.keep], here, atol=2e-6
+        )  # [m], from a small ridge where neighbours lie in a plane
         here = here[level.keep]
     for level in levels:
         eigenvalue = np.linalg.eigvalsh(level.laplacian.toarray()) if level.laplacian.shape[0] < 800 else None
@@ -101,7 +108,10 @@ def test_mesh_vae_learns_and_has_the_papers_sizes(skin, levels):
     assert [conv.weight.shape[2] for conv in full.encode_convs] == [128, 128, 128, 256, 64, 64]
     torch.manual_seed(0)
     small = MeshVAE(levels, first=8, channels=(8, 8, 8, 8), last=8, hidden=32, latent=4)
-    bases = torch.tensor(np.stack([1e3 * dent(skin, [x, -7e-3, 0], 1e-3, 3e-3, 0) for x in (-12e-3, -6e-3)]), dtype=torch.float32)
+    bases = torch.tensor(
+        np.stack([1e3 * dent(skin, [x, -7e-3, 0], 1e-3, 3e-3, 0) for x in (-12e-3, -6e-3)]),
+        dtype=torch.float32,
+    )
     x = torch.einsum("bk,kni->bni", torch.rand(8, 2), bases)
     optimizer = torch.optim.Adam(small.parameters(), 1e-2)
     first = None
@@ -130,7 +140,9 @@ def test_pod_is_the_truncated_singular_value_decomposition():
     pod = Pod.fit(field.view(60, 11, 3), torch.arange(60), modes=3)
     u, s, v = np.linalg.svd(field.numpy(), full_matrices=False)
     wanted = u[:, :3] * s[:3] @ v[:3]
-    np.testing.assert_allclose(pod.decode(pod(field.view(60, 11, 3))).numpy().reshape(60, 33), wanted, atol=1e-4)
+    np.testing.assert_allclose(
+        pod.decode(pod(field.view(60, 11, 3))).numpy().reshape(60, 33), wanted, atol=1e-4
+    )
     np.testing.assert_allclose(pod(field.view(60, 11, 3)).square().mean(0), 1, rtol=1e-3)
 
 
@@ -144,20 +156,28 @@ def test_film_features_of_a_uniform_approach(skin):
     got = features(u)[0]
     gap = features.gap.numpy()
     thinner = np.log(np.maximum(gap - depth, 0.05) / gap)
-    np.testing.assert_allclose(got[:, :3].numpy().T.ravel(), (features.patch.numpy() @ thinner).reshape(3, 19).ravel(), atol=1e-4)
-    assert (got[:, 3:6] >= -got[:, :3] - 1e-5).all()  # Jensen: ln of the mean of 1/h is at least the mean of ln 1/h
+    np.testing.assert_allclose(
+        got[:, :3].numpy().T.ravel(), (features.patch.numpy() @ thinner).reshape(3, 19).ravel(), atol=1e-4
+    )
+    assert (
+        got[:, 3:6] >= -got[:, :3] - 1e-5
+    ).all()  # Jensen: ln of the mean of 1/h is at least the mean of ln 1/h
 
 
 def test_mirrored_touch_is_seen_by_the_mirrored_electrodes(skin):
     features, matrix = FilmFeatures(skin), mirror_matrix(skin)
     np.testing.assert_allclose(np.asarray(matrix.sum(1)).ravel(), 1, atol=1e-12)
-    np.testing.assert_allclose(skin.electrode_pos[ELECTRODE_MIRROR], skin.electrode_pos * [1, 1, -1], atol=1e-5)
+    np.testing.assert_allclose(
+        skin.electrode_pos[ELECTRODE_MIRROR], skin.electrode_pos * [1, 1, -1], atol=1e-5
+    )
     u = 1e3 * dent(skin, [-9e-3, -6e-3, 3.5e-3], 0.8e-3, 3e-3, 0.2e-3)
     flipped = matrix @ u * [1, 1, -1]
     a, b = (features(torch.tensor(x, dtype=torch.float32)[None])[0].numpy() for x in (u, flipped))
     side = np.abs(skin.electrode_pos[:, 2]) > 5e-4
     error = np.abs(b[side] - a[ELECTRODE_MIRROR][side]).max()
-    assert error < 0.1 * np.abs(a).max()  # the mesh itself is symmetric to a few hundredths of a millimetre only
+    assert (
+        error < 0.1 * np.abs(a).max()
+    )  # the mesh itself is symmetric to a few hundredths of a millimetre only
 
 
 def test_heads_are_zero_at_rest_and_averages_are_causal():
@@ -216,5 +236,6 @@ def test_replayed_steps_train_as_launched_ones_do():
         net = torch.nn.Sequential(torch.nn.Linear(19, 32), torch.nn.ELU(), torch.nn.Linear(32, 5)).cuda()
         loss = lambda r, net=net: (net(x[r]) - y[r]).square().mean()  # noqa: E731
         rows = torch.arange(300, device="cuda")
-        found.append(float(cycle(net, loss, rows, 64, 300, 3e-3, lambda: loss(rows), decay=0.95, graph=graph)))  # noqa: B023
+        whole = lambda loss=loss, rows=rows: loss(rows)  # noqa: E731
+        found.append(float(cycle(net, loss, rows, 64, 300, 3e-3, whole, decay=0.95, graph=graph)))
     assert abs(found[0] - found[1]) < 0.02 * found[0] and found[0] < 0.5

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from biotac_mj.learning.protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
+from biotac_mj.learning.protocol import (
+    conformal_width,
+    coverage_curve,
+    interaction_errors,
+    paired_test,
+    quartiles,
+)
 
 
 def test_errors_are_averaged_within_an_interaction_first():
@@ -30,9 +36,13 @@ def test_coverage_and_quartiles():
 def test_intervals_cover_new_interactions_whose_rows_are_alike():
     rng = np.random.default_rng(0)
 
-    def draw(count):  # rows of one interaction share most of their error, so counting rows as independent would be too bold
+    def draw(
+        count,
+    ):  # rows of one interaction share most of their error, so counting rows as independent would be too bold
         size = rng.gamma(2.0, 1.0, count)
-        return np.repeat(size, 8)[:, None] * (1 + 0.1 * rng.normal(size=(8 * count, 19))), np.repeat(np.arange(count), 8)
+        return np.repeat(size, 8)[:, None] * (1 + 0.1 * rng.normal(size=(8 * count, 19))), np.repeat(
+            np.arange(count), 8
+        )
 
     covered = []
     for _ in range(40):

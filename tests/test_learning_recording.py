@@ -1,4 +1,5 @@
-"""`biotac evaluate --electrodes`: synthetic logs with known answers, leakage, and whatever files people have."""
+"""`biotac evaluate --electrodes`: synthetic logs with known answers, leakage, and whatever files people
+have."""
 
 import json
 import pathlib
@@ -16,7 +17,8 @@ PRESS = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
 
 
 def synthetic_log(n=3000, drift=-0.2, seed=0):
-    """Counts (n, 19) and force (n, 3): ln Z is linear in the force, and all electrodes drift together in ln Z."""
+    """Counts (n, 19) and force (n, 3): ln Z is linear in the force, and all electrodes drift together in ln
+    Z."""
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.normal(size=(n, 3)), axis=0)
     force = walk - causal_average(walk, 200.0)
@@ -74,7 +76,9 @@ def test_nothing_of_the_test_part_and_nothing_later_is_used():
     changed = force.copy()
     changed[2100:] = 99  # its answers
     np.testing.assert_array_equal(fit_force(counts, changed, 2100, network=False).prediction, whole)
-    np.testing.assert_allclose(fit_force(counts[:2500], force[:2500], 2100, network=False).prediction, whole[:2500], atol=1e-12)
+    np.testing.assert_allclose(
+        fit_force(counts[:2500], force[:2500], 2100, network=False).prediction, whole[:2500], atol=1e-12
+    )
 
 
 def test_evaluation_of_a_log_with_and_without_force(tmp_path):
@@ -84,7 +88,8 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     result = evaluate_recording(e, f, tmp_path / "r.json", network=False, progress=False)
     assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 2100
     assert (tmp_path / "r.png").stat().st_size > 20_000
-    # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less what eight components take up
+    # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less
+    # what eight components take up
     assert result["reconstruction"]["models"]["pca8"]["test"]["rms"] < 1.2
     assert result["force_regression"]["models"]["drift_aware"]["rmse"][0] < 0.2
     assert any("e6 reads 0 or 4095 in 100.0 %" in note for note in result["notes"])
@@ -99,10 +104,27 @@ def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(real, "_STEPS", (20, 20))
     counts, force = synthetic_log(800)
     e, f = write(tmp_path, counts, force)
-    assert main(["evaluate", "--electrodes", str(e), "--force", str(f), "--json", str(tmp_path / "o.json"), "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                "--electrodes",
+                str(e),
+                "--force",
+                str(f),
+                "--json",
+                str(tmp_path / "o.json"),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     text = capsys.readouterr().out
     assert "electrode_vae_linear_start" in text and "drift_aware" in text
-    assert set(json.loads((tmp_path / "o.json").read_text())["reconstruction"]["models"]) >= {"pca8", "electrode_vae"}
+    assert set(json.loads((tmp_path / "o.json").read_text())["reconstruction"]["models"]) >= {
+        "pca8",
+        "electrode_vae",
+    }
 
 
 def test_bad_files_are_named(tmp_path, capsys):
@@ -116,9 +138,18 @@ def test_bad_files_are_named(tmp_path, capsys):
         with pytest.raises(ValueError, match=text):
             load_recording(bad, force_file)
 
-    refused(r"line 3: 18 columns, 19 are needed \(e1..e19\)", lambda r: [*r[:2], " ".join(r[2].split()[:18]), *r[3:]])
-    refused("line 4: e1 is 'nan', not a finite number", lambda r: [*r[:3], "nan " + " ".join(r[3].split()[1:]), *r[4:]])
-    refused(r"counts of e1 \(\S+5000\) are outside 0..4095", lambda r: ["5000 " + " ".join(r[0].split()[1:]), *r[1:]])
+    refused(
+        r"line 3: 18 columns, 19 are needed \(e1..e19\)",
+        lambda r: [*r[:2], " ".join(r[2].split()[:18]), *r[3:]],
+    )
+    refused(
+        "line 4: e1 is 'nan', not a finite number",
+        lambda r: [*r[:3], "nan " + " ".join(r[3].split()[1:]), *r[4:]],
+    )
+    refused(
+        r"counts of e1 \(\S+5000\) are outside 0..4095",
+        lambda r: ["5000 " + " ".join(r[0].split()[1:]), *r[1:]],
+    )
     refused("line 1: e1 is 'x', not a finite number", lambda r: ["x " + " ".join(r[0].split()[1:]), *r[1:]])
     refused("has 100 rows: at least 400", lambda r: r[:100])
     refused("is empty", lambda r: ["# nothing"])
@@ -135,7 +166,14 @@ def test_bad_files_are_named(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(not PRESS.is_dir(), reason="real recording ../shared/data/epfl_flat_press is not here")
 def test_real_press_beats_the_bars(tmp_path):
-    result = evaluate_recording(PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json", progress=False)
+    result = evaluate_recording(
+        PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json", progress=False
+    )
     models = result["reconstruction"]["models"]
-    assert models["electrode_vae"]["test"]["rms"] < 14.1 and models["electrode_vae_linear_start"]["test"]["rms"] < 10
-    assert (np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]).all()
+    assert (
+        models["electrode_vae"]["test"]["rms"] < 14.1
+        and models["electrode_vae_linear_start"]["test"]["rms"] < 10
+    )
+    assert (
+        np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]
+    ).all()

@@ -1,4 +1,5 @@
-"""Training on a small set whose rule is known, files of weights, use in MuJoCo, and everything that can be wrong with the input."""
+"""Training on a small set whose rule is known, files of weights, use in MuJoCo, and everything that can be
+wrong with the input."""
 
 import json
 import shutil
@@ -41,7 +42,16 @@ def trained(folder, tmp_path_factory):
     """One training of three models on both kinds of split."""
     out = tmp_path_factory.mktemp("trained")
     torch.set_num_threads(1)
-    train_all(folder, out, (0,), ("trajectory", "ring_7mm"), SMALL, paper=False, only=("local_taught", "local_window"), progress=False)
+    train_all(
+        folder,
+        out,
+        (0,),
+        ("trajectory", "ring_7mm"),
+        SMALL,
+        paper=False,
+        only=("local_taught", "local_window"),
+        progress=False,
+    )
     return out
 
 
@@ -70,10 +80,18 @@ def test_local_head_recovers_the_rule_on_an_unseen_object(trained):
 
 def test_weights_are_shipped_with_a_card(trained, tmp_path):
     written = ship(trained, evaluate_models(trained), tmp_path / "weights")
-    assert sorted(p.name for p in written) == ["forward.md", "forward.safetensors", "inverse.md", "inverse.safetensors"]
+    assert sorted(p.name for p in written) == [
+        "forward.md",
+        "forward.safetensors",
+        "inverse.md",
+        "inverse.safetensors",
+    ]
     card = (tmp_path / "weights/forward.md").read_text()
     assert "**synthetic**" in card and "`coarse`" in card and "unseen ring_7mm" in card
-    assert load_forward(tmp_path / "weights/forward.safetensors", load_skin("coarse")).nvert == load_skin("coarse").nvert
+    assert (
+        load_forward(tmp_path / "weights/forward.safetensors", load_skin("coarse")).nvert
+        == load_skin("coarse").nvert
+    )
     with pytest.raises(FileNotFoundError, match="seed 0"):
         ship(tmp_path, {}, tmp_path / "other")
 
@@ -100,8 +118,14 @@ def test_the_papers_networks_train_too(folder, tmp_path):
     )
     train_all(folder, tmp_path, (0,), ("trajectory",), config, only=("pod_log",), progress=False)
     report = json.loads((tmp_path / "trajectory-0.json").read_text())
-    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {"pod_inverse", "pod_inverse_taught", "latent_inverse"} == set(report["inverse"])
-    assert {"latent_projection", "pointnet", "electrode_vae"} <= set(evaluate_models(tmp_path)["splits"]["trajectory"]["models"])
+    assert {"pod", "mesh_vae"} == set(report["mesh"]) and {
+        "pod_inverse",
+        "pod_inverse_taught",
+        "latent_inverse",
+    } == set(report["inverse"])
+    assert {"latent_projection", "pointnet", "electrode_vae"} <= set(
+        evaluate_models(tmp_path)["splits"]["trajectory"]["models"]
+    )
 
 
 def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
@@ -157,7 +181,9 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         <body name="ball" mocap="true" pos="-0.009 -0.0130 0"><geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>"""
     )
     sensor = biotac_mj.SensorBioTac(signal="latent_projection", weights=str(weights), noise=False)
-    handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings())
+    handle = biotac_mj.attach(
+        spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings()
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
@@ -175,7 +201,9 @@ def test_network_counts_in_a_step_of_mujoco(weights):
     got = handle.read(data, "electrodes")
     assert np.abs(got - REST_COUNTS["1"]).max() > 20
     change = np.abs(network.readings(state)["electrodes"] - got)
-    assert change.max() <= 0.15 * np.abs(got - REST_COUNTS["1"]).max() + 1  # the held last step against a motion: nearly the same skin
+    assert (
+        change.max() <= 0.15 * np.abs(got - REST_COUNTS["1"]).max() + 1
+    )  # the held last step against a motion: nearly the same skin
     with pytest.raises(ValueError, match="unknown signal"):
         biotac_mj.SensorBioTac(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
@@ -225,13 +253,17 @@ def test_a_batch_gives_what_single_sensors_give(weights):
     got = film.impedance.numpy()
     np.testing.assert_allclose(got[1], film.rest)
     average = torch.zeros(3, *one.model.memory) if one.model.window else None
-    change = one.model.log_change(torch.tensor(1e3 * u, dtype=torch.float32), average, 0.01)[0].double().numpy()
+    change = (
+        one.model.log_change(torch.tensor(1e3 * u, dtype=torch.float32), average, 0.01)[0].double().numpy()
+    )
     np.testing.assert_allclose(got[[0, 2]], (film.rest * np.exp(change))[[0, 2]], rtol=1e-5)
 
 
 def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
     other = make_set(tmp_path / "other", count=24, seed=5, gain=1.4)
-    result = evaluate_new_sensor(other, weights, tmp_path / "new.json", touches=(0, 5), draws=3)["median_rms_counts_after_touches"]
+    result = evaluate_new_sensor(other, weights, tmp_path / "new.json", touches=(0, 5), draws=3)[
+        "median_rms_counts_after_touches"
+    ]
     assert result["5"] < 0.5 * result["0"] < result["tare"]
     p = np.ones((20, 19))
     with pytest.raises(ValueError, match="the same rows"):
@@ -240,7 +272,8 @@ def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
 
 @pytest.mark.parametrize(("touches", "between"), [(5, 0.2), (5, 0.3), (20, 0.1), (20, 0.3)])
 def test_gains_of_few_touches_are_better_than_none(touches, between):
-    """Gains drawn around a common one, scattered from touch to touch, touches of all sizes, noise of 3 counts."""
+    """Gains drawn around a common one, scattered from touch to touch, touches of all sizes, noise of 3
+    counts."""
     error = np.zeros(3)
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -257,7 +290,8 @@ def test_gains_of_few_touches_are_better_than_none(touches, between):
 
 
 def test_gains_that_touches_do_not_ask_for_stay_one():
-    """A sensor that differs from touch to touch alone, in most of 20 draws; and one or two touches never tell."""
+    """A sensor that differs from touch to touch alone, in most of 20 draws; and one or two touches never
+    tell."""
     kept = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -272,7 +306,9 @@ def test_gains_that_touches_do_not_ask_for_stay_one():
 def test_gains_without_scatter_are_found():
     rng = np.random.default_rng(0)
     p, gain = rng.normal(size=(200, 19)), rng.uniform(0.5, 1.5, 19)
-    np.testing.assert_allclose(adapt(p, gain * p, np.arange(200) // 10, np.full(p.shape, 1e6)), gain, atol=2e-3)
+    np.testing.assert_allclose(
+        adapt(p, gain * p, np.arange(200) // 10, np.full(p.shape, 1e6)), gain, atol=2e-3
+    )
 
 
 def test_contact_patch_finds_the_touch(trained, tmp_path):
@@ -280,13 +316,21 @@ def test_contact_patch_finds_the_touch(trained, tmp_path):
     rest = REST_COUNTS["2"]
     z0 = np.log(4095 / rest - 1)
     places = np.array([[-12e-3, -6.5e-3, 0], [-6e-3, -6.5e-3, 3e-3]])
-    rows = [rest] + [4095 / (1 + np.exp(z0 + log_change(skin, dent(skin, p, 0.8e-3, 2.5e-3, 0)))) for p in places]
+    rows = [rest] + [
+        4095 / (1 + np.exp(z0 + log_change(skin, dent(skin, p, 0.8e-3, 2.5e-3, 0)))) for p in places
+    ]
     source = tmp_path / "counts.txt"
     np.savetxt(source, rows, "%.3f")
-    one = contact_patch(source, tmp_path / "out", skin="coarse", weights=trained / "inverse-trajectory.safetensors", row=2)
+    one = contact_patch(
+        source, tmp_path / "out", skin="coarse", weights=trained / "inverse-trajectory.safetensors", row=2
+    )
     saved = json.loads((tmp_path / "out/contact.json").read_text())
     centre = np.array(saved["centre_mm"][1:]) * 1e-3
-    assert np.linalg.norm(centre - places, axis=1).max() < 4e-3 and centre[0, 0] < centre[1, 0] and centre[1, 2] > centre[0, 2]
+    assert (
+        np.linalg.norm(centre - places, axis=1).max() < 4e-3
+        and centre[0, 0] < centre[1, 0]
+        and centre[1, 2] > centre[0, 2]
+    )
     assert one["row"] == 2 and (tmp_path / "out/contact.png").stat().st_size > 20_000
     with pytest.raises(ValueError, match="--row 9"):
         contact_patch(source, tmp_path / "out", row=9)
@@ -312,7 +356,13 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
     from biotac_mj.batch.attach import _readings
 
     skin = load_skin("coarse")
-    film, acquisition = _readings(biotac_mj.SensorBioTac("latent_projection", weights=str(weights), noise=False).batch(), skin, 2, 0, "cpu")
+    film, acquisition = _readings(
+        biotac_mj.SensorBioTac("latent_projection", weights=str(weights), noise=False).batch(),
+        skin,
+        2,
+        0,
+        "cpu",
+    )
     u = dent(skin, [-9e-3, -7e-3, 0], 0.6e-3, 2e-3, 0)
     x = wp.array(np.stack([skin.vert, skin.vert + u], axis=1), dtype=wp.vec3d)
     pressure = wp.zeros(2, dtype=wp.float64)

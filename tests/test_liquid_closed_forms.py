@@ -1,4 +1,5 @@
-"""The liquid in earnest: inflation against closed forms, an incompressible liquid, skin that lies on the core, bulging."""
+"""The liquid in earnest: inflation against closed forms, an incompressible liquid, skin that lies on the
+core, bulging."""
 
 import math
 import sys
@@ -32,13 +33,16 @@ def ball(material, subdivisions, layers, **options):
 
 
 def lame_pressure(filling, bulk, E, nu):
-    """Pressure when a sphere takes `filling` more than it holds: 3 u(a) / a = filling - p (1 + filling) / K (Timoshenko, section 136)."""
+    """Pressure when a sphere takes `filling` more than it holds: 3 u(a) / a = filling - p (1 + filling) / K
+    (Timoshenko, section 136)."""
     a3, b3 = INNER**3, OUTER**3
     growth = 3 * a3 / (E * (b3 - a3)) * ((1 - 2 * nu) + (1 + nu) * b3 / (2 * a3))
     return filling / (growth + (1 + filling) / bulk)
 
 
-@pytest.mark.parametrize("bulk, nu", [(math.inf, 0.3), (1e6, 0.3), pytest.param(2.2e9, 0.45, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "bulk, nu", [(math.inf, 0.3), (1e6, 0.3), pytest.param(2.2e9, 0.45, marks=pytest.mark.slow)]
+)
 def test_inflated_sphere(bulk, nu):
     """The error of linear tetrahedra falls with the square of their size: two meshes give the limit."""
     exact = lame_pressure(1e-3, bulk, 1e6, nu)
@@ -46,16 +50,21 @@ def test_inflated_sphere(bulk, nu):
     coarse, fine = (ball(material, *mesh, filling=1e-3, bulk_modulus=bulk).rest for mesh in ((2, 3), (3, 6)))
     assert coarse.pressure > 1.02 * exact and fine.pressure > exact  # they are too stiff
     assert fine.pressure - (coarse.pressure - fine.pressure) / 3 == pytest.approx(exact, rel=0.01)
-    assert fine.pressure == pytest.approx(bulk * (1 - fine.volume / fine.natural_volume) if bulk < math.inf else fine.pressure, rel=1e-4)
+    assert fine.pressure == pytest.approx(
+        bulk * (1 - fine.volume / fine.natural_volume) if bulk < math.inf else fine.pressure, rel=1e-4
+    )
 
 
 def test_balloon():
-    """Large strain: p = 2 mu [1 / l + 1 / (4 l^4)] between the stretches at b and a of an incompressible neo-Hookean sphere."""
+    """Large strain: p = 2 mu [1 / l + 1 / (4 l^4)] between the stretches at b and a of an incompressible
+    neo-Hookean sphere."""
     filling, E = 0.3, 1e6
     la = (1 + filling) ** (1 / 3)
     lb = (1 + filling * (INNER / OUTER) ** 3) ** (1 / 3)
     exact = 2 * E / 3 * (1 / lb + 1 / (4 * lb**4) - 1 / la - 1 / (4 * la**4))
-    rest = ball(Material("neo_hookean", E, 0.499), 1, 2, filling=filling, bulk_modulus=math.inf, element="quadratic").rest
+    rest = ball(
+        Material("neo_hookean", E, 0.499), 1, 2, filling=filling, bulk_modulus=math.inf, element="quadratic"
+    ).rest
     assert rest.pressure == pytest.approx(exact, rel=0.03)  # facets: 1.8 % with these 80
     assert rest.pressure < 0.8 * lame_pressure(filling, math.inf, E, 0.5)  # it is far from linear
 
@@ -68,7 +77,7 @@ def test_rest_pressure_and_fill_volume_are_two_ways_to_say_the_same():
     assert by_pressure.natural_volume == pytest.approx(by_volume.natural_volume, rel=1e-6)
 
 
-# --- the BioTac ---------------------------------------------------------------------------------------------------------------------
+# --- the BioTac  ---
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +121,8 @@ def test_pressure_follows_the_volume(coarse, bulk):
 
 @pytest.mark.parametrize("name", ["coarse", pytest.param("default", marks=pytest.mark.slow)])
 def test_incompressible_liquid_keeps_its_volume(name):
-    """The standard press: 60 steps of 0.04 mm at x = -12 mm. What a finite modulus of 2.2 GPa gives differs by its compression only."""
+    """The standard press: 60 steps of 0.04 mm at x = -12 mm. What a finite modulus of 2.2 GPa gives differs
+    by its compression only."""
     geometry = load_skin(name)
     pressure, iterations = [], []
     for bulk in (math.inf, 2.2e9):
@@ -131,7 +141,8 @@ def test_incompressible_liquid_keeps_its_volume(name):
 
 @pytest.fixture(scope="module")
 def on_core(coarse):
-    """Pressed onto the core without friction, with contact so soft that much of it is partly dry, solved tightly."""
+    """Pressed onto the core without friction, with contact so soft that much of it is partly dry, solved
+    tightly."""
     options = SkinOptions(contact_stiffness=2e8, bulk_modulus=1e6, tolerance=1e-6, max_newton=80, max_cg=200)
     model = SkinModel(coarse, "default", options)
     *_, (data, geoms) = sphere_press(model, 2e-4 * np.arange(1, 14), friction=0.0)
@@ -139,15 +150,20 @@ def on_core(coarse):
 
 
 def test_no_pressure_where_the_skin_lies_on_the_core(on_core):
-    """The liquid's forces on a closed surface have no sum, so their sum is what is missing: pressure times the dry area."""
+    """The liquid's forces on a closed surface have no sum, so their sum is what is missing: pressure times
+    the dry area."""
     model, data, _ = on_core
     ns, p, face = len(model.sample), data.pressure[0], model.core_surface.face_np
-    pressed = np.linalg.norm(data.core.sample_force.numpy()[:, 0], axis=1) * (data.core.trial_geom.numpy()[:, 0] >= 0)
+    pressed = np.linalg.norm(data.core.sample_force.numpy()[:, 0], axis=1) * (
+        data.core.trial_geom.numpy()[:, 0] >= 0
+    )
     traction = pressed.reshape(-1, ns) / (model.core_surface.area.numpy()[:, None] / ns)
     dry = np.minimum(traction / (2 * data.liquid._reference.numpy()[0]), 1)
     assert (dry == 1).sum() > 5 and ((dry > 0) & (dry < 1)).sum() > 5
     mesh = trimesh.Trimesh(data.vert_xpos[0], face, process=False)
-    missing = (mesh.face_normals * (mesh.area_faces * dry.mean(1))[:, None]).sum(0)  # out of the skin: the liquid would push the other way
+    missing = (mesh.face_normals * (mesh.area_faces * dry.mean(1))[:, None]).sum(
+        0
+    )  # out of the skin: the liquid would push the other way
     np.testing.assert_allclose(data.liquid_force[0].sum(0), p * missing, rtol=1e-9)
     assert p * np.linalg.norm(missing) > 1e-3 * abs(data.wrench[0, 0, 1])
     total = data.contact_force[0] + data.core_force[0] + data.liquid_force[0]
@@ -170,7 +186,9 @@ def test_gradient_is_that_of_the_volume(on_core):
             volumes.append(data.volume[0])
         x[...] = base
         here._evaluate()
-        assert volumes[0] - volumes[1] == pytest.approx(2 * np.vdot(gradient, p), rel=2e-2, abs=2e-2 * 1e-9 * np.linalg.norm(gradient))
+        assert volumes[0] - volumes[1] == pytest.approx(
+            2 * np.vdot(gradient, p), rel=2e-2, abs=2e-2 * 1e-9 * np.linalg.norm(gradient)
+        )
 
 
 def test_tangent_is_exact(on_core):
@@ -204,7 +222,8 @@ def test_tangent_is_exact(on_core):
             here._evaluate()
             data.outer.touching.zero_()
             difference = (forces[1] - forces[0]) / (2 * h)
-            # facets stand for the core's normals, which contact this soft shows: 6 to 11 % (25 % without the dry parts' tangent)
+            # facets stand for the core's normals, which contact this soft shows: 6 to 11 % (25 % without the
+            # dry parts' tangent)
             assert np.linalg.norm(product - difference) < 0.13 * np.linalg.norm(difference)
 
 
@@ -254,7 +273,10 @@ def test_rest_is_solved_once_and_every_reset_starts_there(coarse, monkeypatch):
 
 
 def test_filled_sensor_in_the_coupling(coarse):
-    config = Config(skin="coarse", options={"skin": {"fill_volume": 2e-8, "bulk_modulus": math.inf}, "readings": {"noise": False}})
+    config = Config(
+        skin="coarse",
+        options={"skin": {"fill_volume": 2e-8, "bulk_modulus": math.inf}, "readings": {"noise": False}},
+    )
     assert Config.parse(config.strings().get) == config  # JSON knows infinity
     stepper, readings = FemStepper(config, coarse, []), SensorReadings(config, coarse)
     state, memory = np.zeros(stepper.nstate), np.zeros(readings.nstate)
@@ -264,12 +286,15 @@ def test_filled_sensor_in_the_coupling(coarse):
     rest = readings.rest
     result = stepper.solve(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
     counts = readings.advance(memory, 0.0, 0.01, result.vert_xpos, result.pressure)
-    np.testing.assert_array_equal(counts["electrodes"], rest["electrodes"])  # the published counts are the filled sensor's
+    np.testing.assert_array_equal(
+        counts["electrodes"], rest["electrodes"]
+    )  # the published counts are the filled sensor's
     assert counts["pdc"] == rest["pdc"] == 2000
 
 
 def test_bulging():
-    """Pressed at the pad's middle, PDC rises all the way to the core, and away from the contact Z falls (real sensors: 61-63 %)."""
+    """Pressed at the pad's middle, PDC rises all the way to the core, and away from the contact Z falls (real
+    sensors: 61-63 %)."""
     from benchmarks.bulging import presses
 
     locations = [(-16e-3, 0.6), (-12e-3, 0.0), (-8e-3, -0.6), (-4e-3, 0.0)]
@@ -285,7 +310,8 @@ def test_bulging():
 @pytest.mark.parametrize("options, text", [
     (dict(bulk_modulus=0.0), "bulk_modulus is 0.0: pass a positive finite number of Pa, or math.inf"),
     (dict(bulk_modulus=math.nan), "bulk_modulus is nan"),
-    (dict(fill_volume=1e-9, rest_pressure=10.0), "fill_volume is 1e-09 and rest_pressure 10.0: pass one of them, a finite number"),
+    (dict(fill_volume=1e-9, rest_pressure=10.0), "fill_volume is 1e-09 and rest_pressure 10.0: pass one of "
+                                                 "them, a finite number"),
     (dict(rest_pressure=math.inf), "rest_pressure inf: pass one of them"),
 ])  # fmt: skip
 def test_bad_options(options, text):
@@ -294,7 +320,11 @@ def test_bad_options(options, text):
 
 
 def test_bad_fillings():
-    with pytest.raises(ValueError, match="fill_volume -1.*e-06 m.3 takes more liquid out than there is .7.*e-07 m.3"):
+    with pytest.raises(
+        ValueError, match="fill_volume -1.*e-06 m.3 takes more liquid out than there is .7.*e-07 m.3"
+    ):
         _ = ball(Material("linear", 1e6, 0.3), 1, 1, filling=-1.5).rest
-    with pytest.raises(ValueError, match="no balance of skin and liquid beyond .* of rest_pressure 1e.06: .* take less"):
+    with pytest.raises(
+        ValueError, match="no balance of skin and liquid beyond .* of rest_pressure 1e.06: .* take less"
+    ):
         _ = ball(Material("neo_hookean", 1e5, 0.3), 1, 1, rest_pressure=1e6).rest

@@ -1,4 +1,5 @@
-"""PAC through `mj_step` with implicit dynamics: tapping, rubbing over ridges, and what steps do to a vibration."""
+"""PAC through `mj_step` with implicit dynamics: tapping, rubbing over ridges, and what steps do to a
+vibration."""
 
 import mujoco
 import numpy as np
@@ -40,8 +41,15 @@ def scene(geoms, timestep, start):
         tool.add_geom(type=kind, size=size, pos=pos, contype=0, conaffinity=0, friction=[0.2, 0, 0])
     for i, geom in enumerate(tool.geoms):
         geom.name = f"g{i}"
-    handle = biotac_mj.attach(spec, body="finger", skin="coarse", coupling="one-way", geoms=[g.name for g in tool.geoms],
-                              friction=0.2, options={"skin": {"dynamics": "implicit"}})  # fmt: skip
+    handle = biotac_mj.attach(
+        spec,
+        body="finger",
+        skin="coarse",
+        coupling="one-way",
+        geoms=[g.name for g in tool.geoms],
+        friction=0.2,
+        options={"skin": {"dynamics": "implicit"}},
+    )
     model = spec.compile()
     return model, mujoco.MjData(model), handle
 
@@ -76,14 +84,20 @@ def test_tapping(pad):
     rising = (instant > touch) & (instant < touch + 1 / 3 / frequency)
     assert pressure[rising].max() > 50 * quiet.std()
     falling = (instant > touch + 1 / 3 / frequency) & (instant < touch + 1 / frequency)
-    assert pressure[falling].min() < -20 * quiet.std()  # below rest while the ball leaves: no steady part passes
+    assert (
+        pressure[falling].min() < -20 * quiet.std()
+    )  # below rest while the ball leaves: no steady part passes
 
 
 def rub(pad, speed, periods, rate):
-    """Amplitudes [counts] of PAC at multiples 1 / periods, 2 / periods... of speed / pitch, once the rubbing is steady."""
+    """Amplitudes [counts] of PAC at multiples 1 / periods, 2 / periods... of speed / pitch, once the rubbing
+    is steady."""
     point, normal, along = pad
     count, dt = 25, PITCH / speed / rate
-    ridges = [(mujoco.mjtGeom.mjGEOM_CAPSULE, [RIDGE, 5e-3, 0], (i - count // 2) * PITCH * along) for i in range(count)]
+    ridges = [
+        (mujoco.mjtGeom.mjGEOM_CAPSULE, [RIDGE, 5e-3, 0], (i - count // 2) * PITCH * along)
+        for i in range(count)
+    ]
     press, lead = 20, 3 * rate  # steps
     n = np.arange(1, press + lead + rate * periods + 1)
     depth = 0.4e-3 * np.minimum(n / press, 1)
@@ -102,8 +116,8 @@ def rub(pad, speed, periods, rate):
 def test_rubbing_over_ridges(pad, speed, rate):
     """PAC shows the lines speed / pitch and its multiples, and next to nothing between them.
 
-    White noise of one count has 2 / sqrt(n) of it in every line, so a line of five counts is 20 times the noise.
-    """
+    White noise of one count has 2 / sqrt(n) of it in every line, so a line of five counts is 20 times the
+    noise."""
     periods = 4
     lines = rub(pad, speed, periods, rate)
     top = min(4 * periods, int(periods * PITCH / speed * 1000))
@@ -120,7 +134,8 @@ def test_rubbing_over_ridges(pad, speed, rate):
 @pytest.mark.parametrize("dt", [2e-4, 5e-4])
 @pytest.mark.parametrize("frequency", [50.0, 200.0, 400.0])
 def test_vibration_through_steps(frequency, dt):
-    """Pressure known at step ends, linear between: a tone passes as sinc^2(f dt) of what the continuous band-pass lets through."""
+    """Pressure known at step ends, linear between: a tone passes as sinc^2(f dt) of what the continuous
+    band-pass lets through."""
     acquisition = Acquisition(noise=False)
     state = np.zeros(acquisition.nstate)
     acquisition.reset(state, REST)

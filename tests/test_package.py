@@ -14,7 +14,13 @@ import biotac_mj
 def run(code, **environ):
     import os
 
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environ}, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environ},
+        timeout=120,
+    )
 
 
 def test_import_is_light():
@@ -32,10 +38,15 @@ def test_import_registers_the_plugin():
     assert run("import mujoco, biotac_mj; " + code).stdout.strip() == "known"
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="MUJOCO_GL=nonsense is Linux's way to ask for a library that is not there")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"),
+    reason="MUJOCO_GL=nonsense is Linux's way to ask for a library that is not there",
+)
 def test_a_gl_library_that_fails_does_not_stop_the_import():
     result = run(
-        "import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, os.environ['MUJOCO_GL'])", MUJOCO_GL="nonsense"
+        "import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, "
+        "os.environ['MUJOCO_GL'])",
+        MUJOCO_GL="nonsense",
     )
     assert result.stdout.split() == ["0", "disable"], result.stderr
     assert "MUJOCO_GL=nonsense does not work here" in result.stderr
@@ -53,7 +64,9 @@ def test_unknown_name_says_what_there_is():
 
 def test_every_package_is_listed(repo):
     listed = set(tomllib.loads((repo / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
-    present = {".".join(path.parent.relative_to(repo).parts) for path in (repo / "biotac_mj").rglob("__init__.py")}
+    present = {
+        ".".join(path.parent.relative_to(repo).parts) for path in (repo / "biotac_mj").rglob("__init__.py")
+    }
     assert present | {"biotac_mj.plugin", "biotac_mj.mjcf", "biotac_mj.assets"} == listed
 
 
@@ -81,12 +94,20 @@ def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(repo / name, source)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source], check=True, capture_output=True)
+    subprocess.run(
+        [*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source],
+        check=True,
+        capture_output=True,
+    )
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
         file.extractall(tmp_path / "site")
-    assert {"biotac_mj/plugin/__init__.py", "biotac_mj/mjcf/biotac.xml", "biotac_mj/assets/skins/default.npz"} <= names
+    assert {
+        "biotac_mj/plugin/__init__.py",
+        "biotac_mj/mjcf/biotac.xml",
+        "biotac_mj/assets/skins/default.npz",
+    } <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "plugin/", "assets/"))]
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r}); import biotac_mj; "

@@ -1,4 +1,5 @@
-"""The engine plugin: everything a BioTac remembers is MuJoCo's own state, and nothing it does wrong crosses into C."""
+"""The engine plugin: everything a BioTac remembers is MuJoCo's own state, and nothing it does wrong crosses
+into C."""
 
 import copy
 import pickle
@@ -29,13 +30,24 @@ def two_biotacs(count=2, stepper="springs", readings="sum", extra="", **settings
         for i in range(count)
     )
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>{bodies}{extra}</worldbody></mujoco>'
+        '<mujoco><option timestep="0.002" '
+        f'integrator="implicitfast"/><worldbody>{bodies}{extra}</worldbody></mujoco>'
     )
     handles = [
-        attach(spec, pos=[0.01 + i, 0, 0], quat=[np.sqrt(0.5), -np.sqrt(0.5), 0, 0], prefix=f"b{i}_", skin=spring_skin.pad_geometry(),
-               stepper=stepper, readings=readings, friction=0.3, seed=i, **settings)
+        attach(
+            spec,
+            pos=[0.01 + i, 0, 0],
+            quat=[np.sqrt(0.5), -np.sqrt(0.5), 0, 0],
+            prefix=f"b{i}_",
+            skin=spring_skin.pad_geometry(),
+            stepper=stepper,
+            readings=readings,
+            friction=0.3,
+            seed=i,
+            **settings,
+        )
         for i in range(count)
-    ]  # fmt: skip
+    ]
     return spec.compile(), handles
 
 
@@ -76,7 +88,9 @@ def test_views_show_what_mujoco_holds():
                 continue
             value = getattr(real, name)
             value = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else np.asarray(value)
-            assert np.array_equal(view.array(name).ravel().astype(float), value.ravel().astype(float), equal_nan=True), name
+            assert np.array_equal(
+                view.array(name).ravel().astype(float), value.ravel().astype(float), equal_nan=True
+            ), name
             compared += 1
         assert view.nv == model.nv if real is model else view.time == data.time
     assert compared > 400
@@ -94,10 +108,19 @@ def test_forward_twice_is_idempotent(model):
     data = start(model)
     mujoco.mj_step(model, data, 20)
     mujoco.mj_forward(model, data)
-    sensors, force, acceleration, state = data.sensordata.copy(), data.qfrc_passive.copy(), data.qacc.copy(), state_of(model, data)
+    sensors, force, acceleration, state = (
+        data.sensordata.copy(),
+        data.qfrc_passive.copy(),
+        data.qacc.copy(),
+        state_of(model, data),
+    )
     for _ in range(3):
         mujoco.mj_forward(model, data)
-    assert np.array_equal(data.sensordata, sensors) and np.array_equal(data.qfrc_passive, force) and np.array_equal(data.qacc, acceleration)
+    assert (
+        np.array_equal(data.sensordata, sensors)
+        and np.array_equal(data.qfrc_passive, force)
+        and np.array_equal(data.qacc, acceleration)
+    )
     assert np.array_equal(state_of(model, data), state)
 
 
@@ -185,7 +208,9 @@ def test_threads_equal_the_loop(model):
 
 def test_rollout_with_two_threads_equals_the_loop(model):
     starts = np.stack([state_of(model, start(model, 0.01 * i), FULL) for i in range(4)])
-    states, sensors = mujoco.rollout.rollout(model, [mujoco.MjData(model), mujoco.MjData(model)], starts, nstep=25)
+    states, sensors = mujoco.rollout.rollout(
+        model, [mujoco.MjData(model), mujoco.MjData(model)], starts, nstep=25
+    )
     for i in range(4):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, starts[i], FULL)
@@ -210,7 +235,9 @@ class _Free:
         return self.vert
 
     def solve(self, state, geom_pos, geom_mat, dt):
-        return SkinResult(state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert)
+        return SkinResult(
+            state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert
+        )
 
 
 register_stepper("free", _Free)
@@ -225,7 +252,11 @@ class _Breaking(spring_skin.SpringSkin):
         if abs(result.wrench).max() > 1.0:
             if "raise" in self.options:
                 raise ArithmeticError("the skin tore")
-            result.converged, result.wrench, result.state = False, result.wrench * np.nan, result.state * np.nan
+            result.converged, result.wrench, result.state = (
+                False,
+                result.wrench * np.nan,
+                result.state * np.nan,
+            )
         return result
 
     def __init__(self, config, geometry, geoms):
@@ -287,21 +318,29 @@ def test_ctrl_c_inside_a_solve_is_raised_by_check():
 
 
 def test_nan_pose_names_the_geom():
-    model, _ = two_biotacs(1, extra='<body name="probe" mocap="true"><geom name="tip" type="sphere" size=".01"/></body>')
+    model, _ = two_biotacs(
+        1, extra='<body name="probe" mocap="true"><geom name="tip" type="sphere" size=".01"/></body>'
+    )
     data = start(model)
     data.mocap_pos[0, 1] = np.nan
     with pytest.warns(RuntimeWarning):
         mujoco.mj_forward(model, data)
-    with pytest.raises(ValueError, match="NaN in the pose of the BioTac or of geom tip: check mocap_pos, qpos and qvel"):
+    with pytest.raises(
+        ValueError, match="NaN in the pose of the BioTac or of geom tip: check mocap_pos, qpos and qvel"
+    ):
         biotac_mj.plugin.check()
     biotac_mj.plugin.clear_errors()
 
 
 def test_a_model_that_cannot_work_fails_when_its_data_is_made():
-    with pytest.warns(RuntimeWarning, match="cannot touch: it knows plane, sphere"), pytest.raises((mujoco.FatalError, ValueError)):
+    with (
+        pytest.warns(RuntimeWarning, match="cannot touch: it knows plane, sphere"),
+        pytest.raises((mujoco.FatalError, ValueError)),
+    ):
         two_biotacs(
             1,
-            extra='<body mocap="true"><geom name="field" type="hfield" hfield="f" pos="0 0 -1"/></body></worldbody>'
+            extra='<body mocap="true"><geom name="field" type="hfield" hfield="f" pos="0 0 '
+            '-1"/></body></worldbody>'
             '<asset><hfield name="f" nrow="2" ncol="2" size="1 1 .1 .1"/></asset><worldbody>',
         )
     biotac_mj.plugin.clear_errors()
@@ -328,10 +367,23 @@ def test_disabled_equalities_are_refused_two_way(model):
 @pytest.mark.parametrize("coupling, limit", [("one-way", 0.4e-3), ("two-way", 2e-3)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
     """CPU time: 0.1 ms and 0.5 ms (docs/coupling.md); the limits leave room for slower machines."""
-    ball = '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" size=".01" mass=".1"/></body>'
-    spec = mujoco.MjSpec.from_string(f'<mujoco><option timestep="0.002"/><worldbody>{ball}</worldbody></mujoco>')
+    ball = (
+        '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '
+        'size=".01" mass=".1"/></body>'
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="0.002"/><worldbody>{ball}</worldbody></mujoco>'
+    )
     quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
-    attach(spec, pos=[0.01, 0, 0], quat=quat, skin=spring_skin.pad_geometry(), stepper="free", readings="none", coupling=coupling)
+    attach(
+        spec,
+        pos=[0.01, 0, 0],
+        quat=quat,
+        skin=spring_skin.pad_geometry(),
+        stepper="free",
+        readings="none",
+        coupling=coupling,
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     best = np.inf

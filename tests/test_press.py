@@ -1,4 +1,5 @@
-"""Press: the path against closed forms, the run with a skin of springs whose answer is known, the files read back."""
+"""Press: the path against closed forms, the run with a skin of springs whose answer is known, the files read
+back."""
 
 import csv
 import json
@@ -87,7 +88,20 @@ def touching_box(size):
     box = trimesh.creation.box(extents=[20 * size, 2 * size, 20 * size])
     none, no_face = np.zeros((0, 3)), np.zeros((0, 3), int)
     return SkinGeometry(
-        "box", box.vertices, np.zeros((0, 4)), box.faces, no_face, [], none, no_face, none, no_face, none, no_face, none, none
+        "box",
+        box.vertices,
+        np.zeros((0, 4)),
+        box.faces,
+        no_face,
+        [],
+        none,
+        no_face,
+        none,
+        no_face,
+        none,
+        no_face,
+        none,
+        none,
     )
 
 
@@ -98,7 +112,9 @@ def touching_box(size):
 )  # fmt: skip
 def test_path_starts_5_um_before_a_flat_skin(name, tip):
     size = 5e-3
-    options = PressOptions(indenter=name, location=(1e-3, 0.0), depth=1e-3, speed=0.01, timestep=4e-3, hold=0.0)
+    options = PressOptions(
+        indenter=name, location=(1e-3, 0.0), depth=1e-3, speed=0.01, timestep=4e-3, hold=0.0
+    )
     path = pressing.plan_path(touching_box(size), press_indenter.make_indenter(name), options)
     # the frame's origin is `tip` behind the front of the shape, which touches inside a face
     assert path.position(0.0)[1] == pytest.approx(-size - tip, abs=0.3e-6)
@@ -117,7 +133,9 @@ def test_slide_goes_across_the_press(shell):
 def test_quaternion_turns_y_to_the_direction():
     for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
         out = np.empty(3)
-        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), pressing._rotation_from_y(np.array(direction, float)))
+        mujoco.mju_rotVecQuat(
+            out, np.array([0.0, 1, 0]), pressing._rotation_from_y(np.array(direction, float))
+        )
         assert np.allclose(out, direction)
 
 
@@ -194,12 +212,28 @@ def test_readings_are_read_back(synthetic_press, tmp_path):
     press_record.write_readings(synthetic_press, tmp_path / "readings.csv")
     with open(tmp_path / "readings.csv") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *[f"e{i}" for i in range(1, 20)],
-                             "pdc", "pac", "tdc", "tac", "nonconverged", "tier"]  # fmt: skip
+    assert list(rows[0]) == [
+        "time_s",
+        "depth_m",
+        "force_x_N",
+        "force_y_N",
+        "force_z_N",
+        *[f"e{i}" for i in range(1, 20)],
+        "pdc",
+        "pac",
+        "tdc",
+        "tac",
+        "nonconverged",
+        "tier",
+    ]
     assert len(rows) == 12
     assert np.allclose([float(row["force_y_N"]) for row in rows], synthetic_press.force[:, 1], rtol=1e-8)
     assert np.array_equal([[float(row[name]) for name in CHANNELS] for row in rows], synthetic_press.counts)
-    assert rows[-1]["nonconverged"] == "1" and rows[-1]["tier"] == "full" and list(tmp_path.iterdir()) == [tmp_path / "readings.csv"]
+    assert (
+        rows[-1]["nonconverged"] == "1"
+        and rows[-1]["tier"] == "full"
+        and list(tmp_path.iterdir()) == [tmp_path / "readings.csv"]
+    )
 
 
 def test_skin_is_read_back(synthetic_press, tmp_path):
@@ -226,14 +260,21 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 def test_record_refuses_wrong_shapes(synthetic_press):
     import dataclasses
 
-    with pytest.raises(ValueError, match=r"counts of a press with 12 saved steps has shape \(12, 22\): \(12, 23\) is needed"):
+    with pytest.raises(
+        ValueError, match=r"counts of a press with 12 saved steps has shape \(12, 22\): \(12, 23\) is needed"
+    ):
         dataclasses.replace(synthetic_press, counts=np.zeros((12, 22)))
 
 
 def test_table(synthetic_press):
     text = press_report.table(synthetic_press, ["a.csv"])
     peak = 4 / 3 * 1.7e6 * np.sqrt(3.5e-3) * 1.5e-3**1.5
-    assert f"{peak:.3f} N at 1.500 mm" in text and "PDC         +300 counts" in text and "1 did not converge" in text and "a.csv" in text
+    assert (
+        f"{peak:.3f} N at 1.500 mm" in text
+        and "PDC         +300 counts" in text
+        and "1 did not converge" in text
+        and "a.csv" in text
+    )
     first = np.argmax(np.abs(synthetic_press.electrode_change[-1]))
     assert f"electrodes  E{first + 1} " in text
 
@@ -247,7 +288,8 @@ def colors(image):
 def test_picture_without_gl(synthetic_press, tmp_path):
     press_report.write_picture(synthetic_press, tmp_path / "press.png")
     image = imread(tmp_path / "press.png")
-    # the surfaces, upper left: skin, dimple and indenter each bring their shades; a blank panel has black and white
+    # the surfaces, upper left: skin, dimple and indenter each bring their shades; a blank panel has black and
+    # white
     assert colors(image[60:480, : image.shape[1] // 2]) > 40
     assert colors(image[60:480, image.shape[1] // 2 :]) > 20
 

@@ -40,7 +40,9 @@ def test_film_is_that_of_the_single_sensor(film):
     batch = BatchFilm(film, 5)
     batch.solve(as_warp(x), wp.ones(5, dtype=int))
     expected = channels.counts_from_impedance(film.impedance(x))
-    assert np.abs(expected - channels.counts_from_impedance(film.impedance(film.geometry.vert))).max() > 50  # something happened
+    assert (
+        np.abs(expected - channels.counts_from_impedance(film.impedance(film.geometry.vert))).max() > 50
+    )  # something happened
     np.testing.assert_allclose(channels.counts_from_impedance(batch.impedance.numpy()), expected, atol=0.1)
     assert batch.valid.numpy().all()
 
@@ -111,7 +113,12 @@ def test_an_impedance_that_is_not_valid_is_held(film):
     nothing = wp.zeros(2, dtype=wp.float64)
     for _ in range(6):
         batch.find_due(DT)
-        batch.advance(DT, wp.array(np.tile(2 * rest, (2, 1)), dtype=wp.float64, ndim=2), wp.array([1, 0], dtype=int), nothing)
+        batch.advance(
+            DT,
+            wp.array(np.tile(2 * rest, (2, 1)), dtype=wp.float64, ndim=2),
+            wp.array([1, 0], dtype=int),
+            nothing,
+        )
     held = batch.state.numpy()[:, 25:44]
     np.testing.assert_allclose(held[0], channels.counts_from_impedance(2 * rest), atol=0.5)
     np.testing.assert_allclose(held[1], channels.counts_from_impedance(rest), atol=0.5)
@@ -124,7 +131,10 @@ def test_reset_of_some_worlds(film):
     for _ in range(5):
         batch.find_due(DT)
         batch.advance(
-            DT, wp.array(np.tile(2 * rest, (3, 1)), dtype=wp.float64, ndim=2), wp.ones(3, dtype=int), wp.full(3, 500.0, wp.float64)
+            DT,
+            wp.array(np.tile(2 * rest, (3, 1)), dtype=wp.float64, ndim=2),
+            wp.ones(3, dtype=int),
+            wp.full(3, 500.0, wp.float64),
         )
     before = batch.state.numpy().copy()
     batch.reset(wp.array([False, True, False], dtype=bool))
@@ -151,5 +161,7 @@ def test_a_film_refuses_arrays_of_another_device(film):
     class Elsewhere:
         device = "another device"
 
-    with pytest.raises(ValueError, match="the film is on cpu, x on another device .*: make both where the film is"):
+    with pytest.raises(
+        ValueError, match="the film is on cpu, x on another device .*: make both where the film is"
+    ):
         BatchFilm(film, 1).solve(Elsewhere(), wp.ones(1, dtype=int))

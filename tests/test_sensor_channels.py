@@ -15,7 +15,9 @@ def test_divider():
     assert channels.impedance_from_counts(3276) == pytest.approx(2500)
     assert channels.impedance_from_counts(0) == np.inf
     z = np.geomspace(100, 1e6, 50)
-    np.testing.assert_allclose(channels.impedance_from_counts(channels.counts_from_impedance(z)), z, rtol=1e-10)
+    np.testing.assert_allclose(
+        channels.impedance_from_counts(channels.counts_from_impedance(z)), z, rtol=1e-10
+    )
 
 
 def test_pressures():

@@ -1,4 +1,5 @@
-"""Film conduction against closed forms, an axisymmetric finite-element solution and a tube whose resistance is known."""
+"""Film conduction against closed forms, an axisymmetric finite-element solution and a tube whose resistance
+is known."""
 
 import dataclasses
 
@@ -27,11 +28,16 @@ def grid(nu, nv):
 
 
 def tube(naround=56, nalong=121, gap=GAP):
-    """A skin of which only the inner surface exists: a tube around a cylindrical core, E1..E19 on it at x = -30 .. 40 mm, pad side."""
+    """A skin of which only the inner surface exists: a tube around a cylindrical core, E1..E19 on it at x =
+    -30 .. 40 mm, pad side."""
     core = trimesh.creation.cylinder(RADIUS, LENGTH + 10e-3, sections=512)
     core.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-    x, angle = np.meshgrid(np.linspace(-LENGTH / 2, LENGTH / 2, nalong), np.linspace(0, 2 * np.pi, naround + 1), indexing="ij")
-    vert = np.stack([x, -(RADIUS + gap) * np.cos(angle), (RADIUS + gap) * np.sin(angle)], axis=-1).reshape(-1, 3)
+    x, angle = np.meshgrid(
+        np.linspace(-LENGTH / 2, LENGTH / 2, nalong), np.linspace(0, 2 * np.pi, naround + 1), indexing="ij"
+    )
+    vert = np.stack([x, -(RADIUS + gap) * np.cos(angle), (RADIUS + gap) * np.sin(angle)], axis=-1).reshape(
+        -1, 3
+    )
     face = grid(nalong, naround + 1)
     seam = np.arange(len(vert))
     seam[naround :: naround + 1] = seam[0 :: naround + 1]  # the last column is the first one
@@ -77,7 +83,9 @@ def test_strip():
 
 def annulus_error(n):
     inner, outer = 1e-3, 4e-3
-    rho, angle = np.meshgrid(np.linspace(inner, outer, n + 1), np.linspace(0, np.pi / 2, n + 1), indexing="ij")
+    rho, angle = np.meshgrid(
+        np.linspace(inner, outer, n + 1), np.linspace(0, np.pi / 2, n + 1), indexing="ij"
+    )
     point = np.stack([rho * np.cos(angle), rho * np.sin(angle), np.zeros_like(rho)], axis=-1).reshape(-1, 3)
     face = grid(n + 1, n + 1)
     matrix = sheet_laplacian(point, face, np.full(len(face), SIGMA * GAP)).tocsc()
@@ -97,7 +105,8 @@ def test_annulus_converges_with_second_order():
 
 
 def test_tube_resistance_per_length(tube_film):
-    """Far from the excitation discs Z grows by 1 / (sigma h 2 pi R) per length, R the radius of the film's middle."""
+    """Far from the excitation discs Z grows by 1 / (sigma h 2 pi R) per length, R the radius of the film's
+    middle."""
     impedance = tube_film.impedance(tube_film.geometry.vert)
     x = tube_film.geometry.electrode_pos[:, 0]
     far = x < 30e-3  # the discs' own near field is the same everywhere, but for the tube's open end
@@ -107,32 +116,44 @@ def test_tube_resistance_per_length(tube_film):
 
 def test_mesh_independent(tube_film):
     finer = FilmConduction(tube(84, 181), conductivity=SIGMA, excitation=EXCITATION, sensor=None)
-    np.testing.assert_allclose(finer.impedance(finer.geometry.vert), tube_film.impedance(tube_film.geometry.vert), rtol=0.02)
+    np.testing.assert_allclose(
+        finer.impedance(finer.geometry.vert), tube_film.impedance(tube_film.geometry.vert), rtol=0.02
+    )
 
 
 def test_spreading_resistance_against_finite_elements():
-    """A disc in a slab, axisymmetric, grounded at r = b: the sheet's ln(b / a) + 1/4 plus the spreading resistance."""
+    """A disc in a slab, axisymmetric, grounded at r = b: the sheet's ln(b / a) + 1/4 plus the spreading
+    resistance."""
     skfem = pytest.importorskip("skfem")
     a, b = 1.0, 8.0
     for thickness in (0.5, 2.0):
         r = np.unique(np.concatenate([np.linspace(0, 2 * a, 49), np.geomspace(2 * a, b, 20)]))
         mesh = skfem.MeshQuad.init_tensor(r, np.linspace(0, thickness, 21))
         basis = skfem.Basis(mesh, skfem.ElementQuad2())
-        stiffness = skfem.BilinearForm(lambda u, v, w: 2 * np.pi * w.x[0] * (u.grad[0] * v.grad[0] + u.grad[1] * v.grad[1])).assemble(basis)
-        disc = skfem.FacetBasis(mesh, skfem.ElementQuad2(), facets=mesh.facets_satisfying(lambda x: (x[1] == 0) & (x[0] <= a)))
+        stiffness = skfem.BilinearForm(
+            lambda u, v, w: 2 * np.pi * w.x[0] * (u.grad[0] * v.grad[0] + u.grad[1] * v.grad[1])
+        ).assemble(basis)
+        disc = skfem.FacetBasis(
+            mesh, skfem.ElementQuad2(), facets=mesh.facets_satisfying(lambda x: (x[1] == 0) & (x[0] <= a))
+        )
         load = skfem.LinearForm(lambda v, w: 2 * np.pi * w.x[0] / (np.pi * a**2) * v).assemble(disc)
         ground = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[0], b)))
         potential = skfem.solve(*skfem.condense(stiffness, load, D=ground))
         sheet = (np.log(b / a) + 0.25) / (2 * np.pi * thickness)
-        assert load @ potential - sheet == pytest.approx(float(spreading_resistance(np.array([thickness / a]))[0]) / a, rel=0.01)
+        assert load @ potential - sheet == pytest.approx(
+            float(spreading_resistance(np.array([thickness / a]))[0]) / a, rel=0.01
+        )
 
 
 def test_spreading_resistance_of_a_thin_film():
-    np.testing.assert_allclose(spreading_resistance(np.array([0.01, 0.03])), np.array([0.01, 0.03]) / (3 * np.pi), rtol=0.03)
+    np.testing.assert_allclose(
+        spreading_resistance(np.array([0.01, 0.03])), np.array([0.01, 0.03]) / (3 * np.pi), rtol=0.03
+    )
 
 
 def moved(geometry, where, radial):
-    """vert with a smooth radial bump of 3 mm width at x = `where` on the pad side; positive = away from the core [m]."""
+    """vert with a smooth radial bump of 3 mm width at x = `where` on the pad side; positive = away from the
+    core [m]."""
     vert = geometry.vert.copy()
     axis = vert * [0, 1, 1]
     unit = axis / np.linalg.norm(axis, axis=1, keepdims=True)
@@ -155,7 +176,9 @@ def test_skin_on_the_core_leaves_the_residual_film(tube_film):
     geometry = tube_film.geometry
     deep = moved(geometry, geometry.electrode_pos[8, 0], -0.8e-3)
     assert tube_film.film(deep)[1].min() == tube_film.residual_film
-    thin = FilmConduction(geometry, conductivity=SIGMA, excitation=EXCITATION, sensor=None, residual_film=20e-6)
+    thin = FilmConduction(
+        geometry, conductivity=SIGMA, excitation=EXCITATION, sensor=None, residual_film=20e-6
+    )
     impedance = tube_film.impedance(deep)
     assert np.all(np.isfinite(impedance)) and thin.impedance(deep)[8] > 1.3 * impedance[8]
 
@@ -208,7 +231,9 @@ def test_core_distance_against_all_triangles():
     for body in (mesh, box):
         point = trimesh.sample.sample_surface(body, 300, seed=1)[0] + rng.normal(scale=0.7e-3, size=(300, 3))
         distance, foot, _ = CoreSurface(body.vertices, body.faces).closest(point)
-        scaled = trimesh.Trimesh(body.vertices * 1e3, body.faces, process=False)  # closest_point drops small triangles in metres
+        scaled = trimesh.Trimesh(
+            body.vertices * 1e3, body.faces, process=False
+        )  # closest_point drops small triangles in metres
         expected = scaled.nearest.signed_distance(point * 1e3) * -1e-3
         np.testing.assert_allclose(distance, expected, atol=2e-6)
         np.testing.assert_allclose(np.linalg.norm(point - foot, axis=1), np.abs(distance), atol=1e-12)

@@ -30,8 +30,8 @@ def film(geometry):
 def indented(film, depth, conserve):
     """A synthetic motion: a Gaussian dent of `depth` [m] over E17, 2 mm wide, along the core's normal.
 
-    With conserve=1 the displaced volume is spread evenly over the film, as an incompressible liquid would; with 0 the shell bulges nowhere.
-    """
+    With conserve=1 the displaced volume is spread evenly over the film, as an incompressible liquid would;
+    with 0 the shell bulges nowhere."""
     geometry = film.geometry
     rest = geometry.vert[film.node]
     distance, foot, _ = film.core.closest(rest)
@@ -40,7 +40,12 @@ def indented(film, depth, conserve):
     dent = np.exp(-((rest - geometry.electrode_pos[E17]) ** 2).sum(1) / (2 * 2e-3**2)) * clear
     corner = rest[film.face]
     area = np.zeros(len(rest))
-    np.add.at(area, film.face, np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)[:, None] / 6)
+    np.add.at(
+        area,
+        film.face,
+        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)[:, None]
+        / 6,
+    )
     lift = conserve * (area * dent).sum() / (area * clear).sum()
     vert = geometry.vert.copy()
     vert[film.node] += depth * ((lift - dent) * clear)[:, None] * normal
@@ -51,7 +56,14 @@ def test_pressing_raises_under_the_contact_and_the_bulge_lowers_elsewhere(film):
     rest = film.impedance(film.geometry.vert)
     change = np.log(film.impedance(indented(film, 1.4e-3, conserve=1.0)) / rest)
     assert np.argmax(change) == E17 and change[E17] > 0.15
-    away = [0, 3, 5, 10, 13, 15]  # E1 E4 E6 and their mirror images: thin film on the flanks, far from the dent
+    away = [
+        0,
+        3,
+        5,
+        10,
+        13,
+        15,
+    ]  # E1 E4 E6 and their mirror images: thin film on the flanks, far from the dent
     assert np.all(change[away] < -0.02)
     dry = np.log(film.impedance(indented(film, 1.4e-3, conserve=0.0)) / rest)
     assert np.all(change < dry)
@@ -65,21 +77,27 @@ def test_readings_follow_a_press(geometry, film):
     assert rows["electrodes"].shape == (11, 19) and rows["pac"].shape == (11, 22)
     assert np.array_equal(rows["electrodes"][0], channels.REST_COUNTS["1"])
     assert np.all(np.diff(rows["electrodes"][1:, E17]) < 0)
-    last = 0.09 + 39 / SLOT_RATE - 1 / (2 * np.pi * 1040)  # PDC's last slot, less the low-pass filter's delay on a ramp
+    last = (
+        0.09 + 39 / SLOT_RATE - 1 / (2 * np.pi * 1040)
+    )  # PDC's last slot, less the low-pass filter's delay on a ramp
     assert channels.pressure_from_counts(rows["pdc"][-1]) == pytest.approx(5e3 * last / 0.1, abs=20)
     assert np.all(rows["tdc"] == rows["tdc"][0])
 
 
 def test_left_right_symmetry(film):
-    """The skin is symmetric in z and so are the excitation electrodes: without calibration E1..E6 equal E11..E16 within the mesh."""
+    """The skin is symmetric in z and so are the excitation electrodes: without calibration E1..E6 equal
+    E11..E16 within the mesh."""
     free = FilmConduction(film.geometry, sensor=None)
     impedance = free.impedance(film.geometry.vert)
     np.testing.assert_allclose(impedance[:6], impedance[10:16], rtol=0.06)
 
 
 def test_physics_explains_the_rest_pattern(film):
-    """ln Z of the uncalibrated film against the mean of the published sensors, which among themselves correlate 0.69-0.91."""
-    published = np.mean([np.log(channels.impedance_from_counts(c)) for c in channels.REST_COUNTS.values()], axis=0)
+    """ln Z of the uncalibrated film against the mean of the published sensors, which among themselves
+    correlate 0.69-0.91."""
+    published = np.mean(
+        [np.log(channels.impedance_from_counts(c)) for c in channels.REST_COUNTS.values()], axis=0
+    )
     impedance = FilmConduction(film.geometry, sensor=None).impedance(film.geometry.vert)
     assert np.corrcoef(np.log(impedance), published)[0, 1] > 0.9
 
@@ -115,7 +133,9 @@ def test_bad_motion(geometry, film):
 
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="stored deformations (../shared/reference) are not here")
-@pytest.mark.parametrize("case, electrode", [("A_sphere3.5_pad_core", 17), ("B_cube_pad", 17), ("B_sphere7_tip", 7)])
+@pytest.mark.parametrize(
+    "case, electrode", [("A_sphere3.5_pad_core", 17), ("B_cube_pad", 17), ("B_sphere7_tip", 7)]
+)
 def test_stored_deformations_raise_the_electrode_under_the_indenter(case, electrode):
     """Reference fields of the published mesh, made without liquid."""
     from biotac_mj.geometry import import_mesh

@@ -1,4 +1,5 @@
-"""Adhesion inside the contact: work, hysteresis, instability, third law, Maugis and Dugdale's sphere, the plugin's state."""
+"""Adhesion inside the contact: work, hysteresis, instability, third law, Maugis and Dugdale's sphere, the
+plugin's state."""
 
 import copy
 
@@ -75,12 +76,15 @@ def test_a_short_range_snaps_at_the_peak():
     last = np.flatnonzero(force < 0)[-1]
     assert force.min() == force[last] == pytest.approx(-peak * AREA, rel=0.03)  # to the size of a step
     assert (force[last + 1 :] == 0).all()
-    assert work(force[: last + 1], up[: last + 1]) == pytest.approx(force[last] ** 2 / (2 * stiffness), rel=0.01)
+    assert work(force[: last + 1], up[: last + 1]) == pytest.approx(
+        force[last] ** 2 / (2 * stiffness), rel=0.01
+    )
     assert work(force, up) > 3 * W * AREA
 
 
 def test_adhesion_pulls_before_it_touches():
-    """What is out of range is not felt; within, the traction is that of the law at the gap that the pad's stretch leaves."""
+    """What is out of range is not felt; within, the traction is that of the law at the gap that the pad's
+    stretch leaves."""
     W, reach = 0.03, 6e-5
     peak = 2 * W / reach
     gaps = np.array([1.01, 0.99, 0.7, 0.4]) * reach
@@ -90,20 +94,30 @@ def test_adhesion_pulls_before_it_touches():
     np.testing.assert_allclose(force[1:], -slope * (reach - gaps[1:]) * BAR / (BAR - slope) * AREA, rtol=1e-3)
 
 
-W, R, E, NU = 0.5, 10e-3, 1e6, 0.3  # of the sphere on a half-space; E* and the unit of depth in which JKR's curve is one for all
+W, R, E, NU = (
+    0.5,
+    10e-3,
+    1e6,
+    0.3,
+)  # of the sphere on a half-space; E* and the unit of depth in which JKR's curve is one for all
 MODULUS = E / (1 - NU**2)
 DEPTH = (np.pi**2 * W**2 * R / MODULUS**2) ** (1 / 3)
 
 
 def sphere_on_half_space(cells, law, depths):
-    """Forces [pi W R] of a sphere at depths [DEPTH] in a fine block, as in `test_skin_contact.hertz`, until it has come off."""
-    radius = 1.3 * (9 * np.pi * W * R**2 / (2 * MODULUS)) ** (1 / 3)  # of JKR's contact without load, and a margin
+    """Forces [pi W R] of a sphere at depths [DEPTH] in a fine block, as in `test_skin_contact.hertz`, until
+    it has come off."""
+    radius = 1.3 * (9 * np.pi * W * R**2 / (2 * MODULUS)) ** (
+        1 / 3
+    )  # of JKR's contact without load, and a margin
     vert, elem, held, top = half_space(cells, radius, 1.6, 1.9)
     options = SkinOptions(contact_law=law, max_newton=60, max_cg=200)
     data = SkinData(SkinModel(skin(vert, elem, held, outer_face=top), Material("linear", E, NU), options))
     x, y, z = vert[held].T
     rho, G = np.linalg.norm(vert[held], axis=1), E / 2 / (1 + NU)
-    side = (-z / rho**3 - (1 - 2 * NU) / (rho * (rho - z))) / (4 * np.pi * G)  # Johnson, Contact Mechanics, eq. 3.18, for one newton
+    side = (-z / rho**3 - (1 - 2 * NU) / (rho * (rho - z))) / (
+        4 * np.pi * G
+    )  # Johnson, Contact Mechanics, eq. 3.18, for one newton
     follow = np.stack([side * x, side * y, -(z**2 / rho**3 + 2 * (1 - NU) / rho) / (4 * np.pi * G)], 1)
     geoms, forces, F = GeomSet(["sphere"], [(R,)]), [], 0.0
     for d in depths:
@@ -119,7 +133,8 @@ def sphere_on_half_space(cells, law, depths):
 
 
 def maugis(tabor):
-    """Pull-off of a sphere [pi W R] between DMT (-2) and JKR (-1.5): Pietrement and Troyon (2000) for Maugis' theory (1992)."""
+    """Pull-off of a sphere [pi W R] between DMT (-2) and JKR (-1.5): Pietrement and Troyon (2000) for Maugis'
+    theory (1992)."""
     c = 4.04 * (1.157 * tabor) ** 1.4
     return -7 / 4 + (c - 1) / (c + 1) / 4
 
@@ -139,32 +154,65 @@ def test_a_sphere_sticks_as_maugis_says(cells, reach, within):
 def jkr(depth):
     """Force of Johnson, Kendall and Roberts' sphere at a depth [pi W R], [DEPTH]: by its contact radius."""
     radius = brentq(lambda a: a**2 / R - np.sqrt(2 * np.pi * a * W / MODULUS) - depth * DEPTH, 1e-4, 1e-2)
-    return (4 * MODULUS * radius**3 / (3 * R) - np.sqrt(8 * np.pi * W * MODULUS * radius**3)) / (np.pi * W * R)
+    return (4 * MODULUS * radius**3 / (3 * R) - np.sqrt(8 * np.pi * W * MODULUS * radius**3)) / (
+        np.pi * W * R
+    )
 
 
 def test_at_a_given_depth_adhesion_takes_as_much_force_as_jkr_says():
     """About pi W R whatever the depth: the pull and what the wider contact bears cancel to first order."""
     path = np.concatenate([np.linspace(-1, 2.5, 15), np.linspace(2.5, 1.25, 6)])
     change = sphere_on_half_space(4, ContactLaw(adhesion=W, adhesion_range=4e-5), path)
-    change = (change - np.pad(sphere_on_half_space(4, None, path[2:]), (2, 0)))[10:]  # without adhesion it begins at the surface
+    change = (change - np.pad(sphere_on_half_space(4, None, path[2:]), (2, 0)))[
+        10:
+    ]  # without adhesion it begins at the surface
     hertz = 4 / 3 * MODULUS * np.sqrt(R) * (path[10:] * DEPTH) ** 1.5 / (np.pi * W * R)
     np.testing.assert_allclose(change, [jkr(d) for d in path[10:]] - hertz, atol=0.15)
 
 
 def evaluate(model, data, geoms, x):
-    """Nodal contact forces at positions x with what the last step left, and the kernel's tangent as a product."""
+    """Nodal contact forces at positions x with what the last step left, and the kernel's tangent as a
+    product."""
     xs, state = wp.array(x[:, None], dtype=wp.vec3d, ndim=2), data.outer
     surface = state.surface
-    wp.launch(lawful_contact.lawful_contact_force, dim=state.touching.shape, device="cpu",
-              inputs=[surface.face, surface.area, model.sample, model.contact_stiffness, model.options.stick_ratio, geoms.struct,
-                      xs, data.x_last, state.anchor_geom, state.anchor, data.laws.struct, data.laws.node_push],
-              outputs=[state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force,
-                       state.bond])  # fmt: skip
+    wp.launch(
+        lawful_contact.lawful_contact_force,
+        dim=state.touching.shape,
+        device="cpu",
+        inputs=[
+            surface.face,
+            surface.area,
+            model.sample,
+            model.contact_stiffness,
+            model.options.stick_ratio,
+            geoms.struct,
+            xs,
+            data.x_last,
+            state.anchor_geom,
+            state.anchor,
+            data.laws.struct,
+            data.laws.node_push,
+        ],
+        outputs=[
+            state.corner,
+            state.block,
+            state.touching,
+            state.trial_geom,
+            state.trial_anchor,
+            state.sample_force,
+            state.bond,
+        ],
+    )
 
     def product(p):
         ps = wp.array(p[:, None], dtype=wp.vec3d, ndim=2)
-        wp.launch(contact.contact_product, dim=state.touching.shape, inputs=[surface.face, state.touching, state.block, ps],
-                  outputs=[state.corner], device="cpu")  # fmt: skip
+        wp.launch(
+            contact.contact_product,
+            dim=state.touching.shape,
+            inputs=[surface.face, state.touching, state.block, ps],
+            outputs=[state.corner],
+            device="cpu",
+        )
         return nodal(model, state)
 
     return nodal(model, state), product
@@ -175,8 +223,15 @@ def test_action_equals_reaction_while_it_sticks():
     top = faces_on(vert, boundary(elem), 2, 4e-3)
     law = ContactLaw(adhesion=0.2, adhesion_hysteresis=3.0, friction_exponent=0.3)
     options = SkinOptions(contact_law=law, tolerance=1e-6, max_newton=200, max_cg=200)
-    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 2] == 0), outer_face=top), Material("corotational", 1e6, 0.3), options)
-    data, geoms = SkinData(model), GeomSet(["sphere", "box"], [(3e-3,), (2e-3, 2e-3, 1e-3)], [0.6, 0.3], [0, 1], [0, 5e-4])
+    model = SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 2] == 0), outer_face=top),
+        Material("corotational", 1e6, 0.3),
+        options,
+    )
+    data, geoms = (
+        SkinData(model),
+        GeomSet(["sphere", "box"], [(3e-3,), (2e-3, 2e-3, 1e-3)], [0.6, 0.3], [0, 1], [0, 5e-4]),
+    )
     for k, d in enumerate([1e-5, 2e-4, 3e-4, 1e-4, 2e-5, -1e-5]):
         geoms.set_pose([[2.5e-3 + 2e-5 * k, 3e-3, 7e-3 - d], [7e-3, 7e-3 - 1e-5 * k, 5e-3 - d]])
         step(model, data, geoms)
@@ -185,7 +240,9 @@ def test_action_equals_reaction_while_it_sticks():
     assert (wrench[:, 2] < -1e-3).all()  # both are held
     size, x = np.linalg.norm(wrench[:, :3], axis=1).sum(), data.vert_xpos[0]
     np.testing.assert_allclose(-wrench[:, :3].sum(0), data.contact_force[0].sum(0), atol=1e-12 * size)
-    np.testing.assert_allclose(-wrench[:, 3:].sum(0), np.cross(x, data.contact_force[0]).sum(0), atol=1e-14 * size)
+    np.testing.assert_allclose(
+        -wrench[:, 3:].sum(0), np.cross(x, data.contact_force[0]).sum(0), atol=1e-14 * size
+    )
     np.testing.assert_allclose(data.contact_force[0].sum(0) + data.reaction[0], 0, atol=1e-4 * size)
 
 
@@ -228,9 +285,13 @@ def test_default_range_is_what_the_mesh_resolves():
     """sqrt(4 W h / E*): finer faces, a shorter range."""
     ranges = []
     for cells in (6, 12):
-        data = SkinData(pad(cells=(cells, cells, 3), contact_law=ContactLaw(adhesion=0.1, adhesion_hysteresis=2.0)))
+        data = SkinData(
+            pad(cells=(cells, cells, 3), contact_law=ContactLaw(adhesion=0.1, adhesion_hysteresis=2.0))
+        )
         face, vert = data.outer.surface.face_np, data.model.geometry.vert
-        edge = np.mean([np.linalg.norm(vert[face[:, a]] - vert[face[:, b]], axis=1) for a, b in ((0, 1), (1, 2), (2, 0))])
+        edge = np.mean(
+            [np.linalg.norm(vert[face[:, a]] - vert[face[:, b]], axis=1) for a, b in ((0, 1), (1, 2), (2, 0))]
+        )
         np.testing.assert_allclose(data.laws.range, np.sqrt(4 * 0.2 * edge / 1e6), rtol=1e-12)
         ranges.append(data.laws.range[0])
     assert ranges[1] < 0.75 * ranges[0]
@@ -280,7 +341,8 @@ def test_what_cannot_be_solved_is_refused():
 
 
 def test_sticking_is_in_the_plugins_state():
-    """In mj_step, both ways: a light ball hangs on the pad against gravity, which a copy of mjData replays; without adhesion it falls."""
+    """In mj_step, both ways: a light ball hangs on the pad against gravity, which a copy of mjData replays;
+    without adhesion it falls."""
     import mujoco
 
     import biotac_mj
@@ -289,7 +351,9 @@ def test_sticking_is_in_the_plugins_state():
     outer = load_skin("coarse").vert[np.unique(load_skin("coarse").outer_face)]
     away = np.hypot(outer[:, 0] - x, outer[:, 2])
     under = (away < radius) & (outer[:, 1] < 0)
-    touch = (outer[under, 1] - np.sqrt(radius**2 - away[under] ** 2)).min()  # pad down: the BioTac's y is the world's z
+    touch = (
+        outer[under, 1] - np.sqrt(radius**2 - away[under] ** 2)
+    ).min()  # pad down: the BioTac's y is the world's z
 
     def hang(law, height):
         spec = mujoco.MjSpec.from_string(
@@ -299,7 +363,9 @@ def test_sticking_is_in_the_plugins_state():
         )
         pose = {"pos": [-x, 0, 0], "quat": [0.5**0.5, 0.5**0.5, 0, 0]}
         options = {"skin": {"element": "linear", "contact_law": law}}
-        handle = biotac_mj.attach(spec, body="finger", skin="coarse", liquid=False, readings="none", options=options, **pose)
+        handle = biotac_mj.attach(
+            spec, body="finger", skin="coarse", liquid=False, readings="none", options=options, **pose
+        )
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_step(model, data, 40)
@@ -312,7 +378,9 @@ def test_sticking_is_in_the_plugins_state():
     model, data, handle = hang(law, -2e-5)  # starts off the skin: it has to be pulled up
     assert 0 < data.qpos[0] < 2e-4 and handle.read(data, "status")[1] == 0
     mujoco.mj_step(model, data, 100)
-    assert handle.read(data, "contact_force")[1] == pytest.approx(-1e-4 * 9.81, rel=0.02)  # pulls the BioTac along -y, by the ball's weight
+    assert handle.read(data, "contact_force")[1] == pytest.approx(
+        -1e-4 * 9.81, rel=0.02
+    )  # pulls the BioTac along -y, by the ball's weight
     twin = copy.copy(data)
     mujoco.mj_step(model, data, 3)
     mujoco.mj_step(model, twin, 3)

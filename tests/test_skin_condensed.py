@@ -96,7 +96,9 @@ def both(coarse):
 
 def test_force_is_that_of_the_full_fem_on_the_coarse_skin(both):
     _, depths, full, condensed = both
-    error = [np.linalg.norm(c.wrench[0, :3] - f[0][:3]) / np.linalg.norm(f[0][:3]) for f, c in zip(full, condensed)]
+    error = [
+        np.linalg.norm(c.wrench[0, :3] - f[0][:3]) / np.linalg.norm(f[0][:3]) for f, c in zip(full, condensed)
+    ]
     assert max(error[:5]) < 0.06 and max(error) < 0.15
     # the error of the coarse skin alone could hide a softening that is not there at all
     assert condensed[4].memory.softening > 1.05
@@ -126,11 +128,16 @@ def test_film_and_counts_are_those_of_the_full_fem(both):
 
 
 def test_without_liquid_it_is_the_linear_skin():
-    model = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="linear"), SkinOptions(liquid=False))
+    model = SkinModel(
+        load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="linear"), SkinOptions(liquid=False)
+    )
     full, condensed = press_both(model, np.arange(1, 10) * 2e-4)
     for (wrench, xpos, _), c in zip(full, condensed):
-        # the same equations until the core is met (1.4 mm): rows in half precision and tolerances of 1e-3 remain
-        if not (c.memory.coordinate >= 3 * len(np.setdiff1d(np.unique(model.geometry.outer_face), model.fixed))).any():
+        # the same equations until the core is met (1.4 mm): rows in half precision and tolerances of 1e-3
+        # remain
+        if not (
+            c.memory.coordinate >= 3 * len(np.setdiff1d(np.unique(model.geometry.outer_face), model.fixed))
+        ).any():
             assert np.abs(c.wrench[0] - wrench).max() < 5e-3 * np.abs(wrench).max()
             assert np.abs(c.vert_xpos - xpos).max() < 3e-6
         else:
@@ -151,13 +158,22 @@ def test_a_filled_skin_is_that_of_the_full_fem():
     depths = np.array([3e-4, 6e-4, 9e-4])
     skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
     away = skin.solve(Memory.rest(1), (start - 1e-3 * direction)[None], EYE)
-    assert away.memory.pressure == 0 and away.volume == model.rest.volume and (away.vert_xpos == model.rest.vert).all()
-    assert model.rest.pressure == pytest.approx(3e3, rel=1e-2) and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5
+    assert (
+        away.memory.pressure == 0
+        and away.volume == model.rest.volume
+        and (away.vert_xpos == model.rest.vert).all()
+    )
+    assert (
+        model.rest.pressure == pytest.approx(3e3, rel=1e-2)
+        and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5
+    )
     for c, depth in zip(walk(skin, start + np.outer(depths, direction)), depths):
         geoms.set_pose((start + depth * direction)[None])
         step(model, data, geoms)
         assert data.converged.all()
-        assert np.linalg.norm(c.wrench[0, :3] - data.wrench[0, 0, :3]) < 0.06 * np.linalg.norm(data.wrench[0, 0, :3])
+        assert np.linalg.norm(c.wrench[0, :3] - data.wrench[0, 0, :3]) < 0.06 * np.linalg.norm(
+            data.wrench[0, 0, :3]
+        )
         assert abs(c.memory.pressure - data.pressure[0]) < 0.06 * data.pressure[0]
         assert abs(c.volume - model.rest.volume) < 5e-4 * model.rest.volume
 
@@ -190,11 +206,17 @@ def test_it_says_where_its_error_was_not_measured(both):
     assert all(c.measured for c in condensed[:8])
     start, direction = touch(both[0].geometry)
     deep = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="svk"))
-    out = CondensedSkin(deep, sphere(), cache=False).solve(Memory.rest(1), (start + 2e-4 * direction)[None], EYE)
+    out = CondensedSkin(deep, sphere(), cache=False).solve(
+        Memory.rest(1), (start + 2e-4 * direction)[None], EYE
+    )
     assert not out.measured
-    assert not correction("neo_hookean").measured(0.45, 0.6) and correction("neo_hookean").measured(0.499, 0.3)
+    assert not correction("neo_hookean").measured(0.45, 0.6) and correction("neo_hookean").measured(
+        0.499, 0.3
+    )
     wide = (2e-3) ** 2  # of a cube on rubber: 12 to 21 % too soft once the core is met, 6.5 % before
-    assert not correction("neo_hookean").measured(0.499, 0.05, wide) and correction("neo_hookean").measured(0.499, 0.0, wide)
+    assert not correction("neo_hookean").measured(0.499, 0.05, wide) and correction("neo_hookean").measured(
+        0.499, 0.0, wide
+    )
     assert correction("corotational").measured(0.3, 0.05, wide)
     assert not correction("corotational").measured(0.45, 0.1)
 
@@ -205,9 +227,21 @@ def test_it_says_where_its_error_was_not_measured(both):
 def test_rest_is_zero(coarse):
     skin = CondensedSkin(coarse, sphere(), cache=False)
     start, direction = touch(coarse.geometry)
-    out = walk(skin, [start - 1e-5 * direction, start + 3e-4 * direction, start - 1e-4 * direction, start - 2e-2 * direction])
+    out = walk(
+        skin,
+        [
+            start - 1e-5 * direction,
+            start + 3e-4 * direction,
+            start - 1e-4 * direction,
+            start - 2e-2 * direction,
+        ],
+    )
     for away in (out[0], out[2], out[3]):
-        assert (away.vert_xpos == coarse.geometry.vert).all() and (away.wrench == 0).all() and (away.tangent == 0).all()
+        assert (
+            (away.vert_xpos == coarse.geometry.vert).all()
+            and (away.wrench == 0).all()
+            and (away.tangent == 0).all()
+        )
         assert away.memory.pressure == 0 and not len(away.memory.contacts)
     assert np.linalg.norm(out[1].wrench) > 0.1
 
@@ -228,7 +262,8 @@ def test_friction_stays_in_its_cone(coarse):
         place = np.einsum("kc,kci->ki", point[number % len(point)], skin._x[face, 0])
         outward = place - out.memory.geom_pos[0]
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        # the wrench is that of the balanced forces, which differ from the stiff contact law's by what Newton's method left
+        # the wrench is that of the balanced forces, which differ from the stiff contact law's by what
+        # Newton's method left
         assert np.allclose(-force.sum(0), out.wrench[0, :3], atol=5e-3 * np.linalg.norm(out.wrench[0, :3]))
         normal = np.einsum("ij,ij->i", force, outward)
         return normal, np.linalg.norm(force - normal[:, None] * outward, axis=1)
@@ -252,8 +287,13 @@ def test_tangent_is_the_force_s_derivative(coarse):
     for axis in np.eye(3):
         moved = skin.solve(held.memory, held.memory.geom_pos + eps * axis, EYE)
         slope = -(moved.wrench[0] - held.wrench[0]) / eps
-        assert np.abs(slope - held.tangent[0][:, :3] @ axis)[:3].max() < 0.15 * np.abs(held.tangent[0][:3, :3]).max()
-    assert np.allclose(held.tangent[0], held.tangent[0].T) and np.linalg.eigvalsh(held.tangent[0]).min() > -1e-9
+        assert (
+            np.abs(slope - held.tangent[0][:, :3] @ axis)[:3].max()
+            < 0.15 * np.abs(held.tangent[0][:3, :3]).max()
+        )
+    assert (
+        np.allclose(held.tangent[0], held.tangent[0].T) and np.linalg.eigvalsh(held.tangent[0]).min() > -1e-9
+    )
 
 
 def test_two_bodies_share_the_skin(coarse):
@@ -373,7 +413,9 @@ def test_balls_fall_on_skins_that_share_a_solver():
         spec.option.timestep, spec.option.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         handles = []
         for i, height in enumerate((3e-3, 4e-3)):
-            ball = spec.worldbody.add_body(name=f"ball{i}", pos=[0.1 * i + top[0], -top[2], -top[1] + 5e-3 + height])
+            ball = spec.worldbody.add_body(
+                name=f"ball{i}", pos=[0.1 * i + top[0], -top[2], -top[1] + 5e-3 + height]
+            )
             ball.mass, ball.inertia, ball.explicitinertial = 0.02, [1e-6] * 3, True
             ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
             ball.add_geom(name=f"ball{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[5e-3, 0, 0])
@@ -408,7 +450,9 @@ def test_a_ball_rests_with_its_weight():
     joint.damping[0] = 1.0
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0])
     quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
-    handle = biotac_mj.attach(spec, quat=quat, skin="coarse", geoms=["ball"], tier="condensed", readings="none")
+    handle = biotac_mj.attach(
+        spec, quat=quat, skin="coarse", geoms=["ball"], tier="condensed", readings="none"
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     while data.time < 0.5:
@@ -423,7 +467,9 @@ def test_a_ball_rests_with_its_weight():
 
 
 def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):
-    record = dataclasses.replace(synthetic_press, parameters={**synthetic_press.parameters, "tier": "condensed"})
+    record = dataclasses.replace(
+        synthetic_press, parameters={**synthetic_press.parameters, "tier": "condensed"}
+    )
     write_readings(record, tmp_path / "readings.csv")
     write_skin(record, tmp_path / "skin.h5")
     with open(tmp_path / "readings.csv") as file:

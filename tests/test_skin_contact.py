@@ -16,7 +16,13 @@ TIGHT = dict(max_newton=200, max_cg=200)
 def pad(law="linear", nu=0.0, E=1e6, cells=(6, 6, 3), size=(1e-2, 1e-2, 4e-3), **options):
     """A pad of 10 x 10 x 4 mm, held at z = 0, to be touched from above."""
     vert, elem = box([np.linspace(0, s, n + 1) for s, n in zip(size, cells)], jitter=0.2)
-    geometry = skin(vert, elem, np.flatnonzero(vert[:, 2] == 0), outer_face=faces_on(vert, boundary(elem), 2, size[2]), name="pad")
+    geometry = skin(
+        vert,
+        elem,
+        np.flatnonzero(vert[:, 2] == 0),
+        outer_face=faces_on(vert, boundary(elem), 2, size[2]),
+        name="pad",
+    )
     return SkinModel(geometry, Material(law, E, nu), SkinOptions(**{**TIGHT, "tolerance": 1e-6, **options}))
 
 
@@ -24,7 +30,7 @@ def plane_at(geoms, x, z, mat=DOWN, y=0.0):
     geoms.set_pose([[x, y, z]], [mat])
 
 
-# --- normal contact ---------------------------------------------------------------------------------------------------------------
+# --- normal contact  ---
 
 
 def test_plane_on_a_pad_is_two_springs_in_series():
@@ -35,7 +41,9 @@ def test_plane_on_a_pad_is_two_springs_in_series():
     step(model, data, geoms)
     expected = depth / (h / 1e6 + 1 / model.contact_stiffness) * 1e-4
     np.testing.assert_allclose(data.wrench[0, 0, :3], [0, 0, expected], rtol=1e-5, atol=1e-5 * expected)
-    np.testing.assert_allclose(data.wrench[0, 0, 3:], np.cross([5e-3, 5e-3, h], [0, 0, expected]), rtol=2e-2, atol=1e-6 * expected)
+    np.testing.assert_allclose(
+        data.wrench[0, 0, 3:], np.cross([5e-3, 5e-3, h], [0, 0, expected]), rtol=2e-2, atol=1e-6 * expected
+    )
 
 
 def hertz_force(d, R, E, nu):
@@ -43,11 +51,12 @@ def hertz_force(d, R, E, nu):
 
 
 def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
-    """Forces of a sphere on a block with `cells` cells per contact radius under the sphere, coarser away from it.
+    """Forces of a sphere on a block with `cells` cells per contact radius under the sphere, coarser away from
+    it.
 
-    The block is cut out of the half-space 4.5 contact radii away: sides and bottom go where the half-space's points go under Hertz's force
-    at one point (the spread of the load matters less than 0.5 % there). Contact springs 40 times stiffer than usual give way by 0.1 %.
-    """
+    The block is cut out of the half-space 4.5 contact radii away: sides and bottom go where the half-space's
+    points go under Hertz's force at one point (the spread of the load matters less than 0.5 % there). Contact
+    springs 40 times stiffer than usual give way by 0.1 %."""
     radius = np.sqrt(R * depths[-1])
     vert, elem, held, top = half_space(cells, radius, 1.3, 1.5)
     options = SkinOptions(tolerance=1e-3, contact_stiffness=k * E, **TIGHT)
@@ -59,7 +68,14 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
         rho, F, G = np.linalg.norm(vert[held], axis=1), hertz_force(d, R, E, nu), E / 2 / (1 + nu)
         # Johnson, Contact Mechanics, eq. 3.18, for a load along -z on the half-space z < 0
         lateral_share = F / (4 * np.pi * G) * (-z / rho**3 - (1 - 2 * nu) / (rho * (rho - z)))
-        u = np.stack([lateral_share * x, lateral_share * y, -F / (4 * np.pi * G) * (z**2 / rho**3 + 2 * (1 - nu) / rho)], 1)
+        u = np.stack(
+            [
+                lateral_share * x,
+                lateral_share * y,
+                -F / (4 * np.pi * G) * (z**2 / rho**3 + 2 * (1 - nu) / rho),
+            ],
+            1,
+        )
         place(data, held, vert[held] + u)
         geoms.set_pose([[0, 0, R - d]])
         step(data.model, data, geoms)
@@ -68,7 +84,9 @@ def hertz(cells, depths, R=10e-3, E=1e6, nu=0.3, k=40 * 180e3):
     return np.array(forces)
 
 
-@pytest.mark.parametrize("cells, largest", [((2, 3), 0.2), pytest.param((4, 6), 0.06, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "cells, largest", [((2, 3), 0.2), pytest.param((4, 6), 0.06, marks=pytest.mark.slow)]
+)
 def test_hertz(cells, largest):
     """From the stiff side, with order 1.5 or better: the contact's edge falls between nodes."""
     depths = np.array([30e-6, 60e-6])  # contact radii of 0.55 and 0.77 mm; `cells` are per 0.77 mm
@@ -84,11 +102,12 @@ def test_hertz(cells, largest):
         assert (abs(limit) < 0.02).all(), limit
 
 
-# --- friction -----------------------------------------------------------------------------------------------------------------------
+# --- friction  ---
 
 
 def slide(model, geoms, depth, path):
-    """Tangential and normal force on a plane pressed in by `depth` and moved along x to each of `path`; the data."""
+    """Tangential and normal force on a plane pressed in by `depth` and moved along x to each of `path`; the
+    data."""
     data, h, forces = SkinData(model), 4e-3, []
     plane_at(geoms, 0, h + 1e-6)
     step(model, data, geoms)
@@ -133,7 +152,9 @@ def test_sticking_is_reversible():
     tangential = -forces[:, 0]
     np.testing.assert_allclose(tangential, tangential[2] * path / 8e-6, atol=1e-4 * tangential[2])
     G, A, h = 0.5e6, 1e-4, 4e-3
-    assert 0.8 * G * A / h < tangential[2] / 8e-6 < G * A / h  # a bit softer than simple shear, as the sides are free
+    assert (
+        0.8 * G * A / h < tangential[2] / 8e-6 < G * A / h
+    )  # a bit softer than simple shear, as the sides are free
 
 
 def test_frictionless_sliding_has_no_drag():
@@ -163,7 +184,8 @@ def test_slip_follows_the_drag():
 
 
 def weigh(angle, mu, weight=1.0, iterations=60):
-    """Puts a rigid slab of `weight` on the pad, gravity leaning by `angle`: whether the pad holds it, and where (x, z) it comes to rest.
+    """Puts a rigid slab of `weight` on the pad, gravity leaning by `angle`: whether the pad holds it, and
+    where (x, z) it comes to rest.
 
     The slab's position follows from the balance of forces by Newton's method with the skin's own tangent.
     """
@@ -193,7 +215,7 @@ def test_slab_on_an_incline(mu):
     assert not held and gone[0] > 5e-4
 
 
-# --- balance and tangent ------------------------------------------------------------------------------------------------------------
+# --- balance and tangent  ---
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational", "neo_hookean"])
@@ -206,22 +228,34 @@ def test_action_equals_reaction(law, with_core):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=7e-3)
     core = (ball.vertices, ball.faces) if with_core else None
     geometry = skin(vert, elem, np.flatnonzero(vert[:, 2] < -6e-3), inner_face=inner, core=core)
-    model = SkinModel(geometry, Material(law, 1e6, 0.3), SkinOptions(liquid=with_core, tolerance=1e-6, **TIGHT))
+    model = SkinModel(
+        geometry, Material(law, 1e6, 0.3), SkinOptions(liquid=with_core, tolerance=1e-6, **TIGHT)
+    )
     data = SkinData(model)
-    geoms = GeomSet(["sphere", "box"], [(3e-3,), (2e-3, 2e-3, 2e-3)], friction=[0.6, 0.3], groups=[0, 1], rounding=[0, 1e-3])
+    geoms = GeomSet(
+        ["sphere", "box"],
+        [(3e-3,), (2e-3, 2e-3, 2e-3)],
+        friction=[0.6, 0.3],
+        groups=[0, 1],
+        rounding=[0, 1e-3],
+    )
     for k in range(8):
         d = 2.5e-4 * (k + 1)
         geoms.set_pose([[1e-4 * k, 0, 13e-3 - d], [12e-3 - d / 2, 0, 1e-3]])
         step(model, data, geoms)
         assert data.converged.all()
-    on_skin = data.contact_force[0] + data.core_force[0] + data.liquid_force[0]  # the liquid's has no sum but where skin lies on the core
+    on_skin = (
+        data.contact_force[0] + data.core_force[0] + data.liquid_force[0]
+    )  # the liquid's has no sum but where skin lies on the core
     x, held = data.vert_xpos[0], model.fixed
     holding = -data.force.numpy()[held, 0]
     size = np.linalg.norm(data.wrench[0, :, :3], axis=1).sum()
     assert (np.linalg.norm(data.core_force[0].sum(0)) > 0.05 * size) == with_core
     # 1e-4 of F is what the facts ask for; the solver's tolerance is 1e-6 in energy
     np.testing.assert_allclose(-data.wrench[0, :, :3].sum(0), data.contact_force[0].sum(0), atol=1e-12 * size)
-    np.testing.assert_allclose(-data.wrench[0, :, 3:].sum(0), np.cross(x, data.contact_force[0]).sum(0), atol=1e-14 * size)
+    np.testing.assert_allclose(
+        -data.wrench[0, :, 3:].sum(0), np.cross(x, data.contact_force[0]).sum(0), atol=1e-14 * size
+    )
     np.testing.assert_allclose(data.reaction[0], holding.sum(0))
     np.testing.assert_allclose(on_skin.sum(0) + data.reaction[0], 0, atol=1e-4 * size)
     if law != "linear":
@@ -230,19 +264,46 @@ def test_action_equals_reaction(law, with_core):
 
 
 def evaluate(model, data, geoms, x):
-    """Nodal contact forces at positions x, and the kernel's tangent as a product, with the anchors of the last step."""
+    """Nodal contact forces at positions x, and the kernel's tangent as a product, with the anchors of the
+    last step."""
     xs, state = wp.array(x[:, None], dtype=wp.vec3d, ndim=2), data.outer
     surface = state.surface
-    wp.launch(contact.contact_force, dim=state.touching.shape, device="cpu",
-              inputs=[surface.face, surface.area, model.sample, model.contact_stiffness, model.options.stick_ratio, geoms.struct,
-                      xs, data.x_last, state.anchor_geom, state.anchor],
-              outputs=[state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force])  # fmt: skip
+    wp.launch(
+        contact.contact_force,
+        dim=state.touching.shape,
+        device="cpu",
+        inputs=[
+            surface.face,
+            surface.area,
+            model.sample,
+            model.contact_stiffness,
+            model.options.stick_ratio,
+            geoms.struct,
+            xs,
+            data.x_last,
+            state.anchor_geom,
+            state.anchor,
+        ],
+        outputs=[
+            state.corner,
+            state.block,
+            state.touching,
+            state.trial_geom,
+            state.trial_anchor,
+            state.sample_force,
+        ],
+    )
     force = nodal(model, state)
 
     def product(p):
         ps = wp.array(p[:, None], dtype=wp.vec3d, ndim=2)
-        wp.launch(contact.contact_product, dim=state.touching.shape, inputs=[surface.face, state.touching, state.block, ps],
-                  outputs=[state.corner], device="cpu")  # fmt: skip
+        wp.launch(
+            contact.contact_product,
+            dim=state.touching.shape,
+            inputs=[surface.face, state.touching, state.block, ps],
+            outputs=[state.corner],
+            device="cpu",
+        )
         return nodal(model, state)
 
     return force, product
@@ -256,7 +317,8 @@ def nodal(model, state):
 
 @pytest.mark.parametrize("mode", ["frictionless", "stick", "slip"])
 def test_contact_tangent(mode):
-    """The blocks are minus the derivative of the forces; where slipping, by tangential moves only (the normal force is lagged there)."""
+    """The blocks are minus the derivative of the forces; where slipping, by tangential moves only (the normal
+    force is lagged there)."""
     h, mu = 4e-3, {"frictionless": 0.0, "stick": 5.0, "slip": 0.1}[mode]
     angle = 0.2
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
@@ -282,7 +344,9 @@ def test_contact_tangent(mode):
     assert share is None or drag == pytest.approx(share * (force.sum(0) @ normal), rel=1e-2, abs=1e-9)
     touching = data.outer.trial_geom.numpy().copy()
     expected = product(p)
-    fd = (evaluate(model, data, geoms, x - size * p)[0] - evaluate(model, data, geoms, x + size * p)[0]) / (2 * size)
+    fd = (evaluate(model, data, geoms, x - size * p)[0] - evaluate(model, data, geoms, x + size * p)[0]) / (
+        2 * size
+    )
     same = (touching == data.outer.trial_geom.numpy()).all()
     assert same  # no sample came or went
     # linear springs and a plane: exact but for rounding 1e-16 / 1e-9 and, slipping, the return's curvature
@@ -293,8 +357,8 @@ def test_contact_tangent(mode):
 def test_tangent_of_a_touching_body(law):
     """What the coupling takes for d wrench / d pose, against central differences of steps.
 
-    The skin behind the contact is taken at rest and the contact's extent as it is, so the derivative is matched to a quarter only.
-    """
+    The skin behind the contact is taken at rest and the contact's extent as it is, so the derivative is
+    matched to a quarter only."""
     h = 4e-3
     model = pad(nu=0.3, law=law, cells=(8, 8, 4))
     geoms = GeomSet(["sphere"], [(5e-3,)], friction=[0.0])
@@ -317,7 +381,8 @@ def test_tangent_of_a_touching_body(law):
 
 
 def test_tangent_of_a_plane_is_its_stiffness():
-    """Linear, frictionless, all touching: the tangent is exact; rotations about the origin turn into torques."""
+    """Linear, frictionless, all touching: the tangent is exact; rotations about the origin turn into
+    torques."""
     model, h, depth = pad(nu=0.3), 4e-3, 1e-4
     geoms = GeomSet(["plane"], [()])
 

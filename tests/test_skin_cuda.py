@@ -15,9 +15,12 @@ pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
 
 
 def press(device, depths, x=(-0.012,), liquid=True, skin="coarse"):
-    """Spheres of 7 mm diameter at positions x along the pad, one world each, pressed to each depth in turn [m]."""
+    """Spheres of 7 mm diameter at positions x along the pad, one world each, pressed to each depth in turn
+    [m]."""
     geometry = load_skin(skin)
-    model = SkinModel(geometry, "default", SkinOptions(liquid=liquid, tolerance=1e-6, max_newton=40), device=device)
+    model = SkinModel(
+        geometry, "default", SkinOptions(liquid=liquid, tolerance=1e-6, max_newton=40), device=device
+    )
     data = SkinData(model, nworld=len(x))
     geoms = GeomSet(["sphere"], [(0.0035,)], friction=[0.5], nworld=len(x), device=device)
     wrench = []
@@ -50,20 +53,30 @@ def test_worlds_of_a_batch_do_not_touch_each_other():
     np.testing.assert_allclose(x[1], x_alone[0], atol=1e-8)
 
 
-# --- the device step --------------------------------------------------------------------------------------------------------------
+# --- the device step  ---
 
 
 def random_worlds(n, seed):
     rng = np.random.default_rng(seed)
     return [
-        dict(x=rng.uniform(-0.015, -0.009), side=rng.uniform(-2e-3, 2e-3), depth=rng.uniform(0.5, 1), friction=rng.uniform(0, 0.8),
-             modulus=rng.uniform(0.7, 1.4), bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]), fill=rng.uniform(-3, 3) * 1e-9)
+        dict(
+            x=rng.uniform(-0.015, -0.009),
+            side=rng.uniform(-2e-3, 2e-3),
+            depth=rng.uniform(0.5, 1),
+            friction=rng.uniform(0, 0.8),
+            modulus=rng.uniform(0.7, 1.4),
+            bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]),
+            fill=rng.uniform(-3, 3) * 1e-9,
+        )
         for _ in range(n)
-    ]  # fmt: skip
+    ]
 
 
 def make(model, worlds):
-    rubber = [dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus) for w in worlds]
+    rubber = [
+        dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus)
+        for w in worlds
+    ]
     data = SkinData(model, len(worlds), rubber)
     geoms = GeomSet(["sphere"], [(0.0035,)], nworld=len(worlds), device=str(model.device))
     geoms.set_friction([[w["friction"]] for w in worlds])
@@ -81,7 +94,10 @@ DEPTHS = (1e-4, 2.5e-4, 4e-4)
 def test_64_random_worlds_are_each_alone_on_the_cpu():
     """Pose, friction, modulus and liquid differ; both stop at an energy error of 1e-5."""
     options = SkinOptions(liquid=True, tolerance=1e-5, max_newton=60)
-    models = {device: SkinModel(load_skin("coarse"), "default", options, device=device) for device in ("cpu", "cuda:0")}
+    models = {
+        device: SkinModel(load_skin("coarse"), "default", options, device=device)
+        for device in ("cpu", "cuda:0")
+    }
     worlds = random_worlds(64, seed=1)
     data, geoms = make(models["cuda:0"], worlds)
     together = []
@@ -96,7 +112,9 @@ def test_64_random_worlds_are_each_alone_on_the_cpu():
             one.set_pose(centres([world], depth))
             step(models["cpu"], alone, one)
             assert alone.converged.all()
-            np.testing.assert_allclose(wrench[i], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * np.abs(together[-1]).max())
+            np.testing.assert_allclose(
+                wrench[i], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * np.abs(together[-1]).max()
+            )
         np.testing.assert_allclose(data.vert_xpos[i], alone.vert_xpos[0], rtol=0, atol=5e-7)
         np.testing.assert_allclose(data.pressure[i], alone.pressure[0], rtol=0.01, atol=5.0)
 
@@ -109,7 +127,10 @@ def test_inside_a_graph_of_the_caller_a_nan_world_disturbs_nobody():
     for spoil in (False, True):
         data, geoms = make(model, worlds)
         prepare_device(model, data, geoms)
-        path = [wp.array(np.swapaxes(centres(worlds, d), 0, 1), dtype=wp.vec3d, ndim=2, device="cuda:0") for d in DEPTHS]
+        path = [
+            wp.array(np.swapaxes(centres(worlds, d), 0, 1), dtype=wp.vec3d, ndim=2, device="cuda:0")
+            for d in DEPTHS
+        ]
         pose = wp.clone(path[0])
         with wp.ScopedCapture("cuda:0") as capture:
             wp.copy(geoms.struct.pos, pose)
@@ -134,17 +155,20 @@ def test_the_step_must_be_ready_before_a_capture():
     model = SkinModel(load_skin("coarse"), "default", SkinOptions(), device="cuda:0")
     model.factor  # noqa: B018
     data, geoms = make(model, random_worlds(1, 0))
-    with pytest.raises(ValueError, match=r"call prepare_device\(model, data, geoms\) before the capture begins"):
+    with pytest.raises(
+        ValueError, match=r"call prepare_device\(model, data, geoms\) before the capture begins"
+    ):
         with wp.ScopedCapture("cuda:0"):
             step_device(model, data, geoms)
 
 
-# --- what no body can have --------------------------------------------------------------------------------------------------------
+# --- what no body can have  ---
 
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element):
-    """The check that ends every step, with nodes put where a sound step never leaves them; the other world passes."""
+    """The check that ends every step, with nodes put where a sound step never leaves them; the other world
+    passes."""
     model = SkinModel(load_skin("coarse"), "rubber", SkinOptions(element=element), device="cuda:0")
     sphere = GeomSet(["sphere"], [(0.0035,)], nworld=2, device="cuda:0")
     sphere.set_pose([[0.1, 0, 0]])
@@ -159,7 +183,11 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element):
             x[corner, 1] += 20 * (x[:, 1].mean(0) - x[corner, 1])
         else:
             place = np.abs(x[inner, 1, 0] + 0.012).argmin()
-            x[inner[place], 1] += [0, 2e-3, 0]  # the pad looks along -y, the core lies above its inner surface
+            x[inner[place], 1] += [
+                0,
+                2e-3,
+                0,
+            ]  # the pad looks along -y, the core lies above its inner surface
         data.x.assign(x)
         data.worlds.asked.fill_(1)
         data.worlds.failed.zero_()

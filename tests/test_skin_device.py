@@ -1,4 +1,5 @@
-"""The device step, kernel by kernel on the CPU: many worlds at once against each of them alone in the host's solver."""
+"""The device step, kernel by kernel on the CPU: many worlds at once against each of them alone in the host's
+solver."""
 
 import dataclasses
 
@@ -26,7 +27,8 @@ def geom_set(nworld, friction=0.5):
 
 
 def poses(worlds, depth):
-    """Sphere pressed on the ball from above and dragged, a box from the side: places and depths differ from world to world."""
+    """Sphere pressed on the ball from above and dragged, a box from the side: places and depths differ from
+    world to world."""
     sphere = [[1e-3 * w["place"] + 0.3 * depth, 1e-3 * w["side"], START - depth * w["depth"]] for w in worlds]
     box = [[12e-3 - 0.5 * depth * w["depth"], 0, 0] for w in worlds]
     return np.stack([sphere, box], 1)
@@ -35,14 +37,24 @@ def poses(worlds, depth):
 def random_worlds(n, seed):
     rng = np.random.default_rng(seed)
     return [
-        dict(place=rng.uniform(0, 2), depth=rng.uniform(0.5, 1), side=rng.uniform(-1, 1), friction=rng.uniform(0, 0.8),
-             modulus=rng.uniform(0.7, 1.4), bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]), fill=rng.uniform(-3, 3) * 1e-9)
+        dict(
+            place=rng.uniform(0, 2),
+            depth=rng.uniform(0.5, 1),
+            side=rng.uniform(-1, 1),
+            friction=rng.uniform(0, 0.8),
+            modulus=rng.uniform(0.7, 1.4),
+            bulk=rng.choice([0.0, 1e6, 2.2e9, np.inf]),
+            fill=rng.uniform(-3, 3) * 1e-9,
+        )
         for _ in range(n)
-    ]  # fmt: skip
+    ]
 
 
 def walk(model, worlds, resident, depths):
-    rubber = [dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus) for w in worlds]
+    rubber = [
+        dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus)
+        for w in worlds
+    ]
     data, geoms = SkinData(model, len(worlds), rubber, resident=resident), geom_set(len(worlds))
     geoms.set_friction([[w["friction"], 0.2] for w in worlds])
     data.set_liquid([w["bulk"] for w in worlds], [w["fill"] if w["bulk"] else 0.0 for w in worlds])
@@ -57,7 +69,8 @@ DEPTHS = (1e-4, 2e-4, 3e-4, 4e-4)
 
 
 def test_random_worlds_together_are_each_alone_on_the_host(model):
-    """Pose, friction, modulus, bulk modulus (none, soft, water, infinite) and fill differ. Both stop at an energy error of 1e-5."""
+    """Pose, friction, modulus, bulk modulus (none, soft, water, infinite) and fill differ. Both stop at an
+    energy error of 1e-5."""
     worlds = random_worlds(6, seed=3)
     together, geoms = walk(model, worlds, True, DEPTHS)
     tangent = together.tangent(geoms)
@@ -65,25 +78,33 @@ def test_random_worlds_together_are_each_alone_on_the_host(model):
     assert peak > 0.1 and np.ptp(together.pressure) > 100
     for i, world in enumerate(worlds):
         alone, one = walk(model, [world], False, DEPTHS)
-        np.testing.assert_allclose(together.wrench[i, 0, :3], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * peak)
+        np.testing.assert_allclose(
+            together.wrench[i, 0, :3], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * peak
+        )
         np.testing.assert_allclose(together.vert_xpos[i], alone.vert_xpos[0], rtol=0, atol=2e-7)
         np.testing.assert_allclose(together.pressure[i], alone.pressure[0], rtol=0.01, atol=2.0)
         np.testing.assert_allclose(together.volume[i], alone.volume[0], rtol=1e-6)
-        np.testing.assert_allclose(tangent[i], alone.tangent(one)[0], rtol=0, atol=0.02 * abs(tangent[i]).max())
+        np.testing.assert_allclose(
+            tangent[i], alone.tangent(one)[0], rtol=0, atol=0.02 * abs(tangent[i]).max()
+        )
 
 
 def test_more_worlds_than_are_solved_finely(model):
-    """Few and many worlds take other kernels (rows of the inverse or a product, samples or faces): the same answers."""
+    """Few and many worlds take other kernels (rows of the inverse or a product, samples or faces): the same
+    answers."""
     worlds = random_worlds(3, seed=5)
     few, _ = walk(model, worlds, True, DEPTHS[:2])
     many, _ = walk(model, worlds * 6, True, DEPTHS[:2])
     for i in range(18):
-        np.testing.assert_allclose(many.wrench[i], few.wrench[i % 3], rtol=0, atol=1e-4 * abs(few.wrench).max())
+        np.testing.assert_allclose(
+            many.wrench[i], few.wrench[i % 3], rtol=0, atol=1e-4 * abs(few.wrench).max()
+        )
         np.testing.assert_allclose(many.vert_xpos[i], few.vert_xpos[i % 3], rtol=0, atol=2e-8)
 
 
 def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
-    """NaN pose, NaN modulus, a geom inside the core: last good state, a reason each, and bit for bit the same in the sound worlds."""
+    """NaN pose, NaN modulus, a geom inside the core: last good state, a reason each, and bit for bit the same
+    in the sound worlds."""
     worlds = random_worlds(5, seed=7)
     data, geoms = walk(model, worlds, True, DEPTHS[:2])
     sound, others = walk(model, worlds, True, DEPTHS[:2])
@@ -100,8 +121,16 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     step_device(model, data, geoms)
     step(model, sound, others)
     assert data.worlds.reason.numpy().tolist() == [NOT_FINITE, CONVERGED, INSIDE_CORE, CONVERGED, NOT_FINITE]
-    assert data.nonconverged.tolist() == [1, 0, 1, 0, 1] and data.converged.tolist() == [False, True, False, True, False]
-    assert (data.vert_xpos[[1, 3]] == sound.vert_xpos[[1, 3]]).all() and (data.wrench[[1, 3]] == sound.wrench[[1, 3]]).all()
+    assert data.nonconverged.tolist() == [1, 0, 1, 0, 1] and data.converged.tolist() == [
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert (data.vert_xpos[[1, 3]] == sound.vert_xpos[[1, 3]]).all() and (
+        data.wrench[[1, 3]] == sound.wrench[[1, 3]]
+    ).all()
     assert (data.vert_xpos[[0, 2, 4]] == good[0][[0, 2, 4]]).all()
     np.testing.assert_allclose(data.wrench[[0, 2]], good[1][[0, 2]], rtol=0, atol=1e-6 * abs(good[1]).max())
     # what was wrong is mended: the worlds go on to where the sound ones are
@@ -109,7 +138,9 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     geoms.set_pose(poses(worlds, DEPTHS[2]))
     step(model, data, geoms)
     assert data.converged.all() and data.nonconverged.tolist() == [1, 0, 1, 0, 1]
-    np.testing.assert_allclose(data.wrench[..., :3], sound.wrench[..., :3], rtol=0, atol=5e-3 * abs(sound.wrench[..., :3]).max())
+    np.testing.assert_allclose(
+        data.wrench[..., :3], sound.wrench[..., :3], rtol=0, atol=5e-3 * abs(sound.wrench[..., :3]).max()
+    )
 
 
 def test_a_step_that_does_not_converge():
@@ -126,7 +157,10 @@ def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, mo
     enough, _ = walk(model, worlds, True, DEPTHS)
     monkeypatch.setattr(SkinData, "contact_capacity", 3)
     tight, _ = walk(model, worlds, True, DEPTHS)
-    assert tight.device_memory.preconditioner.full.numpy()[0] > 3 and enough.device_memory.preconditioner.full.numpy()[0] == 0
+    assert (
+        tight.device_memory.preconditioner.full.numpy()[0] > 3
+        and enough.device_memory.preconditioner.full.numpy()[0] == 0
+    )
     np.testing.assert_allclose(tight.wrench, enough.wrench, rtol=0, atol=2e-3 * abs(enough.wrench).max())
 
 
@@ -135,7 +169,11 @@ def test_other_laws_and_elements(law, poisson):
     """Laws with inverted tetrahedra to refuse; above 0.45 the inverse is kept as two halves."""
     from biotac_mj.skin import Material
 
-    model = SkinModel(finger().geometry, Material(law, 2.8e5, poisson, 0.2, element="linear"), SkinOptions(tolerance=1e-5, max_newton=60))
+    model = SkinModel(
+        finger().geometry,
+        Material(law, 2.8e5, poisson, 0.2, element="linear"),
+        SkinOptions(tolerance=1e-5, max_newton=60),
+    )
     results = []
     for resident in (False, True):
         data, geoms = SkinData(model, resident=resident), geom_set(1)
@@ -151,14 +189,28 @@ def test_other_laws_and_elements(law, poisson):
 
 def test_dynamics():
     """Backward Euler with both dampings, on a core that is shaken: positions and velocities of the host."""
-    options = SkinOptions(liquid=False, dynamics="implicit", mass_damping=5.0, stiffness_damping=1e-4, tolerance=1e-6, max_newton=60)
+    options = SkinOptions(
+        liquid=False,
+        dynamics="implicit",
+        mass_damping=5.0,
+        stiffness_damping=1e-4,
+        tolerance=1e-6,
+        max_newton=60,
+    )
     model = SkinModel(finger().geometry, "default", options)
     results = []
     for resident in (False, True):
         data, geoms = SkinData(model, 2, resident=resident), geom_set(2)
         geoms.set_pose([[0.1, 0.1, 0.1]] * 2)
         for k in range(1, 5):
-            step(model, data, geoms, 1e-3, core_pos=[[0, 2e-4 * np.sin(k), 0], [0, 0, 1e-4 * k]], core_mat=np.tile(np.eye(3), (2, 1, 1)))
+            step(
+                model,
+                data,
+                geoms,
+                1e-3,
+                core_pos=[[0, 2e-4 * np.sin(k), 0], [0, 0, 1e-4 * k]],
+                core_mat=np.tile(np.eye(3), (2, 1, 1)),
+            )
         results.append((data.vert_xpos, data.velocity.numpy()))
     (x, v), (y, u) = results
     assert abs(x - model.geometry.vert).max() > 1e-6
@@ -184,7 +236,13 @@ def test_loads_reset_and_reading_a_state(model):
         step(model, data, geoms)
     again, other = SkinData(model, resident=True), geom_set(1)
     prepare_device(model, again, other)
-    again.load(data.vert_xpos[0], data.increment.numpy()[:, 0], data.motion[0], data.contacts(), data.liquid.last_pressure[0])
+    again.load(
+        data.vert_xpos[0],
+        data.increment.numpy()[:, 0],
+        data.motion[0],
+        data.contacts(),
+        data.liquid.last_pressure[0],
+    )
     other.set_pose(poses([world], DEPTHS[1])[0])
     for d, g in ((data, geoms), (again, other)):
         g.set_pose(poses([world], DEPTHS[2])[0])
@@ -193,9 +251,14 @@ def test_loads_reset_and_reading_a_state(model):
 
 
 def test_what_is_refused(model):
-    with pytest.raises(ValueError, match=r"this data is stepped from the host: make it with SkinData\(model, nworld, resident=True\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"this data is stepped from the host: make it with SkinData\(model, nworld, resident=True\)",
+    ):
         prepare_device(model, SkinData(model), geom_set(1))
-    with pytest.raises(ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"):
+    with pytest.raises(
+        ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"
+    ):
         step_device(model, SkinData(model, resident=True), geom_set(2))
     data = SkinData(model, 2)
     with pytest.raises(ValueError, match="bulk moduli must be numbers >= 0"):
@@ -203,7 +266,9 @@ def test_what_is_refused(model):
     with pytest.raises(ValueError, match="fill volumes finite and not less than minus what there is"):
         data.set_liquid(fill_volume=-1.0)
     dry = SkinModel(model.geometry, "default", SkinOptions(liquid=False))
-    with pytest.raises(ValueError, match=r"this model has no liquid: make it with SkinOptions\(liquid=True\)"):
+    with pytest.raises(
+        ValueError, match=r"this model has no liquid: make it with SkinOptions\(liquid=True\)"
+    ):
         SkinData(dry).set_liquid(1e6)
 
 
@@ -226,7 +291,9 @@ def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
     ready._evaluate(data.worlds.asked)
     ready._refuse_impossible()
     assert data.worlds.failed.numpy().tolist() == [0, 1, 1]
-    monkeypatch.setattr(type(data.device_memory.elements), "refuse_inverted", lambda *_: None)  # the core alone
+    monkeypatch.setattr(
+        type(data.device_memory.elements), "refuse_inverted", lambda *_: None
+    )  # the core alone
     data.worlds.failed.zero_()
     ready._refuse_impossible()
     assert data.worlds.failed.numpy().tolist() == [0, 0, 1]
@@ -234,7 +301,8 @@ def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
 
 @pytest.mark.parametrize("law", ["corotational", "svk", "neo_hookean", "linear"])
 def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
-    """Corner forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean dilatation."""
+    """Corner forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean
+    dilatation."""
     import warp as wp
 
     from biotac_mj.skin.device_quadratic import Quadratic
@@ -249,7 +317,11 @@ def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
     p = rng.standard_normal(vert.shape).astype(np.float32)
     mu = wp.array([rubber.mu] * 2, dtype=wp.float64)
     lam = wp.array([rubber.bulk if law == "neo_hookean" else rubber.lame] * 2, dtype=wp.float64)
-    on, inverted, unused = wp.ones(2, dtype=int), wp.zeros(2, dtype=int), wp.zeros(vert.shape[:2], dtype=wp.vec3d)
+    on, inverted, unused = (
+        wp.ones(2, dtype=int),
+        wp.zeros(2, dtype=int),
+        wp.zeros(vert.shape[:2], dtype=wp.vec3d),
+    )
     scratch, device = element.allocate(2), Quadratic(element, 2)
     element.force(scratch, mu, lam, x, unused)
     device.force(mu, lam, x, on, inverted)

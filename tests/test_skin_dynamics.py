@@ -15,10 +15,13 @@ LENGTH, E, RHO = 50e-3, 1e6, 1000.0
 
 
 def bar(law="linear", nu=0.0, cells=12, tolerance=1e-4, **options):
-    """50 mm long, 10 mm wide, held at x = 0: free, along its axis it has the modes of a fixed-free bar, as nu = 0."""
+    """50 mm long, 10 mm wide, held at x = 0: free, along its axis it has the modes of a fixed-free bar, as nu
+    = 0."""
     vert, elem = box([np.linspace(0, LENGTH, cells + 1), np.linspace(0, 1e-2, 3), np.linspace(0, 1e-2, 3)])
     options = SkinOptions(dynamics="implicit", tolerance=tolerance, max_newton=200, max_cg=200, **options)
-    return SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 0] == 0)), Material(law, E, nu, density=RHO), options)
+    return SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 0] == 0)), Material(law, E, nu, density=RHO), options
+    )
 
 
 def axial_mode(model):
@@ -45,7 +48,9 @@ def swing(model, shape, dt, steps, amplitude=1e-4):
     for _ in range(steps):
         step(model, data, NOTHING, dt)
         assert data.converged.all()
-        out.append(np.vdot(weight, data.vert_xpos[0] - model.geometry.vert) / np.vdot(weight, shape) / amplitude)
+        out.append(
+            np.vdot(weight, data.vert_xpos[0] - model.geometry.vert) / np.vdot(weight, shape) / amplitude
+        )
     return np.array(out), data
 
 
@@ -69,7 +74,8 @@ def test_backward_euler_is_of_first_order():
 
 @pytest.mark.parametrize("mass_damping, stiffness_damping", [(0, 0), (300.0, 0), (0, 2e-4)])
 def test_each_step_is_the_oscillators(mass_damping, stiffness_damping):
-    """A mode is a scalar oscillator: backward Euler of x'' + (alpha + beta w^2) x' + w^2 x = 0, step by step."""
+    """A mode is a scalar oscillator: backward Euler of x'' + (alpha + beta w^2) x' + w^2 x = 0, step by
+    step."""
     model = bar(mass_damping=mass_damping, stiffness_damping=stiffness_damping)
     omega, shape = axial_mode(model)
     dt = 0.2 / omega
@@ -80,7 +86,9 @@ def test_each_step_is_the_oscillators(mass_damping, stiffness_damping):
         x_new = (x + dt * v + dt * damping * x) / (1 + dt * damping + dt**2 * omega**2)
         x, v = x_new, (x_new - x) / dt
         expected.append(x)
-    np.testing.assert_allclose(amplitude, expected, atol=1e-5)  # of the amplitude; the solver's tolerance is absolute here
+    np.testing.assert_allclose(
+        amplitude, expected, atol=1e-5
+    )  # of the amplitude; the solver's tolerance is absolute here
 
 
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
@@ -95,10 +103,17 @@ def test_energy_falls(law):
         energies = []
         for _ in range(15):
             share = wp.zeros((model.nelem, 1), dtype=wp.float64)
-            wp.launch(elasticity.elastic_energy, dim=share.shape, device="cpu", outputs=[share],
-                      inputs=[model.law, data.mu, data.lam, mesh.elem, mesh.inverse_edges, mesh.volume, data.x])  # fmt: skip
+            wp.launch(
+                elasticity.elastic_energy,
+                dim=share.shape,
+                device="cpu",
+                outputs=[share],
+                inputs=[model.law, data.mu, data.lam, mesh.elem, mesh.inverse_edges, mesh.volume, data.x],
+            )
             mass = RHO * model.elasticity.node_volume
-            energies.append(share.numpy().sum() + 0.5 * (mass[:, None] * data.velocity.numpy()[:, 0] ** 2).sum())
+            energies.append(
+                share.numpy().sum() + 0.5 * (mass[:, None] * data.velocity.numpy()[:, 0] ** 2).sum()
+            )
             step(model, data, NOTHING, 1e-3)
         assert (np.diff(energies) < 0).all()
         left[damping] = energies[-1] / energies[0]
@@ -135,11 +150,14 @@ def test_acceleration_needs_its_force():
     for k in range(1, 60):
         step(model, data, NOTHING, dt, (0.5 * a * (k * dt) ** 2)[None], turn[None])
         assert data.converged.all()
-    np.testing.assert_allclose(turn @ data.reaction[0], RHO * LENGTH * 1e-4 * a, rtol=1e-4)  # the whole bar's mass
+    np.testing.assert_allclose(
+        turn @ data.reaction[0], RHO * LENGTH * 1e-4 * a, rtol=1e-4
+    )  # the whole bar's mass
 
 
 def test_momentum_balance_in_free_fall_of_the_nodes():
-    """In every step the free nodes' momentum changes by what the held nodes and the loads push: reaction + load = d(m v) / dt."""
+    """In every step the free nodes' momentum changes by what the held nodes and the loads push: reaction +
+    load = d(m v) / dt."""
     model = bar("neo_hookean", nu=0.3, cells=6, tolerance=1e-7)
     data, dt = SkinData(model), 1e-3
     mass = RHO * model.elasticity.node_volume[model.free]  # the others do not move

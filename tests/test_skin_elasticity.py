@@ -1,4 +1,5 @@
-"""Linear tetrahedra against what they must do exactly, against scikit-fem, and against beams and spheres in closed form."""
+"""Linear tetrahedra against what they must do exactly, against scikit-fem, and against beams and spheres in
+closed form."""
 
 import numpy as np
 import pytest
@@ -16,10 +17,16 @@ NOTHING = GeomSet([], [])
 TIGHT = dict(max_newton=200, max_cg=200)
 
 
-def block(law="corotational", E=1e6, nu=0.3, cells=4, size=1e-2, jitter=0.25, held=lambda v: v[:, 1] == 0, **options):
+def block(
+    law="corotational", E=1e6, nu=0.3, cells=4, size=1e-2, jitter=0.25, held=lambda v: v[:, 1] == 0, **options
+):
     """An irregular cube of 10 mm, held at y = 0."""
     vert, elem = box([np.linspace(0, size, cells + 1)] * 3, jitter)
-    return SkinModel(skin(vert, elem, np.flatnonzero(held(vert))), Material(law, E, nu), SkinOptions(**{**TIGHT, **options}))
+    return SkinModel(
+        skin(vert, elem, np.flatnonzero(held(vert))),
+        Material(law, E, nu),
+        SkinOptions(**{**TIGHT, **options}),
+    )
 
 
 def forces(model, x):
@@ -41,7 +48,9 @@ def test_patch(law):
     """An affine displacement of the boundary of an irregular block goes on inside, exactly."""
     vert, elem = box([np.linspace(0, 1e-2, 5)] * 3, jitter=0.3)
     outside = np.flatnonzero(np.isin(vert, [0, 1e-2]).any(1))
-    model = SkinModel(skin(vert, elem, outside), Material(law, 1e6, 0.3), SkinOptions(tolerance=1e-5, **TIGHT))
+    model = SkinModel(
+        skin(vert, elem, outside), Material(law, 1e6, 0.3), SkinOptions(tolerance=1e-5, **TIGHT)
+    )
     data = SkinData(model)
     A = np.array([[0.05, 0.03, -0.02], [-0.04, -0.06, 0.01], [0.02, 0.05, 0.04]])
     place(data, outside, vert[outside] @ (np.eye(3) + A).T + 1e-3)
@@ -58,7 +67,8 @@ def test_rigid_motion_makes_no_force(law):
     Q, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))
     Q *= np.sign(np.linalg.det(Q))
     f, _ = forces(model, vert @ Q.T + 0.05)
-    # 10 um of stretch make forces of about E L 1e-5 = 0.1 N; rounding of coordinates near 0.05 m leaves E L eps
+    # 10 um of stretch make forces of about E L 1e-5 = 0.1 N; rounding of coordinates near 0.05 m leaves E L
+    # eps
     assert abs(f).max() < 1e-10
 
 
@@ -69,9 +79,13 @@ def test_hessian_at_rest_is_the_rest_stiffness(law):
     K = model.elasticity.rest_stiffness(m.mu, m.lame)
     p = np.random.default_rng(0).standard_normal((g.nvert, 3))
     _, data = forces(model, g.vert)
-    np.testing.assert_allclose(product(model, data, p).ravel(), K @ p.ravel(), rtol=0, atol=1e-10 * abs(K @ p.ravel()).max())
+    np.testing.assert_allclose(
+        product(model, data, p).ravel(), K @ p.ravel(), rtol=0, atol=1e-10 * abs(K @ p.ravel()).max()
+    )
     assert abs(K - K.T).max() < 1e-12 * abs(K).max()
-    rigid = np.concatenate([np.tile(np.eye(3), (g.nvert, 1)), np.concatenate([np.cross(np.eye(3), v).T for v in g.vert])], 1)
+    rigid = np.concatenate(
+        [np.tile(np.eye(3), (g.nvert, 1)), np.concatenate([np.cross(np.eye(3), v).T for v in g.vert])], 1
+    )
     assert abs(K @ rigid).max() < 1e-10 * abs(K).max()
 
 
@@ -94,7 +108,7 @@ def test_forces_balance_and_hessian_is_their_derivative(law):
     assert np.vdot(q, Kp) == pytest.approx(np.vdot(p, product(model, data, q)), rel=1e-10)
 
 
-# --- scikit-fem -----------------------------------------------------------------------------------------------------------------
+# --- scikit-fem  ---
 
 
 def skfem_basis(vert, elem):
@@ -106,7 +120,9 @@ def skfem_basis(vert, elem):
 
 
 def body_force(basis, dofs, density):
-    load = skfem.LinearForm(lambda v, w: density[0] * v[0] + density[1] * v[1] + density[2] * v[2]).assemble(basis)
+    load = skfem.LinearForm(lambda v, w: density[0] * v[0] + density[1] * v[1] + density[2] * v[2]).assemble(
+        basis
+    )
     return load, load[dofs].T
 
 
@@ -128,7 +144,9 @@ def test_linear_elasticity_equals_scikit_fem():
     step(model, data, NOTHING)
     assert data.converged.all()
     ours = data.vert_xpos[0] - g.vert
-    np.testing.assert_allclose(ours, u, rtol=0, atol=1e-6 * abs(u).max())  # the solver's tolerance 1e-8 times its margin
+    np.testing.assert_allclose(
+        ours, u, rtol=0, atol=1e-6 * abs(u).max()
+    )  # the solver's tolerance 1e-8 times its margin
     np.testing.assert_allclose(data.reaction[0], -nodal.sum(0), rtol=1e-6)
 
 
@@ -144,7 +162,8 @@ def first_piola(law, mu, lam, F):
 
 
 def skfem_newton(law, basis, dofs, load, fixed, mu, lam):
-    """Newton's method with scikit-fem; the tangent by complex steps of P, so that no derivative is shared with the kernels."""
+    """Newton's method with scikit-fem; the tangent by complex steps of P, so that no derivative is shared
+    with the kernels."""
 
     def gradient(w):
         return w["u"].grad + identity(w["u"].grad)
@@ -187,13 +206,17 @@ def test_hyperelasticity_equals_scikit_fem(law):
     np.testing.assert_allclose(data.vert_xpos[0] - g.vert, u, rtol=0, atol=1e-5 * abs(u).max())
 
 
-# --- closed forms ---------------------------------------------------------------------------------------------------------------
+# --- closed forms  ---
 
 
 def cantilever_tip(n, length=50e-3, height=10e-3, force=1e-3, E=1e6):
     """Tip deflection of a cantilever of square section with n cells across the height."""
     vert, elem = box([np.linspace(0, length, 5 * n + 1)] + [np.linspace(0, height, n + 1)] * 2)
-    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 0] == 0)), Material("linear", E, 0.0), SkinOptions(tolerance=1e-6, **TIGHT))
+    model = SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 0] == 0)),
+        Material("linear", E, 0.0),
+        SkinOptions(tolerance=1e-6, **TIGHT),
+    )
     data = SkinData(model)
     weight = nodal_areas(vert, faces_on(vert, boundary(elem), 0, length)) / height**2
     load = np.zeros((1, len(vert), 3))
@@ -205,7 +228,8 @@ def cantilever_tip(n, length=50e-3, height=10e-3, force=1e-3, E=1e6):
 
 
 def test_cantilever_converges_to_timoshenko():
-    """nu = 0, so that the clamp is the beam theory's; linear tetrahedra converge from the stiff side with the square of their size."""
+    """nu = 0, so that the clamp is the beam theory's; linear tetrahedra converge from the stiff side with the
+    square of their size."""
     length, height, force, E = 50e-3, 10e-3, 1e-3, 1e6
     inertia, shear = height**4 / 12, 5 / 6 * height**2 * E / 2
     exact = force * length**3 / (3 * E * inertia) + force * length / shear
@@ -220,12 +244,15 @@ def test_cantilever_converges_to_timoshenko():
 
 
 def test_bar_under_traction():
-    """Uniaxial traction: strain p / E along, -nu p / E across, at any point but near no clamp: the held nodes go where they belong."""
+    """Uniaxial traction: strain p / E along, -nu p / E across, at any point but near no clamp: the held nodes
+    go where they belong."""
     p, E, nu = 1e3, 1e6, 0.45
     vert, elem = box([np.linspace(0, 2e-2, 7), np.linspace(0, 1e-2, 4), np.linspace(0, 1e-2, 4)], jitter=0.2)
     corners = np.flatnonzero((vert[:, 0] == 0) & np.isin(vert[:, 1:], [0, 1e-2]).all(1))
     strain = np.array([p / E, -nu * p / E, -nu * p / E])
-    model = SkinModel(skin(vert, elem, corners), Material("linear", E, nu), SkinOptions(tolerance=1e-8, **TIGHT))
+    model = SkinModel(
+        skin(vert, elem, corners), Material("linear", E, nu), SkinOptions(tolerance=1e-8, **TIGHT)
+    )
     data = SkinData(model)
     place(data, corners, vert[corners] * (1 + strain))
     face, load = boundary(elem), np.zeros((1, len(vert), 3))
@@ -249,24 +276,32 @@ def sphere_errors(nu, subdivisions, layers):
     vert, elem, inner = shell(b, a, subdivisions, layers)
     radius = np.linalg.norm(vert, axis=1)
     exact = vert / radius[:, None] * lame_sphere(a, b, p, E, nu, radius)[:, None]
-    held = [np.linalg.norm(vert - b * axis, axis=1).argmin() for axis in np.eye(3)]  # they go where they belong: no other force
+    held = [
+        np.linalg.norm(vert - b * axis, axis=1).argmin() for axis in np.eye(3)
+    ]  # they go where they belong: no other force
     model = SkinModel(skin(vert, elem, held), Material("linear", E, nu), SkinOptions(tolerance=1e-5, **TIGHT))
     data = SkinData(model)
     place(data, held, (vert + exact)[held])
     edge = vert[inner[:, 1:]] - vert[inner[:, :1]]
     load = np.zeros((1, len(vert), 3))
-    np.add.at(load[0], inner.ravel(), np.repeat(-p * np.cross(edge[:, 0], edge[:, 1]) / 6, 3, axis=0))  # normals point into the cavity
+    np.add.at(
+        load[0], inner.ravel(), np.repeat(-p * np.cross(edge[:, 0], edge[:, 1]) / 6, 3, axis=0)
+    )  # normals point into the cavity
     data.set_external(load)
     step(model, data, NOTHING)
     assert data.converged.all()
     errors = []
     for r in (a, b):
         here = abs(radius - r) < 1e-9
-        errors.append(((data.vert_xpos[0] - vert)[here] * vert[here] / r).sum(1).mean() / lame_sphere(a, b, p, E, nu, r) - 1)
+        errors.append(
+            ((data.vert_xpos[0] - vert)[here] * vert[here] / r).sum(1).mean() / lame_sphere(a, b, p, E, nu, r)
+            - 1
+        )
     return np.abs(errors)
 
 
-# 2 % is what good codes accept; nearly incompressible, linear tetrahedra are a little too stiff still with six layers
+# 2 % is what good codes accept; nearly incompressible, linear tetrahedra are a little too stiff still with
+# six layers
 @pytest.mark.parametrize("nu, tolerance", [pytest.param(0.3, 0.02, marks=pytest.mark.slow), (0.45, 0.03)])
 def test_thick_sphere_under_pressure(nu, tolerance):
     coarse, fine = sphere_errors(nu, 2, 3), sphere_errors(nu, 3, 6)
@@ -275,9 +310,12 @@ def test_thick_sphere_under_pressure(nu, tolerance):
 
 
 @pytest.mark.parametrize("change, text", [
-    (lambda v, e: (v, np.concatenate([e[:1, [0, 2, 1, 3]], e[1:]])), "1 of 384 tetrahedra are inverted or degenerate .first: 0, volume -"),
-    (lambda v, e: (v * [1, 1, 0], e), "384 of 384 tetrahedra are inverted or degenerate .*repair the mesh or swap two nodes"),
-    (lambda v, e: (np.where(np.arange(len(v))[:, None] == 3, np.nan, v), e), "skin 'block' has 1 nodes that are NaN or infinite: repair"),
+    (lambda v, e: (v, np.concatenate([e[:1, [0, 2, 1, 3]], e[1:]])), "1 of 384 tetrahedra are inverted or "
+                                                                     "degenerate .first: 0, volume -"),
+    (lambda v, e: (v * [1, 1, 0], e), "384 of 384 tetrahedra are inverted or degenerate .*repair the mesh "
+                                      "or swap two nodes"),
+    (lambda v, e: (np.where(np.arange(len(v))[:, None] == 3, np.nan, v), e), "skin 'block' has 1 nodes that "
+                                                                             "are NaN or infinite: repair"),
 ])  # fmt: skip
 def test_bad_meshes(change, text):
     vert, elem = change(*box([np.linspace(0, 1e-2, 5)] * 3))
@@ -287,12 +325,16 @@ def test_bad_meshes(change, text):
 
 def test_nothing_fixed():
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3)
-    with pytest.raises(ValueError, match="skin 'block' has no fixed nodes: it would float away; fix those on core, nail and clamp"):
+    with pytest.raises(
+        ValueError,
+        match="skin 'block' has no fixed nodes: it would float away; fix those on core, nail and clamp",
+    ):
         SkinModel(skin(vert, elem, []))
 
 
 @pytest.mark.parametrize("force, text", [
-    (np.zeros((1, 5, 3)), r"external forces have shape \(1, 5, 3\): pass finite numbers of shape \(1, 125, 3\)"),
+    (np.zeros((1, 5, 3)), r"external forces have shape \(1, 5, 3\): pass finite numbers of shape \(1, 125, "
+                          r"3\)"),
     (np.full((1, 125, 3), np.nan), "pass finite numbers"),
 ])  # fmt: skip
 def test_bad_loads(force, text):

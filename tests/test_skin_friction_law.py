@@ -1,4 +1,5 @@
-"""Friction whose coefficient depends on pressure: slides at several loads, Hertz's contact, Coulomb's law bit by bit."""
+"""Friction whose coefficient depends on pressure: slides at several loads, Hertz's contact, Coulomb's law bit
+by bit."""
 
 import numpy as np
 import pytest
@@ -7,11 +8,16 @@ from test_skin_contact import pad, plane_at
 
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 
-MU, HEIGHT, AREA = 0.02, 4e-3, 1e-4  # little friction: a pad that is dragged leans, and pressure is not the same everywhere
+MU, HEIGHT, AREA = (
+    0.02,
+    4e-3,
+    1e-4,
+)  # little friction: a pad that is dragged leans, and pressure is not the same everywhere
 
 
 def slide(law, depth, nworld=1, exponents=None, **options):
-    """Forces (nworld, 2) [N], along x and normal, of a plane that is pressed in by `depth` and dragged until all slips; all positions."""
+    """Forces (nworld, 2) [N], along x and normal, of a plane that is pressed in by `depth` and dragged until
+    all slips; all positions."""
     model = pad(contact_law=law, **options)
     data, geoms = SkinData(model, nworld), GeomSet(["plane"], [()], friction=[MU], nworld=nworld)
     if exponents is not None:
@@ -29,7 +35,8 @@ def slide(law, depth, nworld=1, exponents=None, **options):
 
 @pytest.mark.parametrize("n", [0.3, 1.0, -0.4])
 def test_ratio_of_drag_to_load_follows_the_law(n):
-    """nu = 0: a bar under one pressure p, so T / N = mu (p / p0)^-n, at three loads a decade apart and more."""
+    """nu = 0: a bar under one pressure p, so T / N = mu (p / p0)^-n, at three loads a decade apart and
+    more."""
     p0 = 500.0
     law = ContactLaw(friction_exponent=n, friction_pressure=p0)
     ratios, loads = [], []
@@ -61,7 +68,8 @@ def test_exponent_zero_is_coulomb_bit_by_bit():
 
 
 def test_under_hertz_the_ratio_falls_with_the_cube_root():
-    """A sliding sphere: the integral of mu(p) p over Hertz's pressures is mu N (p_max / p0)^-n 3 / (3 - n), and p_max goes as N^(1/3)."""
+    """A sliding sphere: the integral of mu(p) p over Hertz's pressures is mu N (p_max / p0)^-n 3 / (3 - n),
+    and p_max goes as N^(1/3)."""
     R, E, nu, n, p0 = 10e-3, 1e6, 0.3, 0.6, 1e4
     radius = np.sqrt(R * 6e-5)
     grid = list(np.arange(0, 1.3, 1 / 4))
@@ -86,7 +94,9 @@ def test_under_hertz_the_ratio_falls_with_the_cube_root():
         ratio.append(drag / normal), load.append(normal)
     ratio, load = np.array(ratio), np.array(load)
     peak = (6 * load * (E / (1 - nu**2)) ** 2 / (np.pi**3 * R**2)) ** (1 / 3)
-    np.testing.assert_allclose(ratio, MU * (peak / p0) ** -n * 3 / (3 - n), rtol=0.06)  # 8 cells a radius: 2 %
+    np.testing.assert_allclose(
+        ratio, MU * (peak / p0) ** -n * 3 / (3 - n), rtol=0.06
+    )  # 8 cells a radius: 2 %
     assert np.polyfit(np.log(load), np.log(ratio), 1)[0] == pytest.approx(-n / 3, abs=0.03)
 
 

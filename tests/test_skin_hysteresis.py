@@ -1,4 +1,5 @@
-"""Friction elements beside the law: Prandtl and Ishlinskii's closed forms, radial return written down here, work, speed, replay."""
+"""Friction elements beside the law: Prandtl and Ishlinskii's closed forms, radial return written down here,
+work, speed, replay."""
 
 import copy
 
@@ -17,7 +18,8 @@ BRANCHES = ((0.6, 0.02), (0.3, 0.08))
 
 
 def clipped(path, limit):
-    """Prandtl's element: what is left of a path, from zero on, when it drags a friction of this strength along."""
+    """Prandtl's element: what is left of a path, from zero on, when it drags a friction of this strength
+    along."""
     out, slip = [], 0.0
     for value in path:
         slip = np.clip(slip, value - limit, value + limit)
@@ -27,7 +29,8 @@ def clipped(path, limit):
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 def test_shear_of_the_linear_law(element):
-    """tau = mu (gamma + sum of g play(gamma; sqrt(3) strain)): a von Mises strain e is a shear of sqrt(3) e."""
+    """tau = mu (gamma + sum of g play(gamma; sqrt(3) strain)): a von Mises strain e is a shear of sqrt(3)
+    e."""
     model = cube("linear", element, hysteresis=BRANCHES)
     data, mu = SkinData(model), model.material.mu
     path = np.array([0.01, 0.05, 0.3, 0.2, 0.28, -0.1, -0.3, 0.3, 0.0])
@@ -41,8 +44,9 @@ def test_shear_of_the_linear_law(element):
 
 
 def test_a_pulled_bar_with_free_sides():
-    """Linear law, traction t: modulus 9 K m / (3 K + m), m = mu (1 + g), until the von Mises strain is reached; then the friction's stress
-    3 g mu e lies beside the law's own and t = E strain + 2/3 (1 + nu) of it."""
+    """Linear law, traction t: modulus 9 K m / (3 K + m), m = mu (1 + g), until the von Mises strain is
+    reached; then the friction's stress 3 g mu e lies beside the law's own and t = E strain + 2/3 (1 + nu) of
+    it."""
     g, slips, nu = 0.8, 0.01, 0.3
     model = bar("linear", "linear", nu=nu, held=False, hysteresis=((g, slips),))
     vert = model.geometry.vert
@@ -53,7 +57,10 @@ def test_a_pulled_bar_with_free_sides():
     still = 3 * g * model.material.mu * slips
     lateral = (3 * bulk - 2 * stiff) / (2 * (3 * bulk + stiff))
     limit = young * 1.5 * slips / (1 + lateral)  # traction at which the friction slips
-    for traction, expected in ((0.5 * limit, 0.5 * limit / young), (3 * limit, (3 * limit - 2 / 3 * (1 + nu) * still) / E)):
+    for traction, expected in (
+        (0.5 * limit, 0.5 * limit / young),
+        (3 * limit, (3 * limit - 2 / 3 * (1 + nu) * still) / E),
+    ):
         data = SkinData(model)
         load = np.zeros((1, model.nvert, 3))
         load[0, :, 0] = traction * nodal_areas(vert, face)
@@ -62,7 +69,9 @@ def test_a_pulled_bar_with_free_sides():
         assert data.converged[0]
         # the cube of elements at the free end: the held one may not narrow
         cells = (vert[model._elem][:, :, 0] > 0.74 * LENGTH).all(1)
-        edges = np.moveaxis(data.vert_xpos[0][model._elem[cells][:, 1:]] - data.vert_xpos[0][model._elem[cells][:, :1]], 1, 2)
+        edges = np.moveaxis(
+            data.vert_xpos[0][model._elem[cells][:, 1:]] - data.vert_xpos[0][model._elem[cells][:, :1]], 1, 2
+        )
         strain = (edges @ model.elasticity._inverse_edges[cells])[:, 0, 0].mean() - 1
         assert strain == pytest.approx(expected, rel=0.01)
 
@@ -123,7 +132,9 @@ def test_large_strains_and_a_turn(law, element):
     if law != "linear":
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         turn *= np.sign(np.linalg.det(turn))
-        np.testing.assert_allclose(deform(model, data, turn @ F, None), turn @ got, atol=1e-7 * abs(got).max())
+        np.testing.assert_allclose(
+            deform(model, data, turn @ F, None), turn @ got, atol=1e-7 * abs(got).max()
+        )
 
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
@@ -136,7 +147,9 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     view(data.x)[:, 0] = rest @ (np.eye(3) + 0.2 * rng.standard_normal((3, 3))).T
     memory.begin(None)
     memory.commit(data.x, np.array([True]))
-    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.03 * rng.standard_normal((3, 3))).T + 1e-4 * rng.standard_normal(rest.shape)
+    view(data.x)[:, 0] = rest @ (
+        np.eye(3) + 0.03 * rng.standard_normal((3, 3))
+    ).T + 1e-4 * rng.standard_normal(rest.shape)
     x, p = view(data.x).copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
 
     def force(shift):
@@ -161,7 +174,8 @@ def test_the_tangent_is_the_forces_derivative(law, element):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_loops_do_not_know_speed_and_take_work(law):
-    """The same loop ten times as fast gives the same stresses; every closed cycle takes work, a loop of shear 4 g mu y (c - y)."""
+    """The same loop ten times as fast gives the same stresses; every closed cycle takes work, a loop of shear
+    4 g mu y (c - y)."""
     rng = np.random.default_rng(5)
     model = cube(law, "linear", hysteresis=BRANCHES)
     a, b = 0.12 * rng.standard_normal((2, 3, 3))
@@ -184,7 +198,9 @@ def test_the_loop_of_shear_has_its_area():
     g, e = BRANCHES[0]
     model = cube("linear", "linear", hysteresis=(BRANCHES[0],))
     data, mu = SkinData(model), model.material.mu
-    cycle = 0.2 * np.concatenate([np.linspace(0, 1, 21), np.linspace(1, -1, 81)[1:], np.linspace(-1, 1, 81)[1:]])
+    cycle = 0.2 * np.concatenate(
+        [np.linspace(0, 1, 21), np.linspace(1, -1, 81)[1:], np.linspace(-1, 1, 81)[1:]]
+    )
     stress = []
     for gamma in cycle:
         F = np.eye(3)
@@ -193,7 +209,9 @@ def test_the_loop_of_shear_has_its_area():
     gamma, stress = cycle[20:], np.array(stress)[20:]
     area = np.sum((stress[1:] + stress[:-1]) / 2 * np.diff(gamma))
     y = 3**0.5 * e
-    assert area == pytest.approx(4 * g * mu * y * (0.2 - y), rel=0.01)  # corners of the loop fall between the steps
+    assert area == pytest.approx(
+        4 * g * mu * y * (0.2 - y), rel=0.01
+    )  # corners of the loop fall between the steps
 
 
 def test_one_step_is_many_on_a_straight_way():
@@ -227,11 +245,17 @@ def test_a_step_that_fails_slips_nowhere():
     data.memory.commit(data.x, np.array([True, False]))
     np.testing.assert_array_equal(data.memory.friction.slip, before)
     data.memory.commit(data.x, np.array([True, True]))
-    assert abs(data.memory.friction.slip[:, :, 0]).max() < 1e-12 < 1e-3 < abs(data.memory.friction.slip[:, :, 1]).max()
+    assert (
+        abs(data.memory.friction.slip[:, :, 0]).max()
+        < 1e-12
+        < 1e-3
+        < abs(data.memory.friction.slip[:, :, 1]).max()
+    )
 
 
 def test_slip_is_in_the_plugins_state():
-    """Pressed and drawn back in mj_step: less force on the way out, and a copy of mjData replays it bit by bit."""
+    """Pressed and drawn back in mj_step: less force on the way out, and a copy of mjData replays it bit by
+    bit."""
     import mujoco
 
     import biotac_mj
@@ -267,9 +291,13 @@ def test_stiffening_alone_has_no_state():
     from biotac_mj.geometry import load_skin
 
     def config(**material):
-        return SimpleNamespace(material={"element": "linear", **material}, options={}, liquid=None, device="cpu")
+        return SimpleNamespace(
+            material={"element": "linear", **material}, options={}, liquid=None, device="cpu"
+        )
 
-    plain, stiff = (FemStepper(config(**material), load_skin("coarse"), []) for material in ({}, {"stiffening": 0.4}))
+    plain, stiff = (
+        FemStepper(config(**material), load_skin("coarse"), []) for material in ({}, {"stiffening": 0.4})
+    )
     assert plain.nstate == stiff.nstate
     state = np.zeros(stiff.nstate)
     stiff.reset(state)
@@ -284,7 +312,10 @@ def test_what_cannot_be_is_refused():
     ):
         with pytest.raises(ValueError, match=text):
             Material(hysteresis=hysteresis)
-    assert Material(hysteresis=[[0.1, 2]]) == Material(hysteresis=((0.1, 2.0),)) and Material(hysteresis=((0.1, 2.0),)).remembers
+    assert (
+        Material(hysteresis=[[0.1, 2]]) == Material(hysteresis=((0.1, 2.0),))
+        and Material(hysteresis=((0.1, 2.0),)).remembers
+    )
     model = cube("corotational", "linear", hysteresis=BRANCHES)
     with pytest.raises(ValueError, match="skin with hysteresis is solved on the CPU's full tier only"):
         SkinData(model, resident=True)

@@ -1,4 +1,5 @@
-"""Remembered launches: the present contents of the same arrays, other arguments, and no more of them than a few skins'."""
+"""Remembered launches: the present contents of the same arrays, other arguments, and no more of them than a
+few skins'."""
 
 import numpy as np
 import warp as wp

@@ -17,7 +17,11 @@ def sphere(law="neo_hookean", E=2.8e5, nu=0.45, bulk=2.2e9, filled=True, core=No
     """A rubber ball of 10 mm radius with a cavity of 8 mm, glued to the ground by its lower pole."""
     vert, elem, inner = shell(10e-3, 8e-3, subdivisions=2, layers=2)
     geometry = skin(vert, elem, np.flatnonzero(vert[:, 2] < -8.5e-3), inner_face=inner, core=core)
-    return SkinModel(geometry, Material(law, E, nu), SkinOptions(liquid=filled, bulk_modulus=bulk, tolerance=tolerance, **TIGHT))
+    return SkinModel(
+        geometry,
+        Material(law, E, nu),
+        SkinOptions(liquid=filled, bulk_modulus=bulk, tolerance=tolerance, **TIGHT),
+    )
 
 
 def press(model, depths):
@@ -50,12 +54,22 @@ def test_gradient_of_the_volume():
     p = rng.standard_normal(x.shape)
     corner = wp.zeros((3 * len(model.inner.face), 1), dtype=vec3)
     xs = wp.array(x[:, None], dtype=vec3, ndim=2)
-    wp.launch(liquid.volume_gradient, dim=(len(model.inner.face), 1), inputs=[model.inner.face, xs], outputs=[corner], device="cpu")
+    wp.launch(
+        liquid.volume_gradient,
+        dim=(len(model.inner.face), 1),
+        inputs=[model.inner.face, xs],
+        outputs=[corner],
+        device="cpu",
+    )
     gradient = np.zeros_like(x)
     np.add.at(gradient, model.geometry.inner_face.ravel(), corner.numpy()[:, 0])
     near, far = [cavity(model, x + h * p) - cavity(model, x - h * p) for h in (1e-6, 2e-6)]
-    assert np.vdot(gradient, p) == pytest.approx((8 * near - far) / 12e-6, rel=1e-8)  # exact: the volume is cubic
-    assert abs(gradient.sum(0)).max() < 1e-12 * abs(gradient).sum()  # a closed surface has no area vector: the pressure moves nothing
+    assert np.vdot(gradient, p) == pytest.approx(
+        (8 * near - far) / 12e-6, rel=1e-8
+    )  # exact: the volume is cubic
+    assert (
+        abs(gradient.sum(0)).max() < 1e-12 * abs(gradient).sum()
+    )  # a closed surface has no area vector: the pressure moves nothing
 
 
 def test_volume_is_conserved_and_gives_the_pressure():
@@ -73,7 +87,9 @@ def test_volume_is_conserved_and_gives_the_pressure():
     assert cavity(model, empty.vert_xpos[0]) / v0 - 1 < -0.02
     assert data.wrench[0, 0, 2] > 1.05 * empty.wrench[0, 0, 2]
     equator = abs(model.geometry.vert[:, 2]) < 3e-3
-    bulge = np.linalg.norm(data.vert_xpos[0, equator, :2], axis=1) - np.linalg.norm(model.geometry.vert[equator, :2], axis=1)
+    bulge = np.linalg.norm(data.vert_xpos[0, equator, :2], axis=1) - np.linalg.norm(
+        model.geometry.vert[equator, :2], axis=1
+    )
     assert bulge.mean() > 1e-4  # what is pressed away comes out at the side
 
 
@@ -94,7 +110,11 @@ def test_filled_sphere_under_outer_pressure(bulk):
     vert, elem, inner = shell(b, a, subdivisions=3, layers=5)
     held = [np.linalg.norm(vert - b * axis, axis=1).argmin() for axis in np.eye(3)]
     geometry = skin(vert, elem, held, inner_face=inner)
-    model = SkinModel(geometry, Material("linear", E, nu), SkinOptions(liquid=True, bulk_modulus=bulk, tolerance=1e-5, **TIGHT))
+    model = SkinModel(
+        geometry,
+        Material("linear", E, nu),
+        SkinOptions(liquid=True, bulk_modulus=bulk, tolerance=1e-5, **TIGHT),
+    )
     data = SkinData(model)
     place(data, held, vert[held] * (1 + displacement(b) / b))
     surface = boundary(elem)
@@ -108,6 +128,9 @@ def test_filled_sphere_under_outer_pressure(bulk):
 
 def test_core_that_does_not_fit():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=9e-3)
-    text = r"the core \(\d+ mm\^3\) does not fit into the cavity \(\d+ mm\^3\): check the meshes' frames and units"
+    text = (
+        r"the core \(\d+ mm\^3\) does not fit into the cavity \(\d+ mm\^3\): check the meshes' frames "
+        r"and units"
+    )
     with pytest.raises(ValueError, match=text):
         sphere(core=(ball.vertices, ball.faces))

@@ -6,7 +6,17 @@ import warp as wp
 from blocks import box, place, skin
 from scipy.optimize import brentq
 
-from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, elasticity, material, step
+from biotac_mj.skin import (
+    PRESETS,
+    GeomSet,
+    Material,
+    SkinData,
+    SkinModel,
+    SkinOptions,
+    elasticity,
+    material,
+    step,
+)
 from biotac_mj.skin.material import LAWS
 from biotac_mj.skin.types import mat33, real, vec3
 
@@ -14,7 +24,8 @@ MU, LAM = 1.3, 2.1
 
 
 class Law:
-    """Energy, stress and its derivative for many deformation gradients at once: unit tetrahedra whose edges are the columns of F."""
+    """Energy, stress and its derivative for many deformation gradients at once: unit tetrahedra whose edges
+    are the columns of F."""
 
     def __init__(self, name):
         self.law = LAWS[name]
@@ -24,14 +35,21 @@ class Law:
         x = np.zeros((4 * n, 3))
         x.reshape(n, 4, 3)[:, 1:] = np.swapaxes(F, 1, 2)
         elem = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
-        constants = [self.law, wp.array([MU], dtype=real), wp.array([LAM], dtype=real), wp.array(elem, dtype=wp.vec4i)]
+        constants = [
+            self.law,
+            wp.array([MU], dtype=real),
+            wp.array([LAM], dtype=real),
+            wp.array(elem, dtype=wp.vec4i),
+        ]
         constants += [wp.array(np.tile(np.eye(3), (n, 1, 1)), dtype=mat33), wp.array(np.ones(n), dtype=real)]
         return constants, wp.array(x[:, None], dtype=vec3, ndim=2)
 
     def energy(self, F):
         constants, x = self._arrays(F)
         out = wp.zeros((len(F), 1), dtype=real)
-        wp.launch(elasticity.elastic_energy, dim=out.shape, inputs=[*constants, x], outputs=[out], device="cpu")
+        wp.launch(
+            elasticity.elastic_energy, dim=out.shape, inputs=[*constants, x], outputs=[out], device="cpu"
+        )
         return out.numpy()[:, 0]
 
     def stress(self, F, dF=None):
@@ -39,11 +57,23 @@ class Law:
         n = len(F)
         rotation, jacobian = wp.zeros((n, 1), dtype=mat33), wp.zeros((n, 1), dtype=real)
         corner = wp.zeros((4 * n, 1), dtype=vec3)
-        wp.launch(elasticity.elastic_force, dim=(n, 1), inputs=[*constants, x], outputs=[rotation, corner, jacobian], device="cpu")
+        wp.launch(
+            elasticity.elastic_force,
+            dim=(n, 1),
+            inputs=[*constants, x],
+            outputs=[rotation, corner, jacobian],
+            device="cpu",
+        )
         sign = -1
         if dF is not None:
             _, p = self._arrays(dF)
-            wp.launch(elasticity.hessian_product, dim=(n, 1), inputs=[*constants, x, rotation, p], outputs=[corner], device="cpu")
+            wp.launch(
+                elasticity.hessian_product,
+                dim=(n, 1),
+                inputs=[*constants, x, rotation, p],
+                outputs=[corner],
+                device="cpu",
+            )
             sign = 1
         return sign * np.swapaxes(corner.numpy()[:, 0].reshape(n, 4, 3)[:, 1:], 1, 2)
 
@@ -57,13 +87,15 @@ def gradients(law, rng, n=40):
     upright = strong[(det > 0.3) & (singular[:, 2] > 0.2)][:n]
     if law == "neo_hookean":
         return np.concatenate([mild, upright])
-    # the corotational law's rotation is not unique where the two smallest singular values of an inverted F are equal
+    # the corotational law's rotation is not unique where the two smallest singular values of an inverted F
+    # are equal
     inverted = strong[(det < -0.2) & (singular[:, 1] - singular[:, 2] > 0.2)][:n]
     return np.concatenate([mild, upright, inverted])
 
 
 def central(f, h):
-    """Derivative at zero of f by central differences of fourth order: with h = 1e-3 truncation and rounding are both about 1e-11."""
+    """Derivative at zero of f by central differences of fourth order: with h = 1e-3 truncation and rounding
+    are both about 1e-11."""
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
 
@@ -74,7 +106,9 @@ def test_stress_is_the_energys_gradient(law):
     dF = rng.standard_normal(F.shape)
     expected = central(lambda s: Law(law).energy(F + s * dF), 1e-3)
     work = np.einsum("nij,nij->n", Law(law).stress(F), dF)
-    np.testing.assert_allclose(work, expected, rtol=1e-7, atol=1e-7 * abs(expected).max())  # fp64, see `central`
+    np.testing.assert_allclose(
+        work, expected, rtol=1e-7, atol=1e-7 * abs(expected).max()
+    )  # fp64, see `central`
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -117,11 +151,14 @@ def test_all_laws_agree_at_small_strain():
     for law in LAWS:
         lame = LAM - 2 / 3 * MU if law == "neo_hookean" else LAM
         # what differs is of second order: some ten products of two strains of up to 3e-6
-        np.testing.assert_allclose(Law(law).stress(np.eye(3) + strain), lame * trace + 2 * MU * strain, atol=1e-10)
+        np.testing.assert_allclose(
+            Law(law).stress(np.eye(3) + strain), lame * trace + 2 * MU * strain, atol=1e-10
+        )
 
 
 def neo_hookean_cauchy(stretch, mu, kappa):
-    """Principal Cauchy stresses: Holzapfel, Nonlinear Solid Mechanics, eqs 6.84-6.86 with this volumetric energy."""
+    """Principal Cauchy stresses: Holzapfel, Nonlinear Solid Mechanics, eqs 6.84-6.86 with this volumetric
+    energy."""
     J = np.prod(stretch)
     return mu * J ** (-5 / 3) * (stretch**2 - np.mean(stretch**2)) + kappa * (J - 1)
 
@@ -129,7 +166,8 @@ def neo_hookean_cauchy(stretch, mu, kappa):
 @pytest.mark.parametrize("held", [[0], [0, 1]], ids=["uniaxial", "equibiaxial"])
 @pytest.mark.parametrize("stretch", [0.6, 1.8])
 def test_neo_hookean_block_at_large_strain(held, stretch):
-    """Drawn by the faces along the held axes, the rest finds the stretch that is free of stress: a scalar root."""
+    """Drawn by the faces along the held axes, the rest finds the stretch that is free of stress: a scalar
+    root."""
     rubber = Material("neo_hookean", 1.0, 0.4)
     free = [i for i in range(3) if i not in held]
 
@@ -137,7 +175,9 @@ def test_neo_hookean_block_at_large_strain(held, stretch):
         def stretches(other):
             return np.array([stretch if i in held else other for i in range(3)])
 
-        other = brentq(lambda s: neo_hookean_cauchy(stretches(s), rubber.mu, rubber.bulk)[free[0]], 0.3, 3, xtol=1e-14)
+        other = brentq(
+            lambda s: neo_hookean_cauchy(stretches(s), rubber.mu, rubber.bulk)[free[0]], 0.3, 3, xtol=1e-14
+        )
         return stretches(other), neo_hookean_cauchy(stretches(other), rubber.mu, rubber.bulk)
 
     vert, elem = box([np.linspace(0, 1, 5)] * 3, jitter=0.2)
@@ -149,12 +189,14 @@ def test_neo_hookean_block_at_large_strain(held, stretch):
         place(data, fixed, vert[fixed] * stretches)
         step(data.model, data, nothing)
         assert data.converged.all()
-    # without load the solver's tolerance is absolute, 1e-10 of the square root of the energy: displacements to about 1e-9
+    # without load the solver's tolerance is absolute, 1e-10 of the square root of the energy: displacements
+    # to about 1e-9
     np.testing.assert_allclose(data.vert_xpos[0], vert * stretches, atol=1e-8)
     sigma, mises = data.stress()
     np.testing.assert_allclose(sigma[0], np.broadcast_to(np.diag(cauchy), sigma[0].shape), atol=1e-6)
     np.testing.assert_allclose(mises, abs(cauchy[held[0]] - cauchy[free[0]]), atol=1e-6)
-    # the forces that hold the faces do the first Piola-Kirchhoff stress' virtual work: sum f X^T = P V, in a unit cube
+    # the forces that hold the faces do the first Piola-Kirchhoff stress' virtual work: sum f X^T = P V, in a
+    # unit cube
     nominal = -np.einsum("ni,nj->ij", data.force.numpy()[fixed, 0], vert[fixed])
     np.testing.assert_allclose(nominal, np.diag(np.prod(stretches) * cauchy / stretches), atol=1e-6)
 
@@ -183,5 +225,8 @@ def test_bad_constants(values, text):
 def test_presets_by_name():
     assert material("paper") is PRESETS["paper"]
     assert not material("paper").liquid
-    with pytest.raises(ValueError, match="unknown material 'jelly': choose one of default, paper, rubber, .*or pass a Material"):
+    with pytest.raises(
+        ValueError,
+        match="unknown material 'jelly': choose one of default, paper, rubber, .*or pass a Material",
+    ):
         material("jelly")

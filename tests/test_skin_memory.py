@@ -1,4 +1,5 @@
-"""Relaxation and Mullins softening inside the elements, against closed forms of bars and of prescribed homogeneous deformations."""
+"""Relaxation and Mullins softening inside the elements, against closed forms of bars and of prescribed
+homogeneous deformations."""
 
 import copy
 
@@ -26,7 +27,9 @@ def test_force_of_a_stretched_bar_relaxes_as_the_series_says(law, element):
     data, elastic = SkinData(model), SkinModel(model.geometry, Material(law, E, 0.0), model.options)
     stretch = 1.2
     long_term = pull(elastic, SkinData(elastic), stretch, None)
-    exact = {"linear": E * 0.2, "corotational": E * 0.2, "svk": E * stretch * (stretch**2 - 1) / 2}[law] * AREA
+    exact = {"linear": E * 0.2, "corotational": E * 0.2, "svk": E * stretch * (stretch**2 - 1) / 2}[
+        law
+    ] * AREA
     assert long_term == pytest.approx(exact, rel=1e-6)
     time = 0.0
     for dt in (NOW, 0.05, 0.4, 2.0, 0.1, 30.0):
@@ -71,7 +74,8 @@ def test_a_loaded_bar_creeps():
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
 def test_two_jumps_and_a_turn(law, element):
-    """Large strains: P = F (S + sum of g (jumps of what remembers) exp(-their age / tau)), turned with the body."""
+    """Large strains: P = F (S + sum of g (jumps of what remembers) exp(-their age / tau)), turned with the
+    body."""
     rng = np.random.default_rng(2)
     first, second = (np.eye(3) + 0.15 * rng.standard_normal((3, 3)) for _ in range(2))
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
@@ -85,7 +89,11 @@ def test_two_jumps_and_a_turn(law, element):
         if law != "neo_hookean":
             return piola(F)
         C = F.T @ F
-        return elastic.material.mu * np.linalg.det(F) ** (-2 / 3) * (np.eye(3) - np.trace(C) / 3 * np.linalg.inv(C))
+        return (
+            elastic.material.mu
+            * np.linalg.det(F) ** (-2 / 3)
+            * (np.eye(3) - np.trace(C) / 3 * np.linalg.inv(C))
+        )
 
     data = SkinData(model)
     deform(model, data, first, NOW)
@@ -101,7 +109,9 @@ def test_two_jumps_and_a_turn(law, element):
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("beside", [{}, {"stiffening": 0.8, "hysteresis": ((0.7, 0.05), (0.2, 10.0))}, {"stiffening": -0.6}])
+@pytest.mark.parametrize(
+    "beside", [{}, {"stiffening": 0.8, "hysteresis": ((0.7, 0.05), (0.2, 10.0))}, {"stiffening": -0.6}]
+)
 def test_the_tangent_is_the_forces_derivative(law, element, beside):
     model = cube(law, element, prony=((G, TAU), (0.1, 3.0)), mullins=(1.6, 2e3, 0.1), **beside)
     data, rng = SkinData(model), np.random.default_rng(4)
@@ -109,7 +119,9 @@ def test_the_tangent_is_the_forces_derivative(law, element, beside):
     view(data.x)[:, 0] = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T
     memory.begin(0.3)
     memory.commit(data.x, np.array([True]))  # a past, and a largest energy to be below of
-    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
+    view(data.x)[:, 0] = rest @ (
+        np.eye(3) + 0.1 * rng.standard_normal((3, 3))
+    ).T + 2e-4 * rng.standard_normal(rest.shape)
     memory.begin(0.2)
     x, p = view(data.x).copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
 
@@ -133,9 +145,14 @@ def test_the_tangent_is_the_forces_derivative(law, element, beside):
 
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean", "svk"])
 def test_no_energy_comes_out_of_a_cycle(law):
-    """Work of closed cycles of the deformation: zero for the elastic law, positive with memory, at any speed."""
+    """Work of closed cycles of the deformation: zero for the elastic law, positive with memory, at any
+    speed."""
     rng = np.random.default_rng(5)
-    kinds = {"elastic": {}, "prony": {"prony": ((G, TAU), (0.3, 0.05))}, "mullins": {"mullins": (1.5, 3e3, 0.0)}}
+    kinds = {
+        "elastic": {},
+        "prony": {"prony": ((G, TAU), (0.3, 0.05))},
+        "mullins": {"mullins": (1.5, 3e3, 0.0)},
+    }
     for name, memory in kinds.items():
         model = cube(law, "linear", **memory)
         for dt in (0.002, 0.05, 1.0):
@@ -151,7 +168,8 @@ def test_no_energy_comes_out_of_a_cycle(law):
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 def test_softening_of_a_cycle(element):
-    """A bar of svk without lateral strain: W = E (s^2 - 1)^2 / 8, P = eta E s (s^2 - 1) / 2 below the largest stretch, eta = 1 beyond."""
+    """A bar of svk without lateral strain: W = E (s^2 - 1)^2 / 8, P = eta E s (s^2 - 1) / 2 below the largest
+    stretch, eta = 1 beyond."""
     r, m, beta = 1.8, 5e3, 0.2
     model = bar("svk", element, mullins=(r, m, beta))
     data = SkinData(model)
@@ -167,7 +185,8 @@ def test_softening_of_a_cycle(element):
 
 
 def test_both_together():
-    """The softened stress relaxes: after a jump, a hold and a jump back P = s (eta S2 + g (S1 e1 + (eta S2 - S1) e2))."""
+    """The softened stress relaxes: after a jump, a hold and a jump back P = s (eta S2 + g (S1 e1 + (eta S2 -
+    S1) e2))."""
     r, m = 2.0, 1e4
     model = bar("svk", prony=((G, TAU),), mullins=(r, m, 0.0))
     data = SkinData(model)
@@ -182,7 +201,15 @@ def test_both_together():
 
 
 def test_memory_is_saved_replayed_and_forgotten():
-    model = bar("corotational", "quadratic", nu=0.3, prony=SERIES, mullins=(2.0, 1e4, 0.1), hysteresis=((0.5, 0.03),), stiffening=0.4)
+    model = bar(
+        "corotational",
+        "quadratic",
+        nu=0.3,
+        prony=SERIES,
+        mullins=(2.0, 1e4, 0.1),
+        hysteresis=((0.5, 0.03),),
+        stiffening=0.4,
+    )
     data = SkinData(model)
     path = [(1.2, 0.1), (1.25, 0.3), (1.1, 0.2)]
     once = [pull(model, data, *p) for p in path]
@@ -216,15 +243,23 @@ def test_worlds_remember_each_their_own():
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
 def test_stress_of_elements_is_that_on_the_surface(law, element):
-    """Cauchy stress P F^T / J of homogeneous steps, P from the forces on the cube's surface, with all that a material can have."""
-    more = {"prony": ((G, TAU), (0.2, 0.1)), "mullins": (2.0, 2e3, 0.1), "hysteresis": ((0.5, 0.03),), "stiffening": 0.5}
+    """Cauchy stress P F^T / J of homogeneous steps, P from the forces on the cube's surface, with all that a
+    material can have."""
+    more = {
+        "prony": ((G, TAU), (0.2, 0.1)),
+        "mullins": (2.0, 2e3, 0.1),
+        "hysteresis": ((0.5, 0.03),),
+        "stiffening": 0.5,
+    }
     model, rng = cube(law, element, modulus=np.full(48, 1.7), **more), np.random.default_rng(6)
     data = SkinData(model)
     for dt in (0.1, 0.4, 0.05):
         F = np.eye(3) + 0.12 * rng.standard_normal((3, 3))
         expected = deform(model, data, F, dt) @ F.T / np.linalg.det(F)
         cauchy, mises = data.stress()
-        np.testing.assert_allclose(cauchy[0], np.broadcast_to(expected, cauchy[0].shape), atol=1e-6 * abs(expected).max())
+        np.testing.assert_allclose(
+            cauchy[0], np.broadcast_to(expected, cauchy[0].shape), atol=1e-6 * abs(expected).max()
+        )
         deviator = expected - np.trace(expected) / 3 * np.eye(3)
         np.testing.assert_allclose(mises[0], 1.5**0.5 * np.linalg.norm(deviator), rtol=1e-5)
 
@@ -233,7 +268,11 @@ def test_filled_skin_rests():
     """Rest on the filling is relaxed and virgin: nothing moves when time passes."""
     vert, elem, inner = shell(10e-3, 7e-3, subdivisions=1, layers=2)
     material = Material("corotational", E, 0.3, liquid=True, prony=((G, TAU),), mullins=(2.0, 1e3, 0.0))
-    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 0] > 5e-3), inner_face=inner), material, SkinOptions(rest_pressure=2e4))
+    model = SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 0] > 5e-3), inner_face=inner),
+        material,
+        SkinOptions(rest_pressure=2e4),
+    )
     data = SkinData(model)
     at_rest = data.vert_xpos.copy()
     for dt in (1e-3, 1.0):
@@ -243,7 +282,8 @@ def test_filled_skin_rests():
 
 
 def test_memory_is_in_the_plugins_state():
-    """Pressed and held, the force relaxes in mj_step; a copy of mjData replays it bit by bit, and a reset forgets."""
+    """Pressed and held, the force relaxes in mj_step; a copy of mjData replays it bit by bit, and a reset
+    forgets."""
     import mujoco
 
     import biotac_mj
@@ -262,7 +302,8 @@ def test_memory_is_in_the_plugins_state():
         data.mocap_pos[0, 2] -= 2e-4 * (k < 3)
         mujoco.mj_step(model, data)
         force.append(abs(handle.read(data, "contact_force")[1]))
-    # held since the third step; its overstress of about 0.5 (1 - exp(-0.6)) / 0.6 falls by exp(-0.2) a step, the rest stays
+    # held since the third step; its overstress of about 0.5 (1 - exp(-0.6)) / 0.6 falls by exp(-0.2) a step,
+    # the rest stays
     over = np.diff(force[2:])
     assert (over < 0).all() and force[2] > 1.2 * force[7]
     np.testing.assert_allclose(over[1:] / over[:-1], np.exp(-0.2), rtol=0.05)
@@ -279,12 +320,18 @@ def test_memory_is_in_the_plugins_state():
 
 def test_what_cannot_be_is_refused():
     nothing = "energy would come"
-    for prony, text in ((((0.1,),), "pass \\(\\(g, tau\\), ...\\)"), (((-0.1, 1.0),), nothing), (((0.1, 0.0),), nothing)):
+    for prony, text in (
+        (((0.1,),), "pass \\(\\(g, tau\\), ...\\)"),
+        (((-0.1, 1.0),), nothing),
+        (((0.1, 0.0),), nothing),
+    ):
         with pytest.raises(ValueError, match=text):
             Material(prony=prony)
     with pytest.raises(ValueError, match="r must be above 1"):
         Material(mullins=(0.9, 1.0, 0.0))
-    assert Material(prony=[[0.1, 2]], mullins=[2, 1e3, 0]) == Material(prony=((0.1, 2.0),), mullins=(2.0, 1e3, 0.0))
+    assert Material(prony=[[0.1, 2]], mullins=[2, 1e3, 0]) == Material(
+        prony=((0.1, 2.0),), mullins=(2.0, 1e3, 0.0)
+    )
     model = bar(prony=SERIES)
     for dt in (None, 0.0, np.nan):
         with pytest.raises(ValueError, match="relaxes in time: pass the time step"):

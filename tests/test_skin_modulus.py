@@ -22,7 +22,8 @@ def halves(p):
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 def test_two_moduli_in_series(element):
-    """nu = 0: k = 1 / (L1 / (E1 A) + L2 / (E2 A)), and in large strain of svk the stretches that bear the same force."""
+    """nu = 0: k = 1 / (L1 / (E1 A) + L2 / (E2 A)), and in large strain of svk the stretches that bear the
+    same force."""
     model = bar("linear", element, modulus=halves)
     force = pull(model, SkinData(model), 1.3, None)
     assert force == pytest.approx(0.3 * E * AREA * 2 / (1 + 1 / 3), rel=1e-6)
@@ -43,15 +44,28 @@ def test_two_moduli_in_series(element):
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("law", LAWS)
 def test_one_factor_for_all_is_another_modulus(law, element):
-    """One: the same bits. Two: the stress of twice E, with memory, softening (in energy), friction and stiffening in place."""
+    """One: the same bits. Two: the stress of twice E, with memory, softening (in energy), friction and
+    stiffening in place."""
     F = np.eye(3) + 0.1 * np.random.default_rng(1).standard_normal((3, 3))
     plain, one = cube(law, element), cube(law, element, modulus=lambda p: np.ones(len(p)))
-    np.testing.assert_array_equal(deform(one, SkinData(one), F, None), deform(plain, SkinData(plain), F, None))
-    more = {"prony": ((0.3, 0.5),), "mullins": (2.0, 2e3, 0.2), "hysteresis": ((0.5, 0.03),), "stiffening": 0.6}
+    np.testing.assert_array_equal(
+        deform(one, SkinData(one), F, None), deform(plain, SkinData(plain), F, None)
+    )
+    more = {
+        "prony": ((0.3, 0.5),),
+        "mullins": (2.0, 2e3, 0.2),
+        "hysteresis": ((0.5, 0.03),),
+        "stiffening": 0.6,
+    }
     stress = []
-    for model in (cube(law, element, modulus=np.full(48, 2.0), **more), cube(law, element, young=2 * E, **more)):
+    for model in (
+        cube(law, element, modulus=np.full(48, 2.0), **more),
+        cube(law, element, young=2 * E, **more),
+    ):
         data = SkinData(model)
-        stress.append([deform(model, data, np.eye(3) + share * (F - np.eye(3)), 0.1) for share in (1.0, 0.4, 0.7)])
+        stress.append(
+            [deform(model, data, np.eye(3) + share * (F - np.eye(3)), 0.1) for share in (1.0, 0.4, 0.7)]
+        )
     np.testing.assert_allclose(stress[0], stress[1], rtol=1e-10, atol=1e-10 * np.abs(stress).max())
 
 
@@ -65,7 +79,9 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     p = 1e-4 * rng.standard_normal(rest.shape)
 
     def force(h):
-        model.elasticity.force(data.elastic, data.mu, data.lam, wp.array((x + h * p)[:, None], dtype=vec3, ndim=2), data.force)
+        model.elasticity.force(
+            data.elastic, data.mu, data.lam, wp.array((x + h * p)[:, None], dtype=vec3, ndim=2), data.force
+        )
         return data.force.numpy()[:, 0].copy()
 
     h = 1e-3
@@ -79,13 +95,17 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     model.elasticity.force(data.elastic, data.mu, data.lam, force_at_rest, data.force)
     model.elasticity.product(data.elastic, data.mu, data.lam, force_at_rest, along, data.product)
     K = model.elasticity.rest_stiffness(model.material.mu, model.material.lame)
-    np.testing.assert_allclose(view(data.product)[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max())
+    np.testing.assert_allclose(
+        view(data.product)[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max()
+    )
 
 
 def slab(**kw):
     vert, elem = box([np.linspace(0, 1.2e-2, 7), np.linspace(0, 4e-3, 3), np.linspace(0, 6e-3, 4)])
     options = SkinOptions(element=kw.pop("element", "quadratic"), liquid=False, tolerance=1e-5)
-    return SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)), Material("corotational", E, 0.4), options, **kw)
+    return SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)), Material("corotational", E, 0.4), options, **kw
+    )
 
 
 def pressed(model, x):
@@ -101,7 +121,8 @@ def pressed(model, x):
 
 
 def test_a_ball_feels_the_modulus_below_it():
-    """A modulus that rises along x by 1/cm: the ball feels that of its place, as the reduced form says, in as many iterations."""
+    """A modulus that rises along x by 1/cm: the ball feels that of its place, as the reduced form says, in as
+    many iterations."""
     field = lambda p: 1 + 100 * (p[:, 0] - 6e-3)  # noqa: E731
     even, uneven = slab(), slab(modulus=field)
     for x in (3e-3, 6e-3, 9e-3):
@@ -123,17 +144,28 @@ def test_elements_of_a_ten_node_geometry_keep_their_factors(element, parts):
     model = SkinModel(geometry, Material(), SkinOptions(element=element), modulus=factor)
     assert model.nelem == parts * len(elem)
     at = geometry.vert[model._elem[:, :4]].mean(1)
-    home = [np.argmin(np.linalg.norm(vert[elem].mean(1) - p, axis=1)) for p in at.reshape(-1, parts, 3).mean(1)]
-    np.testing.assert_array_equal(model.modulus.reshape(-1, parts), np.repeat(factor[home], parts).reshape(-1, parts))
+    home = [
+        np.argmin(np.linalg.norm(vert[elem].mean(1) - p, axis=1)) for p in at.reshape(-1, parts, 3).mean(1)
+    ]
+    np.testing.assert_array_equal(
+        model.modulus.reshape(-1, parts), np.repeat(factor[home], parts).reshape(-1, parts)
+    )
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(ValueError, match=r"modulus has shape \(3,\): give one factor for each of the 48 elements of .*, shape \(48,\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"modulus has shape \(3,\): give one factor for each of the 48 elements of .*, shape \(48,\)",
+    ):
         cube("linear", "linear", modulus=[1, 2, 3])
-    with pytest.raises(ValueError, match=r"modulus has shape \(\): give one factor for each of the 48 positions"):
+    with pytest.raises(
+        ValueError, match=r"modulus has shape \(\): give one factor for each of the 48 positions"
+    ):
         cube("linear", "linear", modulus=lambda p: 2.0)
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="1 of the 48 factors of modulus are not positive finite numbers"):
+        with pytest.raises(
+            ValueError, match="1 of the 48 factors of modulus are not positive finite numbers"
+        ):
             cube("linear", "linear", modulus=np.r_[bad, np.ones(47)])
     on_a_gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True))
     with pytest.raises(ValueError, match="solved on the CPU's full tier only: choose device='cpu'"):

@@ -1,4 +1,5 @@
-"""Quadratic tetrahedra: their derivatives, what they must do exactly, other codes' answers, and rubber that must not lock."""
+"""Quadratic tetrahedra: their derivatives, what they must do exactly, other codes' answers, and rubber that
+must not lock."""
 
 import pathlib
 import sys
@@ -31,7 +32,9 @@ CPU = wp.get_device("cpu")
 def block(law, nu=0.3, cells=2, jitter=0.25, **options):
     vert, elem = box([np.linspace(0, 1e-2, cells + 1)] * 3, jitter)
     geometry = skin(vert, elem, np.flatnonzero(vert[:, 1] == 0))
-    return SkinModel(geometry, Material(law, 1e6, nu), SkinOptions(element="quadratic", **{**TIGHT, **options}))
+    return SkinModel(
+        geometry, Material(law, 1e6, nu), SkinOptions(element="quadratic", **{**TIGHT, **options})
+    )
 
 
 def state(model, amplitude=4e-4, seed=0):
@@ -50,7 +53,8 @@ def force(model, data, x):
 @pytest.mark.parametrize("nu", [0.3, 0.4999])  # full integration, and mostly mean dilatation
 @pytest.mark.parametrize("law", LAWS)
 def test_derivatives(law, nu):
-    """Force is minus the energy's gradient, the product is the force's derivative: central differences along a random direction."""
+    """Force is minus the energy's gradient, the product is the force's derivative: central differences along
+    a random direction."""
     model = block(law, nu)
     data = state(model)
     x, h = data.x.numpy()[:, 0].copy(), 1e-8
@@ -63,7 +67,9 @@ def test_derivatives(law, nu):
     assert work == pytest.approx(slope, rel=1e-6)
     change = (force(model, data, x + h * p) - force(model, data, x - h * p)) / (2 * h)
     force(model, data, x)
-    model.elasticity.product(data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product)
+    model.elasticity.product(
+        data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product
+    )
     product = data.product.numpy()[:, 0]
     assert abs(product + change).max() < 1e-6 * abs(change).max()
 
@@ -76,19 +82,30 @@ def test_rest_stiffness(law, nu):
     data = SkinData(model)
     force(model, data, model.geometry.vert)
     p = np.random.default_rng(2).standard_normal((model.nvert, 3))
-    model.elasticity.product(data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product)
-    wanted = (model.elasticity.rest_stiffness(model.material.mu, model.material.lame) @ p.ravel()).reshape(-1, 3)
+    model.elasticity.product(
+        data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product
+    )
+    wanted = (model.elasticity.rest_stiffness(model.material.mu, model.material.lame) @ p.ravel()).reshape(
+        -1, 3
+    )
     assert abs(data.product.numpy()[:, 0] - wanted).max() < 1e-10 * abs(wanted).max()
 
 
 def test_stiffness_equals_scikit_fem():
-    """Compressible, integrated at Gauss's points: the energy of any nodal displacement is scikit-fem's with its own P2 tetrahedra."""
+    """Compressible, integrated at Gauss's points: the energy of any nodal displacement is scikit-fem's with
+    its own P2 tetrahedra."""
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, 0.2)
     refined = with_edge_nodes(skin(vert, elem, [0]))
     material = Material("linear", 1e6, 0.3)
-    basis = skfem.Basis(skfem.MeshTet(vert.T.copy(), elem.T.astype(np.int64)), skfem.ElementVector(skfem.ElementTetP2()), intorder=2)
+    basis = skfem.Basis(
+        skfem.MeshTet(vert.T.copy(), elem.T.astype(np.int64)),
+        skfem.ElementVector(skfem.ElementTetP2()),
+        intorder=2,
+    )
     mu, lame = material.mu, material.lame
-    form = skfem.BilinearForm(lambda u, v, w: 2 * mu * ddot(sym_grad(u), sym_grad(v)) + lame * div(u) * div(v))
+    form = skfem.BilinearForm(
+        lambda u, v, w: 2 * mu * ddot(sym_grad(u), sym_grad(v)) + lame * div(u) * div(v)
+    )
     stiffness = form.assemble(basis)
     where = basis.doflocs.T.round(9)
     mine = {tuple(v): i for i, v in enumerate(refined.vert.round(9))}
@@ -103,10 +120,15 @@ def test_stiffness_equals_scikit_fem():
 
 @pytest.mark.parametrize("law", LAWS)
 def test_patch(law):
-    """An affine displacement of the boundary of an irregular block goes on inside, exactly, also nearly incompressible."""
+    """An affine displacement of the boundary of an irregular block goes on inside, exactly, also nearly
+    incompressible."""
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, jitter=0.3)
     outside = np.flatnonzero(np.isin(vert, [0, 1e-2]).any(1))
-    model = SkinModel(skin(vert, elem, outside), Material(law, 1e6, 0.49), SkinOptions(element="quadratic", tolerance=1e-5, **TIGHT))
+    model = SkinModel(
+        skin(vert, elem, outside),
+        Material(law, 1e6, 0.49),
+        SkinOptions(element="quadratic", tolerance=1e-5, **TIGHT),
+    )
     data = SkinData(model)
     A = np.array([[0.05, 0.03, -0.02], [-0.04, -0.06, 0.01], [0.02, 0.05, 0.01]])
     place(data, model.fixed, model.geometry.vert[model.fixed] @ (np.eye(3) + A).T)
@@ -127,17 +149,21 @@ def test_rigid_motion_makes_no_force(law):
 
 
 def test_stress_of_a_stretched_block():
-    """Isochoric stretch s of Neo-Hookean rubber: sigma = mu (s^2 - 1/s) along, less the same mean (Treloar)."""
+    """Isochoric stretch s of Neo-Hookean rubber: sigma = mu (s^2 - 1/s) along, less the same mean
+    (Treloar)."""
     model, s = block("neo_hookean", nu=0.499), 1.3
     data = SkinData(model)
     view(data.x)[:, 0] = model.geometry.vert * [s, s**-0.5, s**-0.5]
     cauchy, mises = data.stress()
     np.testing.assert_allclose(mises[0], model.material.mu * (s**2 - 1 / s), rtol=1e-9)
-    np.testing.assert_allclose(cauchy[0, :, 0, 0] - cauchy[0, :, 1, 1], model.material.mu * (s**2 - 1 / s), rtol=1e-9)
+    np.testing.assert_allclose(
+        cauchy[0, :, 0, 0] - cauchy[0, :, 1, 1], model.material.mu * (s**2 - 1 / s), rtol=1e-9
+    )
 
 
 def test_cook_does_not_lock():
-    """Cook's membrane, plane strain, nu 0.4999: within 2 % of Taylor-Hood elements where linear tetrahedra are lost."""
+    """Cook's membrane, plane strain, nu 0.4999: within 2 % of Taylor-Hood elements where linear tetrahedra
+    are lost."""
     wanted = locking.cook_reference(0.4999, 24)
     errors = np.array([locking.cook_tip(n, "quadratic", 0.4999) for n in (4, 8, 16)]) / wanted - 1
     assert abs(errors[-1]) < 0.02 and (np.abs(errors[:-1]) > 2 * np.abs(errors[1:])).all(), errors
@@ -153,7 +179,8 @@ def test_inflated_sphere(nu):
 
 
 def test_refined_geometry():
-    """Quadratic elements on four-node tetrahedra: the given nodes come first; the new ones fill the same volume and the same surfaces."""
+    """Quadratic elements on four-node tetrahedra: the given nodes come first; the new ones fill the same
+    volume and the same surfaces."""
     coarse = four_nodes("coarse")
     model = SkinModel(coarse, "ansys", SkinOptions(core_contact=False, liquid=False))
     fine = model.geometry
@@ -162,7 +189,9 @@ def test_refined_geometry():
     for name in ("outer_face", "inner_face"):
         given, new = (np.moveaxis(g.vert[getattr(g, name)], 1, 0) for g in (coarse, fine))
         areas = [np.cross(t[1] - t[0], t[2] - t[0]) for t in (given, new)]
-        np.testing.assert_allclose(areas[1].reshape(-1, 4, 3).sum(1), areas[0], atol=1e-12 * abs(areas[0]).max())  # children in order
+        np.testing.assert_allclose(
+            areas[1].reshape(-1, 4, 3).sum(1), areas[0], atol=1e-12 * abs(areas[0]).max()
+        )  # children in order
     corner = fine.vert[fine.tets]
     volume = np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
     assert (volume > 0).all()
@@ -171,7 +200,8 @@ def test_refined_geometry():
 
 
 def test_ansys_preset_presses():
-    """The ANSYS rubber with liquid: every step of a press converges, the liquid keeps its volume, the force rises."""
+    """The ANSYS rubber with liquid: every step of a press converges, the liquid keeps its volume, the force
+    rises."""
     model = SkinModel(load_skin("coarse"), "ansys")
     assert model.element == "quadratic" and model.has_liquid and PRESETS["paper"].element == "linear"
     data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], [model.material.friction])
@@ -187,7 +217,8 @@ def test_ansys_preset_presses():
 
 
 @pytest.mark.parametrize("make, text", [
-    (lambda: SkinOptions(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic, or None for the material's choice"),
+    (lambda: SkinOptions(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic, or "
+                                           "None for the material's choice"),
     (lambda: Material(element="cubic"), "unknown element 'cubic': choose one of linear, quadratic"),
 ])  # fmt: skip
 def test_bad_element(make, text):
@@ -215,7 +246,8 @@ def test_factor_at_a_turned_shape():
 
 
 def test_linear_elements_of_ten_nodes():
-    """Linear elements on ten-node tetrahedra are their eight parts: the same nodes, the same volume but for curved edges."""
+    """Linear elements on ten-node tetrahedra are their eight parts: the same nodes, the same volume but for
+    curved edges."""
     geometry = load_skin("coarse")
     linear, curved = (SkinModel(geometry, "default", SkinOptions(element=e)) for e in ("linear", None))
     assert (linear.element, curved.element) == ("linear", "quadratic")
@@ -226,11 +258,13 @@ def test_linear_elements_of_ten_nodes():
 
 
 def test_coupled_skin_keeps_its_nodes(tmp_path):
-    """In a simulation the sensor and the view see the geometry's own nodes; the state holds them all and replays exactly."""
+    """In a simulation the sensor and the view see the geometry's own nodes; the state holds them all and
+    replays exactly."""
     path = four_nodes("coarse").save(tmp_path / "corners.npz")
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep="0.002"/><worldbody><body name="finger"/>'
-        '<body name="ball" mocap="true" pos="-0.01 -0.0117 0"><geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>'
+        '<body name="ball" mocap="true" pos="-0.01 -0.0117 0"><geom name="ball" type="sphere" '
+        'size="0.0035"/></body></worldbody></mujoco>'
     )
     handle = biotac_mj.attach(spec, body="finger", skin=str(path), material="ansys", readings="none")
     model = spec.compile()
@@ -253,12 +287,16 @@ def test_cuda_equals_cpu(law):
     results = []
     for device in ("cpu", "cuda:0"):
         geometry = skin(vert, elem, np.flatnonzero(vert[:, 1] == 0))
-        model = SkinModel(geometry, Material(law, 1e6, 0.4999), SkinOptions(element="quadratic"), device=device)
+        model = SkinModel(
+            geometry, Material(law, 1e6, 0.4999), SkinOptions(element="quadratic"), device=device
+        )
         data, rng = SkinData(model, 3), np.random.default_rng(0)
         x = np.repeat(model.geometry.vert[:, None], 3, 1) + 4e-4 * rng.uniform(-1, 1, (model.nvert, 3, 3))
         x, p = (wp.array(a, dtype=vec3, ndim=2, device=device) for a in (x, rng.standard_normal(x.shape)))
         model.elasticity.force(data.elastic, data.mu, data.lam, x, data.force)
         model.elasticity.product(data.elastic, data.mu, data.lam, x, p, data.product)
-        results.append((data.force.numpy(), data.product.numpy(), model.elasticity.smallest_jacobian(data.elastic)))
+        results.append(
+            (data.force.numpy(), data.product.numpy(), model.elasticity.smallest_jacobian(data.elastic))
+        )
     for cpu, cuda in zip(*results, strict=True):
         assert abs(cpu - cuda).max() < 1e-11 * abs(cpu).max()

@@ -1,4 +1,5 @@
-"""Nearly incompressible rubber pressed onto the core: no step may pass for a balance that a skin cannot have."""
+"""Nearly incompressible rubber pressed onto the core: no step may pass for a balance that a skin cannot
+have."""
 
 import pathlib
 import sys
@@ -43,7 +44,13 @@ def test_distance_beyond_a_grid_is_a_lower_bound_and_near_the_true_one():
     geoms = GeomSet(["mesh"], [(0, 0, 0)], [0.0], grids=[grid])
     p = np.random.default_rng(0).uniform(-3e-2, 3e-2, (2000, 3))
     out = wp.zeros(len(p), dtype=wp.float64, device="cpu")
-    wp.launch(_bound, dim=len(p), inputs=[geoms.struct, wp.array(p, dtype=wp.vec3d, device="cpu")], outputs=[out], device="cpu")
+    wp.launch(
+        _bound,
+        dim=len(p),
+        inputs=[geoms.struct, wp.array(p, dtype=wp.vec3d, device="cpu")],
+        outputs=[out],
+        device="cpu",
+    )
     exact = np.linalg.norm(np.maximum(np.abs(p) - [2e-3, 3e-3, 5e-3], 0), axis=1)
     beyond = (np.abs(p) > np.array([2e-3, 3e-3, 5e-3]) + 4e-3).any(1)
     assert beyond.sum() > 1000
@@ -63,7 +70,8 @@ def _pressed_in(model):
 
 @pytest.mark.parametrize("trial", [5e-2, np.nan])
 def test_a_trial_far_away_does_not_make_the_skin_lose_the_core(model, trial):
-    """A face that a bad trial of Newton's method put beyond the core's distance grid, or nowhere, meets the core when it is back."""
+    """A face that a bad trial of Newton's method put beyond the core's distance grid, or nowhere, meets the
+    core when it is back."""
     x, nodes = _pressed_in(model)
 
     def core_force(first):
@@ -96,12 +104,15 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
     assert not possible(_pressed_in(model)[0])
     element = model.geometry.elem[np.isin(model.geometry.elem, model.fixed).sum(1) == 0][0]
     folded = rest.copy()
-    folded[element[0]] += 1.2 * (rest[element[1:4]].mean(0) - rest[element[0]])  # a corner through the face opposite
+    folded[element[0]] += 1.2 * (
+        rest[element[1:4]].mean(0) - rest[element[0]]
+    )  # a corner through the face opposite
     assert not possible(folded)
 
 
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
-    """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those inside the core counts."""
+    """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
+    inside the core counts."""
     contact = _Step._contact
 
     def blind(self, state, geoms):
@@ -130,7 +141,8 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
 
 
 def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypatch):
-    """The factor of the deformed shape is made within a step and forgotten with it: fresh SkinData at that state steps alike, bitwise."""
+    """The factor of the deformed shape is made within a step and forgotten with it: fresh SkinData at that
+    state steps alike, bitwise."""
     made = []
     factor_at = SkinModel.factor_at
     monkeypatch.setattr(SkinModel, "factor_at", lambda self, x: made.append(1) or factor_at(self, x))
@@ -154,14 +166,18 @@ def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypa
     step(model, fresh, _sphere_at(geoms, 9e-4))
     np.testing.assert_array_equal(fresh.vert_xpos, data.vert_xpos)
     np.testing.assert_array_equal(fresh.wrench, data.wrench)
-    enclosed = [trimesh.Trimesh(v, model.geometry.inner_face, process=False).volume for v in (model.geometry.vert, data.vert_xpos[0])]
+    enclosed = [
+        trimesh.Trimesh(v, model.geometry.inner_face, process=False).volume
+        for v in (model.geometry.vert, data.vert_xpos[0])
+    ]
     assert abs((enclosed[1] - enclosed[0]) / model.liquid_volume) < 2e-6  # the liquid's volume is kept
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("indenter, least, most", [("sphere_7mm", 2.8, 3.6), ("cube_14mm", 13.0, 17.0)])
 def test_the_preset_bears_a_press_to_the_core(model, indenter, least, most):
-    """Every step in balance; force grows with depth, on the core steeply; no element inverted, no skin in the core, liquid kept."""
+    """Every step in balance; force grows with depth, on the core steeply; no element inverted, no skin in the
+    core, liquid kept."""
     found = rubber.press("coarse", indenter)
     force = np.array(found["force_N"])
     assert found["not_converged"] == 0 and found["steps"] == 24
@@ -169,4 +185,8 @@ def test_the_preset_bears_a_press_to_the_core(model, indenter, least, most):
     assert np.diff(force)[-1] > 20 * np.diff(force)[3]
     assert found["least_jacobian"] > 0.5 and found["deepest_in_core_um"] < 60
     assert np.abs(found["pressure_Pa"]).max() < 3e3
-    assert PRESETS["ansys"].poissons_ratio == 0.499 and PRESETS["ansys"].friction == 0.186 and PRESETS["ansys"].youngs_modulus == 2.8e5
+    assert (
+        PRESETS["ansys"].poissons_ratio == 0.499
+        and PRESETS["ansys"].friction == 0.186
+        and PRESETS["ansys"].youngs_modulus == 2.8e5
+    )

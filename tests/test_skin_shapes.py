@@ -12,21 +12,40 @@ from biotac_mj.skin import GeomSet, bake_distance_grid
 from biotac_mj.skin.contact import Geoms
 from biotac_mj.skin.shapes import distance, distance_bound
 
-SIZES = {"sphere": (0.8, 0, 0), "capsule": (0.5, 0.7, 0), "cylinder": (0.6, 0.9, 0), "ellipsoid": (0.5, 0.8, 1.1), "box": (0.5, 0.8, 1.1)}
+SIZES = {
+    "sphere": (0.8, 0, 0),
+    "capsule": (0.5, 0.7, 0),
+    "cylinder": (0.6, 0.9, 0),
+    "ellipsoid": (0.5, 0.8, 1.1),
+    "box": (0.5, 0.8, 1.1),
+}
 
 
 @wp.kernel
-def _distances(geoms: Geoms, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d), bound: wp.array(dtype=wp.float64)):
+def _distances(
+    geoms: Geoms,
+    point: wp.array(dtype=wp.vec3d),
+    out: wp.array(dtype=wp.vec4d),
+    bound: wp.array(dtype=wp.float64),
+):
     i = wp.tid()
     out[i] = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], point[i])
-    bound[i] = distance_bound(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], point[i])
+    bound[i] = distance_bound(
+        geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], point[i]
+    )
 
 
 def evaluate(kind, size, points, rounding=0.0, grids=()):
     """Normals (n, 3), distances (n,) and their lower bounds (n,)."""
     geoms = GeomSet([kind], [size], rounding=[rounding], grids=grids)
     out, bound = wp.zeros(len(points), dtype=wp.vec4d), wp.zeros(len(points), dtype=wp.float64)
-    wp.launch(_distances, dim=len(points), inputs=[geoms.struct, wp.array(points, dtype=wp.vec3d)], outputs=[out, bound], device="cpu")
+    wp.launch(
+        _distances,
+        dim=len(points),
+        inputs=[geoms.struct, wp.array(points, dtype=wp.vec3d)],
+        outputs=[out, bound],
+        device="cpu",
+    )
     return out.numpy()[:, :3], out.numpy()[:, 3], bound.numpy()
 
 
@@ -39,17 +58,22 @@ def gradient(kind, size, points, h=1e-6, **options):
     out = np.empty_like(points)
     for axis in range(3):
         offset = h * np.eye(3)[axis]
-        out[:, axis] = (evaluate(kind, size, points + offset, **options)[1] - evaluate(kind, size, points - offset, **options)[1]) / (2 * h)
+        out[:, axis] = (
+            evaluate(kind, size, points + offset, **options)[1]
+            - evaluate(kind, size, points - offset, **options)[1]
+        ) / (2 * h)
     return out
 
 
 @pytest.mark.parametrize("kind", [*SIZES, "plane"])
 def test_outside_equals_mujoco(kind):
-    """mj_geomDistance to a tiny sphere as the probe; its convex solver is told to be as exact as doubles allow."""
+    """mj_geomDistance to a tiny sphere as the probe; its convex solver is told to be as exact as doubles
+    allow."""
     size = SIZES.get(kind, (1, 1, 1))
     text = " ".join(map(str, size))
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option ccd_tolerance="1e-10" ccd_iterations="500"/><worldbody><geom name="shape" type="{kind}" size="{text}"/>'
+        '<mujoco><option ccd_tolerance="1e-10" ccd_iterations="500"/><worldbody><geom name="shape" '
+        f'type="{kind}" size="{text}"/>'
         '<body mocap="true"><geom name="probe" type="sphere" size="1e-4"/></body></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
@@ -138,17 +162,34 @@ def test_rounding(kind):
     normal, rounded, _ = evaluate(kind, SIZES[kind], points, rounding=r)
     np.testing.assert_allclose(rounded, small - r, atol=1e-12)
     assert (rounded >= sharp - 1e-12).all()  # it loses its edges only
-    face = np.array([[0.51, 0, 0], [0.2, 0.1, 1.2]]) if kind == "box" else np.array([[0.61, 0, 0], [0.1, 0.1, 1.0]])
-    np.testing.assert_allclose(evaluate(kind, SIZES[kind], face, rounding=r)[1], evaluate(kind, SIZES[kind], face)[1], atol=1e-12)
+    face = (
+        np.array([[0.51, 0, 0], [0.2, 0.1, 1.2]])
+        if kind == "box"
+        else np.array([[0.61, 0, 0], [0.1, 0.1, 1.0]])
+    )
+    np.testing.assert_allclose(
+        evaluate(kind, SIZES[kind], face, rounding=r)[1], evaluate(kind, SIZES[kind], face)[1], atol=1e-12
+    )
     smooth = rounded > 1e-6
-    np.testing.assert_allclose(normal[smooth], gradient(kind, SIZES[kind], points[smooth], rounding=r), atol=1e-5)
+    np.testing.assert_allclose(
+        normal[smooth], gradient(kind, SIZES[kind], points[smooth], rounding=r), atol=1e-5
+    )
 
 
 def test_points_on_axes_have_a_normal():
-    """Centres and axes, where the direction is not unique, still give a unit normal and the right distance."""
-    for kind, depth in (("sphere", 0.8), ("capsule", 0.5), ("cylinder", 0.6), ("box", 0.5), ("ellipsoid", 0.5)):
+    """Centres and axes, where the direction is not unique, still give a unit normal and the right
+    distance."""
+    for kind, depth in (
+        ("sphere", 0.8),
+        ("capsule", 0.5),
+        ("cylinder", 0.6),
+        ("box", 0.5),
+        ("ellipsoid", 0.5),
+    ):
         normal, d, _ = evaluate(kind, SIZES[kind], np.zeros((1, 3)))
-        assert d[0] == pytest.approx(-depth, rel=1e-4)  # the ellipsoid's root is ill-conditioned at its very centre
+        assert d[0] == pytest.approx(
+            -depth, rel=1e-4
+        )  # the ellipsoid's root is ill-conditioned at its very centre
         assert np.linalg.norm(normal) == pytest.approx(1)
 
 
@@ -164,7 +205,7 @@ def test_ellipsoid_far_and_flat():
     assert d[0] == pytest.approx(expected, rel=1e-9)
 
 
-# --- meshes -------------------------------------------------------------------------------------------------------------------------
+# --- meshes  ---
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +215,8 @@ def ring():
 
 
 def test_ring_equals_trimesh(ring):
-    """Near the surface the distance is the triangles'; trimesh works in millimetres, as its tolerances are absolute."""
+    """Near the surface the distance is the triangles'; trimesh works in millimetres, as its tolerances are
+    absolute."""
     mesh, grid = ring
     rng = np.random.default_rng(0)
     on, index = trimesh.sample.sample_surface(mesh, 400, seed=1)
@@ -184,7 +226,9 @@ def test_ring_equals_trimesh(ring):
     normal, ours, bound = evaluate("mesh", (), points, grids=[grid])
     near = expected < 0.25 * grid.spacing  # farther out only a bound is needed
     assert near.sum() > 200
-    np.testing.assert_allclose(ours[near], expected[near], atol=2e-8)  # single precision of a few millimetres is 1e-7 of them
+    np.testing.assert_allclose(
+        ours[near], expected[near], atol=2e-8
+    )  # single precision of a few millimetres is 1e-7 of them
     assert (bound <= expected + 1e-8).all()
     assert ((ours > 0) == (expected > 0))[abs(expected) > 1e-8].all()
     # normals lead away from the nearest point
@@ -192,7 +236,9 @@ def test_ring_equals_trimesh(ring):
     away = (points * 1e3 - closest) * np.sign(expected)[:, None]
     clear = near & (abs(expected) > 1e-5)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    assert (np.einsum("ij,ij->i", away, normal)[clear] > 0.999).mean() > 0.98  # the rest lies at equal distance of two triangles
+    assert (
+        np.einsum("ij,ij->i", away, normal)[clear] > 0.999
+    ).mean() > 0.98  # the rest lies at equal distance of two triangles
 
 
 def test_ring_has_a_hole(ring):
@@ -226,7 +272,9 @@ def test_mesh_sphere_equals_sphere():
     sagitta = 3.5e-3 * (1 - np.cos(0.5 * ball.edges_unique_length.max() / 3.5e-3 * 2 / np.sqrt(3)))
     near = d > -grid.spacing
     np.testing.assert_allclose(d[near], (np.linalg.norm(points, axis=1) - 3.5e-3)[near], atol=1.5 * sagitta)
-    np.testing.assert_allclose(d, np.linalg.norm(points, axis=1) - 3.5e-3, atol=1.5 * sagitta + 0.05 * grid.spacing)
+    np.testing.assert_allclose(
+        d, np.linalg.norm(points, axis=1) - 3.5e-3, atol=1.5 * sagitta + 0.05 * grid.spacing
+    )
     assert (np.einsum("ij,ij->i", normal, direction) > 0.998).all()  # facets lean by up to 2.3 degrees
 
 
@@ -241,30 +289,43 @@ def test_two_meshes_keep_apart():
 
     out, bound = wp.zeros(1, dtype=wp.vec4d), wp.zeros(1, dtype=wp.float64)
     both.struct.grid = wp.array([1], dtype=int)
-    wp.launch(_distances, dim=1, inputs=[both.struct, wp.array(p, dtype=wp.vec3d)], outputs=[out, bound], device="cpu")
+    wp.launch(
+        _distances,
+        dim=1,
+        inputs=[both.struct, wp.array(p, dtype=wp.vec3d)],
+        outputs=[out, bound],
+        device="cpu",
+    )
     assert out.numpy()[0, 3] == pytest.approx(-0.05e-3, abs=1e-8)
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------------------------
+# --- bad input  ---
 
 
 def test_open_mesh():
     ball = trimesh.creation.icosphere(subdivisions=2)
     with pytest.raises(ValueError, match="the mesh is open: its inside is not defined; close its holes"):
         bake_distance_grid(ball.vertices, ball.faces[1:])
-    with pytest.raises(ValueError, match="a mesh geom without faces has no distance field: give it a triangle mesh"):
+    with pytest.raises(
+        ValueError, match="a mesh geom without faces has no distance field: give it a triangle mesh"
+    ):
         bake_distance_grid(ball.vertices, np.zeros((0, 3), int))
 
 
 @pytest.mark.parametrize("arguments, text", [
-    (dict(types=["hfield"], sizes=[(1,)]), "geom type 'hfield' cannot touch the skin: use one of plane, sphere, capsule"),
-    (dict(types=["mesh"], sizes=[()]), r"every mesh geom needs one DistanceGrid: make it with bake_distance_grid\(vert, face\)"),
-    (dict(types=["sphere"], sizes=[(0.0,)]), r"a sphere of size \[0.0, 0.0, 0.0\] is not a solid: sizes must be positive and finite"),
+    (dict(types=["hfield"], sizes=[(1,)]), "geom type 'hfield' cannot touch the skin: use one of plane, "
+                                           "sphere, capsule"),
+    (dict(types=["mesh"], sizes=[()]), r"every mesh geom needs one DistanceGrid: make it with "
+                                       r"bake_distance_grid\(vert, face\)"),
+    (dict(types=["sphere"], sizes=[(0.0,)]), r"a sphere of size \[0.0, 0.0, 0.0\] is not a solid: sizes "
+                                             r"must be positive and finite"),
     (dict(types=["box"], sizes=[(1.0, 1.0)]), "a box of size .* is not a solid"),
     (dict(types=["sphere"], sizes=[(float("nan"),)]), "is not a solid"),
-    (dict(types=["sphere"], sizes=[(1.0,)], friction=[-0.5]), r"friction \[-0.5\] must be finite and not negative"),
+    (dict(types=["sphere"], sizes=[(1.0,)], friction=[-0.5]), r"friction \[-0.5\] must be finite and not "
+                                                              r"negative"),
     (dict(types=["sphere"], sizes=[(1.0,)], friction=[np.nan]), r"friction \[nan\] must be finite"),
-    (dict(types=["box"], sizes=[(1.0, 1.0, 1.0)], rounding=[2.0]), "rounding of a box is 2.0: a fillet's radius lies"),
+    (dict(types=["box"], sizes=[(1.0, 1.0, 1.0)], rounding=[2.0]), "rounding of a box is 2.0: a fillet's "
+                                                                   "radius lies"),
     (dict(types=["sphere"], sizes=[(1.0,)], rounding=[np.nan]), "rounding of a sphere is nan"),
 ])  # fmt: skip
 def test_bad_geoms(arguments, text):
@@ -274,11 +335,16 @@ def test_bad_geoms(arguments, text):
 
 def test_bad_poses():
     geoms = GeomSet(["sphere"], [(1.0,)], nworld=2)
-    with pytest.raises(ValueError, match="geom positions contain NaN or infinite numbers: the simulation has diverged or a pose was"):
+    with pytest.raises(
+        ValueError,
+        match="geom positions contain NaN or infinite numbers: the simulation has diverged or a pose was",
+    ):
         geoms.set_pose([[np.nan, 0, 0]])
     with pytest.raises(ValueError, match="geom rotations contain NaN"):
         geoms.set_pose([[0, 0, 0]], [np.full((3, 3), np.inf)])
-    with pytest.raises(ValueError, match=r"geom positions have shape \(3,\): expected \(1, 3\) or \(2, 1, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"geom positions have shape \(3,\): expected \(1, 3\) or \(2, 1, 3\)"
+    ):
         geoms.set_pose([0, 0, 0])
     with pytest.raises(ValueError, match="geom friction coefficients contain NaN"):
         geoms.set_friction([np.nan])

@@ -50,7 +50,8 @@ def test_force_grows_and_is_symmetric(press):
 
 
 def test_pressure_is_proportional_to_overclosure(press):
-    """Contact written out with numpy: k times overclosure times a share of the face's rest area; friction within its cone."""
+    """Contact written out with numpy: k times overclosure times a share of the face's rest area; friction
+    within its cone."""
     model, data, forces = press
     face, n = model.geometry.outer_face, model.options.samples**2
     centre = np.array([X, first_touch(model.geometry) + DEPTHS[-1], 0])
@@ -96,13 +97,17 @@ def test_liquid_bulges_and_carries(skin):
     assert dry.volume[0] < v0 * (1 - 1e-3)  # the empty skin loses a part of its volume
     assert abs(data.volume[0] / v0 - 1) < 1e-5
     inner = np.unique(skin.inner_face)
-    inner = inner[np.linalg.norm(skin.vert[inner] - [X, first_touch(skin) + RADIUS, 0], axis=1) > 6e-3]  # away from the sphere
+    inner = inner[
+        np.linalg.norm(skin.vert[inner] - [X, first_touch(skin) + RADIUS, 0], axis=1) > 6e-3
+    ]  # away from the sphere
     normal = np.zeros((skin.nvert, 3))
     corners = skin.vert[skin.inner_face]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     np.add.at(normal, skin.inner_face.ravel(), np.repeat(area, 3, axis=0))  # towards the core
     normal = normal[inner] / np.linalg.norm(normal[inner], axis=1, keepdims=True)
-    outward = {f: -((d.vert_xpos[0, inner] - skin.vert[inner]) * normal).sum(1) for f, (_, d) in outcome.items()}
+    outward = {
+        f: -((d.vert_xpos[0, inner] - skin.vert[inner]) * normal).sum(1) for f, (_, d) in outcome.items()
+    }
     assert outward[True].max() > 2e-5
     assert outward[True].sum() > outward[False].sum()
 
@@ -111,7 +116,10 @@ def test_deep_inside_the_core(skin):
     model = SkinModel(skin)
     data, geoms = SkinData(model), GeomSet(["sphere"], [(RADIUS,)])
     geoms.set_pose([[X, first_touch(skin) + 5e-3, 0]])
-    with pytest.raises(ValueError, match=r"geom 0 of world 0 \(sphere\) is \d\.\d\d mm inside the rigid core: no skin fits between them"):
+    with pytest.raises(
+        ValueError,
+        match=r"geom 0 of world 0 \(sphere\) is \d\.\d\d mm inside the rigid core: no skin fits between them",
+    ):
         step(model, data, geoms)
     assert (data.vert_xpos[0] == skin.vert).all()  # nothing happened
 
@@ -129,7 +137,8 @@ def test_twenty_newtons_between_cube_and_core(skin):
         if force > 20:
             break
     assert force > 20
-    # under p samples are p/k inside, k = 180 E per mm: 5 MPa on average under the cube, twice that at the facet's edge is 36 um
+    # under p samples are p/k inside, k = 180 E per mm: 5 MPa on average under the cube, twice that at the
+    # facet's edge is 36 um
     grid = model.core(1).struct
     inside = wp.zeros(len(model.core_surface.face) * len(model.sample), dtype=wp.float64)
     wp.launch(rest_gap, dim=(len(model.core_surface.face), len(model.sample)),

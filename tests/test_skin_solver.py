@@ -18,9 +18,18 @@ def finger(shuffle=None, law="corotational", **options):
     if shuffle is not None:
         elem = np.random.default_rng(shuffle).permutation(elem)
     ball = trimesh.creation.icosphere(subdivisions=2, radius=7e-3)
-    geometry = skin(vert, elem, np.flatnonzero(vert[:, 2] < -6e-3), inner_face=inner, core=(ball.vertices, ball.faces), name="ball")
+    geometry = skin(
+        vert,
+        elem,
+        np.flatnonzero(vert[:, 2] < -6e-3),
+        inner_face=inner,
+        core=(ball.vertices, ball.faces),
+        name="ball",
+    )
     if shuffle is not None:
-        geometry = dataclasses.replace(geometry, outer_face=np.random.default_rng(shuffle).permutation(geometry.outer_face))
+        geometry = dataclasses.replace(
+            geometry, outer_face=np.random.default_rng(shuffle).permutation(geometry.outer_face)
+        )
     return SkinModel(geometry, Material(law), SkinOptions(**{"max_newton": 60, **options}))
 
 
@@ -30,11 +39,14 @@ def model():
 
 
 def geoms(nworld=1):
-    return GeomSet(["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)], [0.7, 0.3], [0, 1], [0, 5e-4], nworld=nworld)
+    return GeomSet(
+        ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)], [0.7, 0.3], [0, 1], [0, 5e-4], nworld=nworld
+    )
 
 
 def pose(s, world=0):
-    """Sphere from above, dragged sideways; box from the side, in worlds 1 and 2 elsewhere; world 2 lets go at the end."""
+    """Sphere from above, dragged sideways; box from the side, in worlds 1 and 2 elsewhere; world 2 lets go at
+    the end."""
     leave = 4e-3 if world == 2 and s > 0.8e-3 else 0.0
     return [[0.3 * s, 1e-3 * world, 13.5e-3 - s + leave], [12e-3 - 0.5 * s + leave, 0, 1e-3 * world]]
 
@@ -51,18 +63,26 @@ def press(model, worlds, path=PATH, material=None):
 
 @pytest.mark.parametrize("tolerance, apart", [(1e-3, 1e-6), (1e-9, 1e-9)])
 def test_a_world_of_a_batch_is_the_world_alone(tolerance, apart):
-    """A batch sums in another order and its preconditioner rounds to single precision, so the paths to balance differ, by far less than
-    the tolerance, and what they lead to does not."""
+    """A batch sums in another order and its preconditioner rounds to single precision, so the paths to
+    balance differ, by far less than the tolerance, and what they lead to does not."""
     model = finger(tolerance=tolerance, max_newton=200)
     batch, touching = press(model, [0, 1, 2])
     tangent = batch.tangent(touching)
     for w in range(3):
         alone, one = press(model, [w])
-        np.testing.assert_allclose(batch.vert_xpos[w], alone.vert_xpos[0], rtol=0, atol=apart * 1e-3)  # of the way pressed
-        np.testing.assert_allclose(batch.wrench[w], alone.wrench[0], rtol=0, atol=20 * apart * abs(batch.wrench).max())
+        np.testing.assert_allclose(
+            batch.vert_xpos[w], alone.vert_xpos[0], rtol=0, atol=apart * 1e-3
+        )  # of the way pressed
+        np.testing.assert_allclose(
+            batch.wrench[w], alone.wrench[0], rtol=0, atol=20 * apart * abs(batch.wrench).max()
+        )
         stiff = max(20 * apart, tolerance)  # water makes much of little volume
-        np.testing.assert_allclose(batch.pressure[w], alone.pressure[0], rtol=0, atol=stiff * abs(batch.pressure).max())
-        np.testing.assert_allclose(tangent[w], alone.tangent(one)[0], rtol=0, atol=1e-5 * abs(tangent).max())  # rows are single precision
+        np.testing.assert_allclose(
+            batch.pressure[w], alone.pressure[0], rtol=0, atol=stiff * abs(batch.pressure).max()
+        )
+        np.testing.assert_allclose(
+            tangent[w], alone.tangent(one)[0], rtol=0, atol=1e-5 * abs(tangent).max()
+        )  # rows are single precision
     assert abs(batch.wrench[2]).max() < 1e-9 < abs(batch.wrench[0]).max()
     assert abs(batch.wrench[0] - batch.wrench[1]).max() > 1e-2  # the worlds do differ
 
@@ -70,7 +90,9 @@ def test_a_world_of_a_batch_is_the_world_alone(tolerance, apart):
 def test_worlds_in_another_order(model):
     one, _ = press(model, [0, 1])
     other, _ = press(model, [1, 0])
-    np.testing.assert_allclose(one.vert_xpos, other.vert_xpos[::-1], rtol=0, atol=1e-9)  # a millionth of the way pressed
+    np.testing.assert_allclose(
+        one.vert_xpos, other.vert_xpos[::-1], rtol=0, atol=1e-9
+    )  # a millionth of the way pressed
 
 
 def test_the_same_input_gives_the_same_bits():
@@ -91,9 +113,14 @@ def test_order_of_tetrahedra_and_faces_does_not_matter():
 
 
 def test_each_world_has_its_material(model):
-    soft = [dataclasses.replace(model.material, youngs_modulus=s * model.material.youngs_modulus) for s in (1.0, 0.8)]
+    soft = [
+        dataclasses.replace(model.material, youngs_modulus=s * model.material.youngs_modulus)
+        for s in (1.0, 0.8)
+    ]
     data, _ = press(model, [0, 0], material=soft)
-    alone = SkinModel(model.geometry, soft[1], dataclasses.replace(model.options, contact_stiffness=model.contact_stiffness))
+    alone = SkinModel(
+        model.geometry, soft[1], dataclasses.replace(model.options, contact_stiffness=model.contact_stiffness)
+    )
     expected, _ = press(alone, [0])
     # other preconditioners take other ways: what the tolerance of 1e-3 leaves
     np.testing.assert_allclose(data.wrench[1], expected.wrench[0], rtol=0, atol=5e-3 * abs(data.wrench).max())
@@ -136,7 +163,7 @@ def test_load_goes_on_where_it_was_read(model):
     assert (data.wrench == again.wrench).all()
 
 
-# --- failure --------------------------------------------------------------------------------------------------------------------
+# --- failure  ---
 
 
 def test_a_step_that_does_not_converge_keeps_the_last_good_state():
@@ -171,19 +198,24 @@ def test_after_a_failed_step_smaller_ones_go_on():
     np.testing.assert_allclose(data.wrench, expected.wrench, rtol=0, atol=1e-3 * abs(expected.wrench).max())
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------------------
+# --- bad input  ---
 
 
 def test_a_geom_deep_inside_the_core(model):
     data, touching = SkinData(model), geoms()
     touching.set_pose([[0, 0, 8e-3], [1.0, 0, 0]])
-    text = r"geom 0 of world 0 \(sphere\) is 2.\d\d mm inside the rigid core: no skin fits between them; move it out, press less deep"
+    text = (
+        r"geom 0 of world 0 \(sphere\) is 2.\d\d mm inside the rigid core: no skin fits between them; "
+        r"move it out, press less deep"
+    )
     with pytest.raises(ValueError, match=text):
         step(model, data, touching)
 
 
 def test_numbers_of_worlds(model):
-    with pytest.raises(ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"):
+    with pytest.raises(
+        ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"
+    ):
         step(model, SkinData(model), geoms(2))
     with pytest.raises(ValueError, match="pass one corotational material for each of the 2 worlds"):
         SkinData(model, 2, [Material()])
@@ -209,12 +241,17 @@ def test_bad_options(options, text):
 
 
 def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
-    """Nearly incompressible rubber whose first try fails is solved with another factor: the same answer, and the old one is back."""
+    """Nearly incompressible rubber whose first try fails is solved with another factor: the same answer, and
+    the old one is back."""
     from biotac_mj.geometry import load_skin
     from biotac_mj.skin import solver
 
     def press(fail):
-        model = SkinModel(load_skin("coarse"), Material("neo_hookean", 2.8e5, 0.49), SkinOptions(tolerance=1e-5, max_newton=60))
+        model = SkinModel(
+            load_skin("coarse"),
+            Material("neo_hookean", 2.8e5, 0.49),
+            SkinOptions(tolerance=1e-5, max_newton=60),
+        )
         data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.0])
         newton, tries = solver._Step._newton, []
 

@@ -1,4 +1,5 @@
-"""Stiffening of every law: Yeoh's closed forms in large strain, forces against differences of an energy written down here, robustness."""
+"""Stiffening of every law: Yeoh's closed forms in large strain, forces against differences of an energy
+written down here, robustness."""
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from biotac_mj.skin.types import vec3
 
 
 def invariant(law, F):
-    """q of `stiffening.py`: 2 |dev A|^2 of the law's strain, the isochoric first invariant less 3 for neo_hookean."""
+    """q of `stiffening.py`: 2 |dev A|^2 of the law's strain, the isochoric first invariant less 3 for
+    neo_hookean."""
     eye = np.eye(3)
     if law == "neo_hookean":
         return np.linalg.det(F) ** (-2 / 3) * np.sum(F * F, axis=(-2, -1)) - 3
@@ -34,9 +36,12 @@ def beyond(s, q):
 
 
 def gradients(elements, x):
-    """Deformation gradients at all integration points and the volumes that belong to them, from the shape functions."""
+    """Deformation gradients at all integration points and the volumes that belong to them, from the shape
+    functions."""
     if hasattr(elements, "_gradient"):
-        return np.einsum("eai,eqaj->eqij", x[elements._elem], elements._gradient).reshape(-1, 3, 3), elements._weight.ravel()
+        return np.einsum("eai,eqaj->eqij", x[elements._elem], elements._gradient).reshape(
+            -1, 3, 3
+        ), elements._weight.ravel()
     edges = np.moveaxis(x[elements._elem[:, 1:]] - x[elements._elem[:, :1]], 1, 2)
     return edges @ elements._inverse_edges, elements._volume
 
@@ -44,7 +49,8 @@ def gradients(elements, x):
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("s", [0.0, 0.7, -0.4])
 def test_uniaxial_and_equibiaxial_rubber(element, s):
-    """Differences of Cauchy stress of an isochoric stretch: mu (a^2 - b^2) h'(I1 - 3), with Yeoh's h' = 1 + 2 s (I1 - 3)."""
+    """Differences of Cauchy stress of an isochoric stretch: mu (a^2 - b^2) h'(I1 - 3), with Yeoh's h' = 1 + 2
+    s (I1 - 3)."""
     model = cube("neo_hookean", element, nu=0.45, stiffening=s)
     data, mu = SkinData(model), model.material.mu
     for stretch in (0.6, 0.9, 1.3, 1.8):
@@ -59,7 +65,8 @@ def test_uniaxial_and_equibiaxial_rubber(element, s):
 
 @pytest.mark.parametrize("s, t", [(0.5, 1.2e6), (0.5, -1.2e6), (-0.4, 0.2e6)])
 def test_a_bar_with_free_sides(s, t):
-    """Pulled by a traction t: the stretches (a, b, b) that make W - t a least, found here by themselves, bear t, nothing aside."""
+    """Pulled by a traction t: the stretches (a, b, b) that make W - t a least, found here by themselves, bear
+    t, nothing aside."""
     model = cube("neo_hookean", "quadratic", nu=0.4, stiffening=s)
     mu, kappa = model.material.mu, model.material.bulk
 
@@ -69,7 +76,9 @@ def test_a_bar_with_free_sides(s, t):
         q = J ** (-2 / 3) * (a * a + 2 * b * b) - 3
         return (mu / 2 * (q + beyond(s, q)) + kappa / 2 * (J - 1) ** 2 - t * a) / mu
 
-    a, b = minimize(energy, [1.0, 1.0], method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-15, "maxiter": 4000}).x
+    a, b = minimize(
+        energy, [1.0, 1.0], method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-15, "maxiter": 4000}
+    ).x
     assert abs(a - 1) > 0.25
     P = deform(model, SkinData(model), np.diag([a, b, b]), None)
     assert P[0, 0] == pytest.approx(t, rel=1e-5) and abs(P[1, 1]) < 1e-5 * abs(t)
@@ -101,17 +110,24 @@ def test_force_is_the_energys_gradient(law, element, s):
 def test_small_strains_do_not_stiffen(law):
     """Twice the strain, twice the stress, to second order in the strain: the same tangent at rest."""
     F = np.eye(3) + 1e-5 * np.random.default_rng(7).standard_normal((3, 3))
-    plain, stiff = (deform(m, SkinData(m), F, None) for m in (cube(law, "linear"), cube(law, "linear", stiffening=1.5)))
+    plain, stiff = (
+        deform(m, SkinData(m), F, None) for m in (cube(law, "linear"), cube(law, "linear", stiffening=1.5))
+    )
     np.testing.assert_allclose(stiff, plain, atol=1e-8 * abs(plain).max())
 
 
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
 @pytest.mark.parametrize("s", [1.5, -0.5])
 def test_absurd_presses_leave_a_sound_state(law, s):
-    """A ball pushed at once through nearly the whole slab: whatever becomes of the step, no NaN, no inverted element called a balance."""
+    """A ball pushed at once through nearly the whole slab: whatever becomes of the step, no NaN, no inverted
+    element called a balance."""
     vert, elem = box([np.linspace(0, 1e-2, 4), np.linspace(0, 4e-3, 3), np.linspace(0, 1e-2, 4)])
     material = Material(law, E, 0.45, stiffening=s, friction=0.3)
-    model = SkinModel(skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)), material, SkinOptions(element="quadratic", liquid=False))
+    model = SkinModel(
+        skin(vert, elem, np.flatnonzero(vert[:, 1] == 0)),
+        material,
+        SkinOptions(element="quadratic", liquid=False),
+    )
     data, ball = SkinData(model), GeomSet(["sphere"], [(3e-3, 0, 0)])
     forces = []
     for depth in (-0.1e-3, 0.5e-3, 3.6e-3, 0.5e-3):
@@ -139,5 +155,7 @@ def test_what_cannot_be_is_refused():
         SkinData(model, material=[Material("corotational", E, 0.3)])
     from biotac_mj.skin.condensed import CondensedSkin
 
-    with pytest.raises(ValueError, match="condensed tier is elastic, the same everywhere: leave stiffening out"):
+    with pytest.raises(
+        ValueError, match="condensed tier is elastic, the same everywhere: leave stiffening out"
+    ):
         CondensedSkin(model, NOTHING)

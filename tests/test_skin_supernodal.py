@@ -29,8 +29,12 @@ def test_solves_agree_with_lu(model):
     for k in range(3):
         exact = lu.solve(rhs[free, k].ravel())
         wrong = out[free, k].ravel() - exact
-        assert wrong @ (K @ wrong) < (1e-4 * (model.material.poissons_ratio > 0.4) + 3e-6) ** 2 * (exact @ (K @ exact))
-        np.testing.assert_array_equal(factor.solve(rhs[:, k : k + 1])[:, 0], out[:, k])  # whatever is solved beside it
+        assert wrong @ (K @ wrong) < (1e-4 * (model.material.poissons_ratio > 0.4) + 3e-6) ** 2 * (
+            exact @ (K @ exact)
+        )
+        np.testing.assert_array_equal(
+            factor.solve(rhs[:, k : k + 1])[:, 0], out[:, k]
+        )  # whatever is solved beside it
 
 
 def test_operator_is_symmetric(model):
@@ -38,7 +42,9 @@ def test_operator_is_symmetric(model):
     a, b = rng.standard_normal((2, model.nvert, 1, 3))
     solve = model.factor.solve
     one, other = (solve(a)[model.free] * b[model.free]).sum(), (solve(b)[model.free] * a[model.free]).sum()
-    size = np.sqrt((solve(a)[model.free] * a[model.free]).sum() * (solve(b)[model.free] * b[model.free]).sum())
+    size = np.sqrt(
+        (solve(a)[model.free] * a[model.free]).sum() * (solve(b)[model.free] * b[model.free]).sum()
+    )
     assert abs(one - other) < 1e-6 * size
     assert model.factor_at(model.geometry.vert).elimination is model.factor.elimination
 
@@ -65,25 +71,41 @@ def test_dissection_separates(model):
     parts, label = sp.csgraph.connected_components(near[rest][:, rest])
     assert parts >= 2 and np.bincount(label).max() < 0.65 * n and len(middle) < 0.05 * n
     elimination = Elimination(model._stiffness, model.geometry.vert[model.free])
-    entries = sum((end - begin) * (end - begin + 1) / 2 + (end - begin) * len(later) for begin, end, later, _ in elimination.fronts)
-    lu = sp.linalg.splu(model._stiffness.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
+    entries = sum(
+        (end - begin) * (end - begin + 1) / 2 + (end - begin) * len(later)
+        for begin, end, later, _ in elimination.fronts
+    )
+    lu = sp.linalg.splu(
+        model._stiffness.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0,
+        options={"SymmetricMode": True},
+    )
     assert entries < 1.3 * lu.L.nnz  # nearly as good as minimum degree, although leaves are full
 
 
 @pytest.mark.parametrize("n", [1, 2, 60])
 def test_chains_and_loose_parts(n):
     """Springs in a row, two rows that do not touch, everything held to the ground a little."""
-    chain = sp.diags([-np.ones(n - 1), np.r_[2.0 * np.ones(n)], -np.ones(n - 1)], [-1, 0, 1]) + 0.1 * sp.eye(n)
-    matrix = sp.kron(sp.block_diag([chain, chain]), sp.csr_matrix([[2.0, 1, 0], [1, 3, 0], [0, 0, 1]])).tocsc()
+    chain = sp.diags([-np.ones(n - 1), np.r_[2.0 * np.ones(n)], -np.ones(n - 1)], [-1, 0, 1]) + 0.1 * sp.eye(
+        n
+    )
+    matrix = sp.kron(
+        sp.block_diag([chain, chain]), sp.csr_matrix([[2.0, 1, 0], [1, 3, 0], [0, 0, 1]])
+    ).tocsc()
     points = np.zeros((2 * n, 3))
     points[:, 0], points[n:, 1] = np.tile(np.arange(n), 2), 1
     b = np.random.default_rng(3).standard_normal((2 * n, 2, 3))
     x = SupernodalFactor(matrix, Elimination(matrix, points), np.arange(2 * n)).solve(b)
     for k in range(2):
-        np.testing.assert_allclose(x[:, k].ravel(), np.linalg.solve(matrix.toarray(), b[:, k].ravel()), atol=1e-5)
+        np.testing.assert_allclose(
+            x[:, k].ravel(), np.linalg.solve(matrix.toarray(), b[:, k].ravel()), atol=1e-5
+        )
 
 
 def test_not_positive_definite():
     matrix = sp.csc_matrix(np.diag([1.0, 1, 1, 1, -1, 1]))
-    with pytest.raises(ValueError, match="not positive definite: elements are inverted, or parts of the skin are not held"):
+    with pytest.raises(
+        ValueError, match="not positive definite: elements are inverted, or parts of the skin are not held"
+    ):
         SupernodalFactor(matrix, Elimination(matrix, np.eye(3)[:2]), np.arange(2))

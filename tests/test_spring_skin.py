@@ -20,7 +20,11 @@ def test_tangent_is_the_derivative_of_the_wrench():
         step[0, i] = 1e-7
         plus = skin.solve(state, *displace(pos, mat, step), 1e-3).wrench[0]
         minus = skin.solve(state, *displace(pos, mat, -step), 1e-3).wrench[0]
-        # frictionless turning changes the normals, which the tangent leaves out: a few percent for the rotations
+        # frictionless turning changes the normals, which the tangent leaves out: a few percent for the
+        # rotations
         np.testing.assert_allclose(
-            -(plus - minus) / 2e-7, result.tangent[0][:, i], rtol=0.02, atol=0.02 * abs(result.tangent[0][:, i]).max()
+            -(plus - minus) / 2e-7,
+            result.tangent[0][:, i],
+            rtol=0.02,
+            atol=0.02 * abs(result.tangent[0][:, i]).max(),
         )

@@ -41,7 +41,11 @@ def rollout(domain, task, steps, seed, **settings):
         step = env.step(action)
         for name, value in env.observation_spec().items():
             value.validate(step.observation[name])
-        rows.append(np.concatenate([np.ravel(v) for v in step.observation.values()] + [[step.reward], env.physics.data.qpos]))
+        rows.append(
+            np.concatenate(
+                [np.ravel(v) for v in step.observation.values()] + [[step.reward], env.physics.data.qpos]
+            )
+        )
         assert 0.0 <= step.reward <= 1.0
     return np.array(rows), env
 
@@ -61,7 +65,8 @@ def check(domain, task, steps):
 
 @pytest.mark.parametrize("domain, task", TASKS)
 def test_a_task(domain, task):
-    """Specs hold, rewards lie in [0, 1], nothing is NaN, the same seed gives the same trajectory and another one another."""
+    """Specs hold, rewards lie in [0, 1], nothing is NaN, the same seed gives the same trajectory and another
+    one another."""
     check(domain, task, 12)
 
 
@@ -93,7 +98,9 @@ class PlateTask(composer.Task):
 
     def __init__(self, depth, **settings):
         self.arena, self.entity, self.depth = composer.Arena(), BioTac(**settings), depth
-        self.arena.attach(self.entity, self.arena.mjcf_model.worldbody.add("site", name="mount", pos=[0, 0, 0.1]))
+        self.arena.attach(
+            self.entity, self.arena.mjcf_model.worldbody.add("site", name="mount", pos=[0, 0, 0.1])
+        )
         self.plate = self.arena.mjcf_model.worldbody.add("body", name="plate", mocap=True, pos=[0, 0, -1])
         self.plate.add("geom", name="plate", type="box", size=[0.03, 0.01, 0.03])
         self.set_timesteps(0.01, 0.005)
@@ -109,12 +116,18 @@ class PlateTask(composer.Task):
 
 
 def environment(task, **settings):
-    options = dict(random_state=0, recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
+    options = dict(
+        random_state=0,
+        recompile_mjcf_every_episode=False,
+        strip_singleton_obs_buffer_dim=True,
+        legacy_step=False,
+    )
     return composer.Environment(task, **options | settings)
 
 
 def test_presets_and_patch():
-    """TACTILE and PRIVILEGED have the documented shapes; force and patch say where a plate presses: from the pad, along +y."""
+    """TACTILE and PRIVILEGED have the documented shapes; force and patch say where a plate presses: from the
+    pad, along +y."""
     task = PlateTask(0.6e-3, noise=False)
     task.entity.observables.enable(TACTILE + PRIVILEGED)
     env = environment(task)
@@ -126,11 +139,17 @@ def test_presets_and_patch():
     assert not step.observation["biotac/contact_patch"].any()
     for _ in range(15):
         step = env.step(np.zeros(0))
-    force, patch, skin = (step.observation[f"biotac/{name}"] for name in ("contact_force", "contact_patch", "skin"))
+    force, patch, skin = (
+        step.observation[f"biotac/{name}"] for name in ("contact_force", "contact_patch", "skin")
+    )
     assert force[1] > 0.3 and force[1] > 5 * np.abs(force[[0, 2]]).max()
     np.testing.assert_allclose(patch[3:], -force[:3] / np.linalg.norm(force[:3]))
     # the plate's face has come to y = -8.3 + 0.6 mm, so the touching skin lies there
-    assert patch[1] == pytest.approx(-7.7e-3, abs=0.25e-3) and -0.018 < patch[0] < 0.006 and abs(patch[2]) < 1.5e-3
+    assert (
+        patch[1] == pytest.approx(-7.7e-3, abs=0.25e-3)
+        and -0.018 < patch[0] < 0.006
+        and abs(patch[2]) < 1.5e-3
+    )
     assert skin[:, 1].min() == pytest.approx(-7.7e-3, abs=0.05e-3)  # nothing is behind the plate's face
     task.entity.observables.enable(("pdc",))
     assert list(environment(task).reset().observation) == ["biotac/pdc"]
@@ -164,14 +183,21 @@ def test_delay_noise_and_rate_belong_to_the_observable():
 def test_entity_attaches_to_any_site_and_twice():
     arena = composer.Arena()
     for name in ("left", "right"):
-        arena.attach(BioTac(name=name), arena.mjcf_model.worldbody.add("site", name=f"at_{name}", pos=[0.1 * (name == "left"), 0, 0]))
+        arena.attach(
+            BioTac(name=name),
+            arena.mjcf_model.worldbody.add("site", name=f"at_{name}", pos=[0.1 * (name == "left"), 0, 0]),
+        )
     physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
     assert physics.model.nplugin == 2
-    assert physics.model.name2id("left/electrodes", "sensor") >= 0 and physics.model.name2id("right/core", "body") >= 0
+    assert (
+        physics.model.name2id("left/electrodes", "sensor") >= 0
+        and physics.model.name2id("right/core", "body") >= 0
+    )
 
 
 def test_estimator_recovers_a_map_and_names_its_error():
-    """Exact on a map that is linear in touch and quadratic in its shape; the reported error is that of episodes it has not seen."""
+    """Exact on a map that is linear in touch and quadratic in its shape; the reported error is that of
+    episodes it has not seen."""
     rng = np.random.RandomState(0)
     x = rng.standard_normal((2000, 20))
     shape = 10 * x / (np.abs(x).sum(axis=1, keepdims=True) + 1)
@@ -186,13 +212,18 @@ def test_estimator_recovers_a_map_and_names_its_error():
 
 
 def test_every_estimator_says_what_it_was_fitted_on():
-    """The package's estimators fit the tasks' own BioTac: no warning; the digest is one of the skin's content."""
+    """The package's estimators fit the tasks' own BioTac: no warning; the digest is one of the skin's
+    content."""
     stored, config = touch.load_calibration(), BioTac().handle.config
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for controller in scripted.SCRIPTED.values():
             touch.check_fitted_on(controller().fit, stored, config)
-            assert touch.load_estimator(controller().fit).error.min() > 0 if controller.task != "explore" else "explore/weight" in stored
+            assert (
+                touch.load_estimator(controller().fit).error.min() > 0
+                if controller.task != "explore"
+                else "explore/weight" in stored
+            )
     assert touch.fitted_on(config) == touch.fitted_on(BioTac(name="other", slots=3, seed=5).handle.config)
     assert touch.fitted_on(config)["skin"] != touch.fitted_on(BioTac(skin="default").handle.config)["skin"]
 
@@ -200,7 +231,11 @@ def test_every_estimator_says_what_it_was_fitted_on():
 @pytest.mark.parametrize(
     "settings, text",
     [
-        ({"tier": "full"}, r"'press' was fitted on a BioTac with tier 'condensed' \(here 'full'\).*--estimators press --skin SKIN"),
+        (
+            {"tier": "full"},
+            r"'press' was fitted on a BioTac with tier 'condensed' \(here 'full'\).*--estimators press "
+            r"--skin SKIN",
+        ),
         ({"material": "rubber"}, r"with material 'default' \(here 'rubber'\)"),
         ({"skin": "default"}, r"with skin '\w{16}' \(here '\w{16}'\)"),
         ({"liquid": False}, r"liquid True \(here False\).*calibration=FILE"),
@@ -246,7 +281,9 @@ def test_touch_is_tared():
         felt = reader.update({"a/electrodes": REST_COUNTS["2"] + 100, "a/pdc": np.array([2300.0])})
     assert felt.shape == (1, 20) and (felt[0, :19] < -0.5).all()  # counts rise where ln Z falls
     assert felt[0, 19] == pytest.approx(2.0, abs=0.05)
-    with pytest.raises(ValueError, match="no electrodes in the observation: load the task with observe='tactile'"):
+    with pytest.raises(
+        ValueError, match="no electrodes in the observation: load the task with observe='tactile'"
+    ):
         reader.update({"position": np.zeros(3)})
 
 
@@ -307,8 +344,12 @@ def test_dm_controls_pixels():
     gl = find_gl()
     if gl not in ("egl", "osmesa"):
         pytest.skip("no GL library to render pixels with: install libosmesa6 or EGL")
-    environ = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": gl}
-    done = subprocess.run([sys.executable, "-c", _PIXELS], env=environ, capture_output=True, text=True, timeout=600)
+    environ = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"} | {
+        "MUJOCO_GL": gl
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", _PIXELS], env=environ, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -318,7 +359,10 @@ def test_example_puts_it_on_an_existing_model(repo, capsys):
 
     force, step = load_example(repo, "existing_model").main()
     assert force[1] == pytest.approx((0.05 + 0.003965) * 9.81, rel=0.01)
-    assert step.observation["biotac/electrodes"].shape == (19,) and "force on the fingertip" in capsys.readouterr().out
+    assert (
+        step.observation["biotac/electrodes"].shape == (19,)
+        and "force on the fingertip" in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(
@@ -326,11 +370,20 @@ def test_example_puts_it_on_an_existing_model(repo, capsys):
     [
         (lambda: load("arm", "press"), "no domain 'arm': choose one of finger, gripper"),
         (lambda: load("finger", "push"), "domain 'finger' has no task 'push': choose one of press"),
-        (lambda: load("finger", "press", task_kwargs={"observe": "touch"}), "unknown preset observe='touch': choose one of tactile"),
-        (lambda: load("finger", "explore", task_kwargs={"objects": ["peg"]}), "no object 'peg': choose from sphere_3-5mm"),
+        (
+            lambda: load("finger", "press", task_kwargs={"observe": "touch"}),
+            "unknown preset observe='touch': choose one of tactile",
+        ),
+        (
+            lambda: load("finger", "explore", task_kwargs={"objects": ["peg"]}),
+            "no object 'peg': choose from sphere_3-5mm",
+        ),
         (lambda: BioTac(site="tip"), "BioTac got site='tip': an Entity is placed with robot.attach"),
         (lambda: BioTac(tier="fast"), "unknown tier 'fast': choose one of full, condensed"),
-        (lambda: scripted.make_controller("juggle"), "no scripted controller for task 'juggle': there are press"),
+        (
+            lambda: scripted.make_controller("juggle"),
+            "no scripted controller for task 'juggle': there are press",
+        ),
         (
             lambda: touch.load_estimator("juggle"),
             "no calibration of task 'juggle': run `python -m biotac_mj.tasks.calibrate --estimators juggle`",
@@ -351,8 +404,16 @@ def test_scores_of_several_files_make_one_table(repo, tmp_path, monkeypatch, cap
     benchmark = importlib.import_module("tasks")
 
     def row(task, seed, score):
-        return {"domain": "gripper", "task": task, "policy": "scripted", "seed": seed, "score": score, "last_second": score,
-                "failed_steps": seed, "seconds": 2.0 + seed}  # fmt: skip
+        return {
+            "domain": "gripper",
+            "task": task,
+            "policy": "scripted",
+            "seed": seed,
+            "score": score,
+            "last_second": score,
+            "failed_steps": seed,
+            "seconds": 2.0 + seed,
+        }
 
     first, second = tmp_path / "first.json", tmp_path / "second.json"
     first.write_text(json.dumps({"rows": [row("hold", 0, 0.1), row("lift", 0, 0.5)]}))

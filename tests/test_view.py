@@ -1,4 +1,5 @@
-"""View: the scene carries a ball's weight, is rendered with coloured electrodes, and is stepped while its window is open."""
+"""View: the scene carries a ball's weight, is rendered with coloured electrodes, and is stepped while its
+window is open."""
 
 import contextlib
 
@@ -48,7 +49,9 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     view.view(skin="coarse")
     data = seen["data"]
-    assert np.linalg.norm(Window.cam.lookat) < 0.02 and Window.cam.distance < 0.1  # looks at the fingertip, not past it
+    assert (
+        np.linalg.norm(Window.cam.lookat) < 0.02 and Window.cam.distance < 0.1
+    )  # looks at the fingertip, not past it
     assert seen["syncs"] == 75 and data.time == pytest.approx(75 * 4e-3)
     # the ball of 100 g has come to rest: the pad, up here, carries it
     assert np.abs(data.qvel).max() < 1e-3

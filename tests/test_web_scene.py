@@ -14,8 +14,14 @@ XML = """<mujoco><asset>
   <body name="moving" pos=".1 .2 .3" euler="20 30 40"><freejoint/>
     <geom name="{kind}" type="{kind}" {size} pos=".01 0 .02" euler="10 0 50" material="red"/></body></worldbody></mujoco>"""
 
-SIZES = {"sphere": 'size=".02"', "ellipsoid": 'size=".01 .02 .03"', "box": 'size=".01 .02 .03"', "capsule": 'size=".01 .02"',
-         "cylinder": 'size=".01 .02"', "mesh": 'mesh="wedge"'}  # fmt: skip
+SIZES = {
+    "sphere": 'size=".02"',
+    "ellipsoid": 'size=".01 .02 .03"',
+    "box": 'size=".01 .02 .03"',
+    "capsule": 'size=".01 .02"',
+    "cylinder": 'size=".01 .02"',
+    "mesh": 'mesh="wedge"',
+}
 
 
 @pytest.mark.parametrize("kind", SIZES)

@@ -1,4 +1,5 @@
-"""The page in the browser: what an HTTP client and a websocket client get from it, and what a headless browser shows."""
+"""The page in the browser: what an HTTP client and a websocket client get from it, and what a headless
+browser shows."""
 
 import asyncio
 import urllib.request
@@ -24,7 +25,9 @@ def messages(page, seconds=1.0):
     async def listen():
         frames = []
         address = page.url.replace("http", "ws")
-        async with websockets.connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as socket:
+        async with websockets.connect(
+            address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None
+        ) as socket:
             try:
                 while True:
                     frames.append(await asyncio.wait_for(socket.recv(), seconds))
@@ -33,7 +36,8 @@ def messages(page, seconds=1.0):
 
     out = []
     for frame in asyncio.run(listen()):
-        # two lengths, a compressed msgpack, then the arrays it refers to, each aligned to 8 bytes (viser/infra/_infra.py)
+        # two lengths, a compressed msgpack, then the arrays it refers to, each aligned to 8 bytes
+        # (viser/infra/_infra.py)
         size = int.from_bytes(frame[8:16], "little")
         content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size]))
         arrays, at = [], 16 + size
@@ -70,7 +74,9 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     counts = np.full(19, 3000.0)
     counts[4] -= 300
     for time in (0.1, 0.2):
-        page.update(time, {"left": (moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]), np.array([1.0, 0, 0, 0]))})
+        page.update(
+            time, {"left": (moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]), np.array([1.0, 0, 0, 0]))}
+        )
     found = messages(page)
     names = {m.get("name") for m, _ in found}
     assert {"/left", "/left/skin", "/left/core", *(f"/left/e{i}" for i in range(1, 20))} <= names
@@ -78,7 +84,9 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     text = repr([m for m, _ in found])
     assert "t = 0.200 s" in text and "force [N]" in text and "'e19'" in text
     # the electrode whose counts fell is red, the others are grey
-    assert tuple(page._scene["left"][2][4].color) == (204, 38, 25) and tuple(page._scene["left"][2][5].color) == (216, 216, 216)
+    assert tuple(page._scene["left"][2][4].color) == (204, 38, 25) and tuple(
+        page._scene["left"][2][5].color
+    ) == (216, 216, 216)
     rows = page._gui["left"][1].data
     np.testing.assert_allclose(rows[0], [0.1, 0.2])
     np.testing.assert_allclose(rows[5], [-300, -300])
@@ -104,7 +112,9 @@ def test_a_browser_shows_the_finger_wherever_it_is_and_what_it_feels(page, shell
         page.update(0.1, {"left": (vert, counts, 50.0, 0.4, *pose)})
         # the skin, and on the map the electrode whose counts fell; the page may draw one before the other
         before = window.until(lambda picture: len(green(picture)) > 3000 and red_on_the_map(picture) > 100)
-        assert np.abs(green(before).mean(0) - np.array(before.shape[:2]) / 2).max() < 70  # in the middle of the page
+        assert (
+            np.abs(green(before).mean(0) - np.array(before.shape[:2]) / 2).max() < 70
+        )  # in the middle of the page
         wide = vert * [1, 1, 1.6]
         page.update(0.2, {"left": (wide, counts, 50.0, 0.4, *pose)})
         window.until(lambda picture: len(green(picture)) > 1.15 * len(green(before)))
@@ -127,7 +137,9 @@ def test_a_recorded_press_is_played(synthetic_press, tmp_path):
     page = web_view.play_file(tmp_path / "skin.h5", speed=1e3, rounds=1, port=8932)
     try:
         finger = page.fingers["biotac"]
-        np.testing.assert_allclose(vertices(messages(page), "/biotac/skin"), synthetic_press.vert_xpos[-1][finger.node], atol=1e-7)
+        np.testing.assert_allclose(
+            vertices(messages(page), "/biotac/skin"), synthetic_press.vert_xpos[-1][finger.node], atol=1e-7
+        )
         rows = page._gui["biotac"][2].data
         np.testing.assert_allclose(rows[1], np.linalg.norm(synthetic_press.force, axis=1), atol=1e-9)
     finally:
@@ -141,7 +153,8 @@ def test_a_model_is_shown_while_it_steps():
     import biotac_mj
 
     spec = mujoco.MjSpec.from_string(
-        '<mujoco><option timestep="0.01"/><worldbody><body mocap="true" pos="-.01 -.0175 0"><geom size=".01"/></body></worldbody></mujoco>'
+        '<mujoco><option timestep="0.01"/><worldbody><body mocap="true" pos="-.01 -.0175 0"><geom '
+        'size=".01"/></body></worldbody></mujoco>'
     )
     handle = biotac_mj.attach(spec, skin=spring_skin.pad_geometry(), stepper="springs", readings="sum")
     model = spec.compile()
@@ -158,9 +171,15 @@ def test_a_model_is_shown_while_it_steps():
     "arguments, text",
     [
         (["view", "--recording", "x.h5"], "a recording is shown in the browser: add --web"),
-        (["view", "--web", "--recording", "/no/such.h5"], "no recording at /no/such.h5: make one with `biotac press --out DIR`"),
+        (
+            ["view", "--web", "--recording", "/no/such.h5"],
+            "no recording at /no/such.h5: make one with `biotac press --out DIR`",
+        ),
         (["view", "--web", "--recording", __file__], "is no recorded press"),
-        (["view", "--web", "--hand", "/no/hand.xml"], "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand"),
+        (
+            ["view", "--web", "--hand", "/no/hand.xml"],
+            "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand",
+        ),
     ],
 )
 def test_bad_input(arguments, text, capsys):

@@ -1,4 +1,5 @@
-"""Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step` (docs/batch.md)."""
+"""Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step`
+(docs/batch.md)."""
 
 from .attach import add, attach, make
 from .batch import Batch

@@ -1,4 +1,5 @@
-"""`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them into `mujoco_warp.step`."""
+"""`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them
+into `mujoco_warp.step`."""
 
 import dataclasses
 import warnings
@@ -41,8 +42,8 @@ def add(
     """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
 
     Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can touch and move against the
-        BioTac now, and names those that have no name.
+      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can
+        touch and move against the BioTac now, and names those that have no name.
       site, body: name of the site or the body it is fixed to; neither is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds.
@@ -67,13 +68,16 @@ def add(
         spec.attach(child, frame=own.add_frame(), prefix=prefix)
     _add_slots(spec, spec.body(prefix + "core"), prefix, len(bodies))
     for i, name in enumerate(bodies):
-        weld = spec.equality(f"{prefix}couple{i}")  # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
+        weld = spec.equality(
+            f"{prefix}couple{i}"
+        )  # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
         weld.active, weld.name2 = True, name
     return prefix
 
 
 def _movers(spec, own, prefix, geoms):
-    """Names of the bodies with joints, or the world, that carry geoms which can touch and move against body `own`."""
+    """Names of the bodies with joints, or the world, that carry geoms which can touch and move against body
+    `own`."""
     own, names = _mover(own), {}
     for geom in spec.geoms:
         if not (geom.contype or geom.conaffinity) if geoms is None else geom.name not in geoms:
@@ -109,27 +113,40 @@ def attach(
     readings=True,
     options=None,
 ) -> Batch:
-    """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on `mjw.step(m, d)` steps them too.
+    """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on
+    `mjw.step(m, d)` steps them too.
 
     Args:
-      mjm: the MjModel, made from a spec that `add` changed; m, d: mujoco_warp's Model and Data of it. Make room for six constraint rows
-        per touching body that moves: `mjw.put_data(mjm, mjd, nworld)` after `mj_forward` does, `mjw.make_data` with `njmax`.
+      mjm: the MjModel, made from a spec that `add` changed; m, d: mujoco_warp's Model and Data of it. Make
+        room for six constraint rows per touching body that moves: `mjw.put_data(mjm, mjd, nworld)` after
+        `mj_forward` does, `mjw.make_data` with `njmax`.
       prefix, skin: as given to `add`.
-      material: name, dict or Material of all worlds, or a sequence of one for each world, all of one law and element.
+      material: name, dict or Material of all worlds, or a sequence of one for each world, all of one law and
+        element.
       liquid, priority, coupling, geoms, rounding: as for `biotac_mj.attach`.
       friction: of the skin, one number or (nworld,); None takes the material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
-      readings: False leaves the electrodes and pressure channels out (force and status remain); True or a dict of `PhysicsReadings`'
-        settings: noise, sensor, film_every_step, temperature; or what `SensorBioTac(...).batch()` gives.
+      readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
+        dict of `PhysicsReadings`' settings: noise, sensor, film_every_step, temperature; or what
+        `SensorBioTac(...).batch()` gives.
       options: {"skin": {...}} settings of SkinOptions.
 
     Raises:
-      ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or (two-way) equality
-        constraints disabled, or has no room for the rows; a number of materials or frictions that is not nworld.
+      ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or
+        (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
+        frictions that is not nworld.
     """
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
-    settings = dict(material=material, liquid=liquid, friction=friction, priority=priority, geoms=geoms, rounding=rounding, options=options)
+    settings = dict(
+        material=material,
+        liquid=liquid,
+        friction=friction,
+        priority=priority,
+        geoms=geoms,
+        rounding=rounding,
+        options=options,
+    )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
     slots = {}
     if coupling == "two-way":
@@ -137,35 +154,60 @@ def attach(
         _warn_of_damping(mjm, touching)
     film, acquisition = _readings(readings, rest_geometry(config, geometry), d.nworld, seed, device)
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
-    batch = Batch(mjm, touching, slots, skin_of(bool(slots)), film, acquisition, addresses, coupling == "two-way")
+    batch = Batch(
+        mjm, touching, slots, skin_of(bool(slots)), film, acquisition, addresses, coupling == "two-way"
+    )
     Hook.of(m).add(batch)
     return batch
 
 
 def make(
-    mjm, nworld, device=None, prefix="biotac_", skin="default", material=None, liquid=None, friction=None, priority=0, geoms=None,
-    rounding=None, seed=0, readings=True, options=None,
-) -> PoseBatch:  # fmt: skip
-    """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step, such as mjx.
+    mjm,
+    nworld,
+    device=None,
+    prefix="biotac_",
+    skin="default",
+    material=None,
+    liquid=None,
+    friction=None,
+    priority=0,
+    geoms=None,
+    rounding=None,
+    seed=0,
+    readings=True,
+    options=None,
+) -> PoseBatch:
+    """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step,
+    such as mjx.
 
     Args:
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options: as for `attach`.
+      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options: as for
+      `attach`.
 
     Raises:
       ValueError: see `attach`.
     """
     device = str(wp.get_device(device))
-    settings = dict(material=material, liquid=liquid, friction=friction, priority=priority, geoms=geoms, rounding=rounding, options=options)
+    settings = dict(
+        material=material,
+        liquid=liquid,
+        friction=friction,
+        priority=priority,
+        geoms=geoms,
+        rounding=rounding,
+        options=options,
+    )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
     film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, device)
     return PoseBatch(mjm, touching, skin_of(False), film, acquisition)
 
 
 def _skins(mjm, prefix, skin, nworld, device, settings):
-    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one BioTac."""
+    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one
+    BioTac."""
     material, friction, priority = settings["material"], settings["friction"], int(settings["priority"])
     materials = _materials(material, nworld)
     single = dataclasses.asdict(materials[0]) if materials else material
@@ -174,19 +216,31 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         single = dataclasses.asdict(single)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     config = Config(
-        skin=reference(skin)[0], material=single, liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
-        geoms=settings["geoms"], rounding=dict(settings["rounding"] or {}), friction=float(mu[0]), priority=priority, device=device,
+        skin=reference(skin)[0],
+        material=single,
+        liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
+        geoms=settings["geoms"],
+        rounding=dict(settings["rounding"] or {}),
+        friction=float(mu[0]),
+        priority=priority,
+        device=device,
         options=dict(settings["options"] or {}),
-    )  # fmt: skip
+    )
     core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
-        raise ValueError(f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are {names}")
+        raise ValueError(
+            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are "
+            f"{names}"
+        )
     touching = Touching(ModelView(mjm._address), core, config)
     geometry = reference(skin)[1]
     fem = skin_model(geometry, *_choices(config), device)
     if fem.options.dynamics != "quasistatic":
-        raise ValueError("a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia")
+        raise ValueError(
+            "a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use "
+            "biotac_mj.attach for inertia"
+        )
     grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
@@ -201,7 +255,9 @@ def _materials(material, nworld):
         return None
     out = [Material(**x) if isinstance(x, dict) else preset(x) for x in material]
     if len(out) != nworld:
-        raise ValueError(f"{len(out)} materials for {nworld} worlds: pass one for each, or a single one for all")
+        raise ValueError(
+            f"{len(out)} materials for {nworld} worlds: pass one for each, or a single one for all"
+        )
     return out
 
 
@@ -215,7 +271,11 @@ def _per_world(value, nworld, default):
 def _frictions(mjm, geom, friction, priority):
     """(nworld, ngeom) by MuJoCo's rule: the larger one, or that of the higher priority."""
     other, rank = mjm.geom_friction[geom, 0], mjm.geom_priority[geom]
-    return np.where(rank == priority, np.maximum(other, friction[:, None]), np.where(rank > priority, other, friction[:, None]))
+    return np.where(
+        rank == priority,
+        np.maximum(other, friction[:, None]),
+        np.where(rank > priority, other, friction[:, None]),
+    )
 
 
 def _sensor(mjm, name):
@@ -224,11 +284,18 @@ def _sensor(mjm, name):
 
 def _check_model(mjm, coupling):
     if mjm.opt.integrator in (int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_DISCRETE)):
-        raise ValueError("a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler")
+        raise ValueError(
+            "a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler"
+        )
     if mjm.opt.disableflags & _SPRINGLESS == _SPRINGLESS:
-        raise ValueError("mujoco_warp asks for no passive forces where springs and dampers are both disabled: enable one of the flags")
+        raise ValueError(
+            "mujoco_warp asks for no passive forces where springs and dampers are both disabled: enable one "
+            "of the flags"
+        )
     if coupling == "two-way" and mjm.opt.disableflags & _ROWLESS:
-        raise ValueError("two-way coupling needs the flags constraint and equality: enable them, or use coupling='one-way'")
+        raise ValueError(
+            "two-way coupling needs the flags constraint and equality: enable them, or use coupling='one-way'"
+        )
     if mjm.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
         raise ValueError("a touched body must not sleep: disable the flag sleep")
 
@@ -239,14 +306,17 @@ def _warn_of_damping(mjm, touching):
     for i in np.flatnonzero(np.isin(mjm.dof_treeid, list(trees)) & (damped > _DAMPED)):
         joint = mjm.jnt(int(mjm.dof_jntid[i])).name or f"#{mjm.dof_jntid[i]}"
         warnings.warn(
-            f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the batch solves its skins where "
-            "the body would go without the integrator's damping; take smaller steps, less damping, or biotac_mj.attach on the CPU",
+            f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the "
+            "batch solves its skins where "
+            "the body would go without the integrator's damping; take smaller steps, less damping, or "
+            "biotac_mj.attach on the CPU",
             stacklevel=3,
         )
 
 
 def _slots(mjm, m, d, touching, prefix):
-    """{group that moves against the BioTac: weld constraint whose rows it gets}; the other welds are switched off, in m and d."""
+    """{group that moves against the BioTac: weld constraint whose rows it gets}; the other welds are switched
+    off, in m and d."""
     core, tree = touching.core, mjm.body_treeid
     roots = [int(mjm.body_weldid[b]) if tree[b] >= 0 else 0 for b in touching.body]
     needed = sorted({root for root in roots if root or tree[core] >= 0})
@@ -255,12 +325,19 @@ def _slots(mjm, m, d, touching, prefix):
     without = [mjm.body(root).name or f"#{root}" for root in needed if root not in place]
     if without:
         raise ValueError(
-            f"there is no room for two-way coupling of the BioTac {prefix!r} with {', '.join(without)}: add it after the objects, with "
-            "coupling='two-way', or name the geoms that may touch with add(geoms=[...]) and attach(geoms=[...])"
+            f"there is no room for two-way coupling of the BioTac {prefix!r} with {', '.join(without)}: add "
+            "it after the objects, with "
+            "coupling='two-way', or name the geoms that may touch with add(geoms=[...]) and "
+            "attach(geoms=[...])"
         )
-    rows = sum(6 if t == mujoco.mjtEq.mjEQ_WELD else 3 if t == mujoco.mjtEq.mjEQ_CONNECT else 1 for t in mjm.eq_type)
+    rows = sum(
+        6 if t == mujoco.mjtEq.mjEQ_WELD else 3 if t == mujoco.mjtEq.mjEQ_CONNECT else 1 for t in mjm.eq_type
+    )
     if needed and d.njmax < rows + 7:
-        raise ValueError(f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a larger njmax")
+        raise ValueError(
+            f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a "
+            "larger njmax"
+        )
     active0, active = m.eq_active0.numpy().copy(), d.eq_active.numpy().copy()
     for root, weld in place.items():
         active0[weld] = active[:, weld] = root in needed
@@ -280,7 +357,9 @@ def _readings(choice, geometry, nworld, seed, device):
     if settings.pop("signal", "physics") != "physics":
         from ..learning.serve import LearnedBatchFilm
 
-        film = LearnedBatchFilm(geometry, nworld, device, settings.pop("weights", None), settings.pop("sensor", "1"))
+        film = LearnedBatchFilm(
+            geometry, nworld, device, settings.pop("weights", None), settings.pop("sensor", "1")
+        )
         return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)
     film = BatchFilm(FilmConduction(geometry, sensor=settings.pop("sensor", "1")), nworld, device)
     return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)

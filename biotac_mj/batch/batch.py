@@ -1,7 +1,9 @@
-"""The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA graph.
+"""The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA
+graph.
 
 Once per step, when mujoco_warp asks for passive forces, as `coupling/world.py` does for one world:
-1. the linear models of the last step enter the dynamics, and mujoco_warp's own later stages say where the bodies go;
+1. the linear models of the last step enter the dynamics, and mujoco_warp's own later stages say where the
+   bodies go;
 2. the skins are solved there;
 3. their new linear models take the old ones' place, and mujoco_warp goes on.
 The readings are written when it asks for the velocity sensors.
@@ -34,7 +36,10 @@ class Batch(Skins):
             self._group_slot = wp.array(np.array(group_slot, np.int32), dtype=int)
             self._row = wp.full((len(weld), self.nworld), -1, dtype=int)
             self._jacobian = wp.zeros((*self.groups, mjm.nv), dtype=wp.spatial_vectord)
-            self._start_pos, self._start_mat = wp.zeros(self.groups, dtype=wp.vec3d), wp.zeros(self.groups, dtype=wp.mat33d)
+            self._start_pos, self._start_mat = (
+                wp.zeros(self.groups, dtype=wp.vec3d),
+                wp.zeros(self.groups, dtype=wp.mat33d),
+            )
             self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
 
     def predict(self, m, d):
@@ -47,13 +52,19 @@ class Batch(Skins):
             [self._start_pos, self._start_mat, self._jacobian],
         )
         if self.moving:
-            self._launch(dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row])
+            self._launch(
+                dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
+            )
 
     def act(self, m, d):
         """Puts the linear models into the forces and the rows."""
         model = [self.wrench0, self.tangent0, self.pos0, self.mat0]
-        self._launch(dynamics.linear_models, self.groups, [self._start_pos, self._start_mat, *model], [self._wrench])
-        self._launch(dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive])
+        self._launch(
+            dynamics.linear_models, self.groups, [self._start_pos, self._start_mat, *model], [self._wrench]
+        )
+        self._launch(
+            dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive]
+        )
         efc = d.efc
         self._launch(
             dynamics.write_rows,
@@ -67,13 +78,19 @@ class Batch(Skins):
         """Solves the skins where the bodies go, with d.qacc or without acceleration."""
         pos, mat = self._start_pos, self._start_mat
         if accelerated:
-            self._launch(dynamics.follow, self.groups, [self.dt**2, self._jacobian, d.qacc, pos, mat], [self._pos, self._mat])
+            self._launch(
+                dynamics.follow,
+                self.groups,
+                [self.dt**2, self._jacobian, d.qacc, pos, mat],
+                [self._pos, self._mat],
+            )
             pos, mat = self._pos, self._mat
         self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
 
 
 class Hook:
-    """What a mujoco_warp Model calls: all batches of the Model step together, after callbacks that were there before."""
+    """What a mujoco_warp Model calls: all batches of the Model step together, after callbacks that were there
+    before."""
 
     def __init__(self, m):
         self.batches = []
@@ -123,7 +140,8 @@ class Hook:
 
 
 def _accelerate(m, d):
-    """The accelerations under the present passive forces and rows, by mujoco_warp's own later stages; it does them again afterwards."""
+    """The accelerations under the present passive forces and rows, by mujoco_warp's own later stages; it does
+    them again afterwards."""
     import mujoco_warp as mjw
     from mujoco_warp._src import smooth
 

@@ -1,8 +1,8 @@
-"""The skin's linear model in mujoco_warp's dynamics: the equations of `coupling/` (docs/coupling.md) for all worlds at once.
+"""The skin's linear model in mujoco_warp's dynamics: the equations of `coupling/` (docs/coupling.md) for all
+worlds at once.
 
-Arrays of mujoco_warp lead with the world and are single precision; ours are [item, world] and double. A wrench or a small motion has its
-linear part first. Everything is in the BioTac frame, about its origin.
-"""
+Arrays of mujoco_warp lead with the world and are single precision; ours are [item, world] and double. A
+wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin."""
 
 import mujoco
 import warp as wp
@@ -70,7 +70,9 @@ def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.ar
 
 
 @wp.func
-def _ahead_mat(b: int, w: int, h: real, xmat: wp.array2d(dtype=wp.mat33), cvel: wp.array2d(dtype=wp.spatial_vector)):
+def _ahead_mat(
+    b: int, w: int, h: real, xmat: wp.array2d(dtype=wp.mat33), cvel: wp.array2d(dtype=wp.spatial_vector)
+):
     return rotation(h * vector(wp.spatial_top(cvel[w, b]))) * matrix(xmat[w, b])
 
 
@@ -92,7 +94,8 @@ def advance_groups(
     mat_out: wp.array2d(dtype=mat33),
     jacobian_out: wp.array3d(dtype=vec6),
 ):
-    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative to the BioTac."""
+    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative
+    to the BioTac."""
     g, w = wp.tid()
     b = body[g]
     frame = _ahead_mat(core, w, h, xmat, cvel)
@@ -105,7 +108,9 @@ def advance_groups(
     turn = wp.transpose(matrix(xmat[w, core]))
     here = vector(xpos[w, core])
     for i in range(jacobian_out.shape[2]):
-        share = real(isdofancestor[b, i] - isdofancestor[core, i])  # the bodies' own columns differ in sign alone: both are about `here`
+        share = real(
+            isdofancestor[b, i] - isdofancestor[core, i]
+        )  # the bodies' own columns differ in sign alone: both are about `here`
         j = vec6()
         if finite and share != real(0.0):
             spin = vector(wp.spatial_top(cdof[w, i]))
@@ -183,7 +188,8 @@ def find_rows(
     # Out:
     row_out: wp.array2d(dtype=int),
 ):
-    """The first of the six rows of each weld that holds a slot [slot, world]; -1 where there was no room for it."""
+    """The first of the six rows of each weld that holds a slot [slot, world]; -1 where there was no room for
+    it."""
     s, w = wp.tid()
     row = int(-1)
     for r in range(wp.min(ne[w], efc_id.shape[1])):
@@ -193,7 +199,9 @@ def find_rows(
 
 
 @wp.func
-def tangent_diagonal(tangent: wp.array2d(dtype=mat66), group_slot: wp.array(dtype=int), s: int, w: int, k: int):
+def tangent_diagonal(
+    tangent: wp.array2d(dtype=mat66), group_slot: wp.array(dtype=int), s: int, w: int, k: int
+):
     total = real(0.0)
     for g in range(tangent.shape[0]):
         if group_slot[g] == s:

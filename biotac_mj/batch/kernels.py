@@ -1,14 +1,23 @@
 """Poses in, linear models kept, forces and readings out: kernels of `skins.py`.
 
-Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A wrench or a small motion has its
-linear part first. Everything is in the BioTac frame, about its origin, where nothing else is said.
-"""
+Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A
+wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin, where
+nothing else is said."""
 
 import warp as wp
 
 from ..skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
-__all__ = ["accept_models", "body_forces", "geom_poses", "matrix", "relative_poses", "reset_models", "vector", "write_sensors"]
+__all__ = [
+    "accept_models",
+    "body_forces",
+    "geom_poses",
+    "matrix",
+    "relative_poses",
+    "reset_models",
+    "vector",
+    "write_sensors",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,13 +73,18 @@ def geom_poses(
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
-    """Poses of the geoms [geom, world] on bodies at pos, mat [group, world]; quaternions are mujoco_warp's (w, x, y, z)."""
+    """Poses of the geoms [geom, world] on bodies at pos, mat [group, world]; quaternions are mujoco_warp's
+    (w, x, y, z)."""
     k, w = wp.tid()
     g = geom[k]
     q = geom_quat[w % geom_quat.shape[0], g]
     a = real(q[0])
     u = vec3(real(q[1]), real(q[2]), real(q[3]))
-    local = (a * a - wp.dot(u, u)) * wp.identity(n=3, dtype=real) + real(2.0) * wp.outer(u, u) + real(2.0) * a * wp.skew(u)
+    local = (
+        (a * a - wp.dot(u, u)) * wp.identity(n=3, dtype=real)
+        + real(2.0) * wp.outer(u, u)
+        + real(2.0) * a * wp.skew(u)
+    )
     scale = a * a + wp.dot(u, u)  # stored in single precision
     R = mat[group[k], w]
     pos_out[k, w] = pos[group[k], w] + R * vector(geom_pos[w % geom_pos.shape[0], g])
@@ -92,7 +106,8 @@ def accept_models(
     mat0: wp.array2d(dtype=mat33),
     failed: wp.array(dtype=int),
 ):
-    """The linear models of this step: of the skin just solved; its last wrench where it found no balance; none where the input was bad."""
+    """The linear models of this step: of the skin just solved; its last wrench where it found no balance;
+    none where the input was bad."""
     g, w = wp.tid()
     why = reason[w]
     if why == NOT_FINITE or why == INSIDE_CORE:
@@ -145,7 +160,8 @@ def body_forces(
     # Out:
     xfrc_out: wp.array3d(dtype=float),
 ):
-    """Wrenches on the bodies' centres of mass in the world's frame; the BioTac's body gets the opposite of all."""
+    """Wrenches on the bodies' centres of mass in the world's frame; the BioTac's body gets the opposite of
+    all."""
     w = wp.tid()
     for b in range(xfrc_out.shape[1]):
         for i in range(6):
@@ -184,7 +200,8 @@ def write_sensors(
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
-    """Readings at the addresses of electrodes, pdc, pac, tac, tdc, contact_force and status; -1: the model has no such sensor."""
+    """Readings at the addresses of electrodes, pdc, pac, tac, tdc, contact_force and status; -1: the model
+    has no such sensor."""
     w = wp.tid()
     if address[0] >= 0:
         for e in range(19):

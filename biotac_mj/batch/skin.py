@@ -1,4 +1,5 @@
-"""The skins of all worlds behind one small door: geoms where they will be in, wrenches, tangents and liquid out, all on the device."""
+"""The skins of all worlds behind one small door: geoms where they will be in, wrenches, tangents and liquid
+out, all on the device."""
 
 import warp as wp
 
@@ -25,10 +26,13 @@ class BatchSkin:
       data: the SkinData: positions, materials and liquids.
       pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before `step`.
       x: (nvert, nworld) nodes [m].
-      wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's origin [N, N m].
+      wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
+        origin [N, N m].
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
-      pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the energy norm, estimated.
-      reason: (nworld,) int: 0, or why the last step failed (`skin.device_worlds`). iterations: (nworld,) int of the last step.
+      pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
+        energy norm, estimated.
+      reason: (nworld,) int: 0, or why the last step failed (`skin.device_worlds`). iterations: (nworld,) int
+        of the last step.
     """
 
     def __init__(self, model: SkinModel, nworld, geoms, grids, friction, materials=None, tangents=True):
@@ -56,7 +60,10 @@ class BatchSkin:
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
             self.pressure = wp.zeros(nworld, dtype=wp.float64)
             rows = (self._small.capacity if tangents else 0, nworld)
-            self._row_group, self._row_part = wp.zeros(rows, dtype=int), wp.zeros(rows, dtype=wp.spatial_matrixd)
+            self._row_group, self._row_part = (
+                wp.zeros(rows, dtype=int),
+                wp.zeros(rows, dtype=wp.spatial_matrixd),
+            )
             self._rest = self.data.rest_vert
 
     @property
@@ -65,38 +72,79 @@ class BatchSkin:
         return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
     def step(self):
-        """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA graph.
+        """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA
+        graph.
 
-        A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its last good state.
-        """
+        A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its
+        last good state."""
         m, d, small = self.model, self.data, self._small
         step_device(m, d, self.geoms)
         self._launch(
-            kernels.read_outputs, self.nworld, [m.rest.pressure, int(m.has_liquid), d.worlds, self._wrench], [self.pressure, self.wrench]
+            kernels.read_outputs,
+            self.nworld,
+            [m.rest.pressure, int(m.has_liquid), d.worlds, self._wrench],
+            [self.pressure, self.wrench],
         )
         if self._tangents and self.ngroup:
             o, rows = d.outer, self._row_group.shape
-            touched = [m.outer.start, m.outer.slot, len(m.sample), o.touching, o.trial_geom, self.geoms.struct.group]
+            touched = [
+                m.outer.start,
+                m.outer.slot,
+                len(m.sample),
+                o.touching,
+                o.trial_geom,
+                self.geoms.struct.group,
+            ]
             self._launch(kernels.group_rows, rows, [small.size, small.node, *touched], [self._row_group])
-            self._launch(kernels.drag_rows, rows, [small.liquid, small.size, small.node, small._G, d.x, self._row_group], [self._row_part])
-            self._launch(kernels.sum_rows, self.tangent.shape, [small.size, self._row_group, self._row_part], [self.tangent])
+            self._launch(
+                kernels.drag_rows,
+                rows,
+                [small.liquid, small.size, small.node, small._G, d.x, self._row_group],
+                [self._row_part],
+            )
+            self._launch(
+                kernels.sum_rows,
+                self.tangent.shape,
+                [small.size, self._row_group, self._row_part],
+                [self.tangent],
+            )
 
     def reset(self, mask):
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
         m, d, n = self.model, self.data, self.nworld
-        self._launch(kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity])
+        self._launch(
+            kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity]
+        )
         for state in [d.outer] + ([d.core] if d.core else []):
-            self._launch(kernels.reset_samples, state.anchor_geom.shape, [mask], [state.anchor_geom, state.trial_geom])
-            self._launch(kernels.reset_faces, state.touching.shape, [mask], [state.touching, state.kept, state.clearance])
-        self._launch(kernels.reset_geoms, self.pos.shape, [mask], [self.geoms.struct.pos_last, self._motion, self._touched_by])
-        self._launch(kernels.reset_worlds, n, [mask, m.rest.pressure if m.has_liquid else 0.0], [d.worlds, self.pressure])
+            self._launch(
+                kernels.reset_samples, state.anchor_geom.shape, [mask], [state.anchor_geom, state.trial_geom]
+            )
+            self._launch(
+                kernels.reset_faces,
+                state.touching.shape,
+                [mask],
+                [state.touching, state.kept, state.clearance],
+            )
+        self._launch(
+            kernels.reset_geoms,
+            self.pos.shape,
+            [mask],
+            [self.geoms.struct.pos_last, self._motion, self._touched_by],
+        )
+        self._launch(
+            kernels.reset_worlds,
+            n,
+            [mask, m.rest.pressure if m.has_liquid else 0.0],
+            [d.worlds, self.pressure],
+        )
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
 
 
 def _world_bytes(nworld, *roots):
-    """Bytes of the wp.arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that objects hold."""
+    """Bytes of the wp.arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that
+    objects hold."""
     seen, total, stack = set(), 0, list(roots)
     while stack:
         thing = stack.pop()

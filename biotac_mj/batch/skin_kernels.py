@@ -1,10 +1,11 @@
-"""Kernels of `skin.py`: outputs of the device step, the stiffness that a touching body feels, reset of some worlds.
+"""Kernels of `skin.py`: outputs of the device step, the stiffness that a touching body feels, reset of some
+worlds.
 
-The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its corrected compliance C:
-R' (D - D C D) R with the body's rigid motions R (`skin.preconditioner.body_tangent`). The device step has just made G = (I + D W)^-1 D over
-all touching nodes for its linear solves, and that is D - D C D; a body's tangent is R' G R over the nodes that it touches. Nodes that two
-bodies touch count for one of them.
-"""
+The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its
+corrected compliance C: R' (D - D C D) R with the body's rigid motions R (`skin.preconditioner.body_tangent`).
+The device step has just made G = (I + D W)^-1 D over all touching nodes for its linear solves, and that is D
+- D C D; a body's tangent is R' G R over the nodes that it touches. Nodes that two bodies touch count for one
+of them."""
 
 import warp as wp
 
@@ -161,7 +162,9 @@ def reset_nodes(
 
 
 @wp.kernel
-def reset_samples(mask: wp.array(dtype=bool), anchor_geom_out: wp.array2d(dtype=int), trial_geom_out: wp.array2d(dtype=int)):
+def reset_samples(
+    mask: wp.array(dtype=bool), anchor_geom_out: wp.array2d(dtype=int), trial_geom_out: wp.array2d(dtype=int)
+):
     i, w = wp.tid()
     if mask[w]:
         anchor_geom_out[i, w] = -1
@@ -202,7 +205,9 @@ def reset_geoms(
 
 
 @wp.kernel
-def reset_worlds(mask: wp.array(dtype=bool), rest_pressure: real, st: Worlds, pressure_out: wp.array(dtype=real)):
+def reset_worlds(
+    mask: wp.array(dtype=bool), rest_pressure: real, st: Worlds, pressure_out: wp.array(dtype=real)
+):
     w = wp.tid()
     if mask[w]:
         pressure = rest_pressure

@@ -1,4 +1,5 @@
-"""BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the bodies."""
+"""BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the
+bodies."""
 
 import numpy as np
 import warp as wp
@@ -22,7 +23,8 @@ class Skins:
     Attributes:
       nworld: number of worlds.
       failed: (nworld,) wp.array int, steps that found no balance since the reset.
-      wrench0, tangent0: (ngroup, nworld) wp.arrays, linear models in force: of the skin ON each touching body in the BioTac frame.
+      wrench0, tangent0: (ngroup, nworld) wp.arrays, linear models in force: of the skin ON each touching body
+        in the BioTac frame.
     """
 
     def __init__(self, touching, skin, film, acquisition, dt, addresses):
@@ -48,7 +50,8 @@ class Skins:
         self.reset()
 
     def reset(self, world_mask=None):
-        """Puts skins, sensors and their clocks of some worlds back to rest, as mjw.reset_data does with the rest of the world.
+        """Puts skins, sensors and their clocks of some worlds back to rest, as mjw.reset_data does with the
+        rest of the world.
 
         Args:
           world_mask: (nworld,) of bool, a wp.array or on the host; None resets all.
@@ -62,7 +65,10 @@ class Skins:
         elif world_mask is not None:
             mask = wp.array(np.asarray(world_mask, bool), dtype=bool, device=self.device)
         if mask.shape != (self.nworld,) or mask.dtype is not wp.bool:
-            raise ValueError(f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, True resets")
+            raise ValueError(
+                f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, "
+                "True resets"
+            )
         self.skin.reset(mask)
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
         self._launch(kernels.reset_models, self.nworld, [mask], models)
@@ -76,13 +82,16 @@ class Skins:
 
     @property
     def wrench(self):
-        """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a copy on the host."""
+        """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a
+        copy on the host."""
         return np.swapaxes(self.wrench0.numpy(), 0, 1).copy()
 
     @property
     def nbytes(self):
         """Device memory that grows with the number of worlds, of skins and sensors together [bytes]."""
-        return self.skin.nbytes + (self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0)
+        return self.skin.nbytes + (
+            self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0
+        )
 
     def solve_at(self, pos, mat, geom_pos, geom_quat):
         """Solves the skins for touching bodies at pos, mat [group, world] in the BioTac frame. Launches only.
@@ -92,13 +101,18 @@ class Skins:
         """
         skin = self.skin
         poses = [geom_pos, geom_quat, pos, mat]
-        self._launch(kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat])
+        self._launch(
+            kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
+        )
         skin.step()
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
-        self._launch(kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models)
+        self._launch(
+            kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models
+        )
 
     def sense(self, sensordata):
-        """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches only."""
+        """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches
+        only."""
         state, skin = self._no_state, self.skin
         if self.acquisition:
             self.film.solve(skin.x, self.acquisition.find_due(self.dt))
@@ -117,13 +131,16 @@ class Skins:
 
 
 class PoseBatch(Skins):
-    """For a simulator that has no callback: poses in, forces and readings out, between its steps. Made by `biotac_mj.batch.make`.
+    """For a simulator that has no callback: poses in, forces and readings out, between its steps. Made by
+    `biotac_mj.batch.make`.
 
-    The forces act in the simulator's next step, explicitly: with a touched mass m the step must stay below some 0.8 sqrt(m / k), k the
-    contact's stiffness (docs/coupling.md). Poses that are prescribed know no such limit.
+    The forces act in the simulator's next step, explicitly: with a touched mass m the step must stay below
+    some 0.8 sqrt(m / k), k the contact's stiffness (docs/coupling.md). Poses that are prescribed know no such
+    limit.
 
     Attributes:
-      xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre of mass, world frame.
+      xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre
+        of mass, world frame.
       sensordata: (nworld, 55) wp.array float, the channels of `readings` one after another.
     """
 
@@ -132,7 +149,9 @@ class PoseBatch(Skins):
         super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
             self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
-            self._geom_quat = wp.array(mjm.geom_quat[None].astype(np.float32), dtype=wp.quat)  # (w, x, y, z), as mujoco_warp keeps it
+            self._geom_quat = wp.array(
+                mjm.geom_quat[None].astype(np.float32), dtype=wp.quat
+            )  # (w, x, y, z), as mujoco_warp keeps it
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
@@ -140,8 +159,9 @@ class PoseBatch(Skins):
         """Solves the skins where the bodies are, and writes `xfrc_applied` and `sensordata`. Launches only.
 
         Args:
-          xpos, xipos: (nworld, nbody, 3) float, frames and centres of mass of the bodies [m]; xmat: (nworld, nbody, 3, 3). Arrays of Warp,
-            or of anything that speaks DLPack (JAX, torch), on the batch's device; they are not copied.
+          xpos, xipos: (nworld, nbody, 3) float, frames and centres of mass of the bodies [m]; xmat: (nworld,
+            nbody, 3, 3). Arrays of Warp, or of anything that speaks DLPack (JAX, torch), on the batch's
+            device; they are not copied.
 
         Raises:
           ValueError: a wrong shape, or not single precision.
@@ -149,9 +169,15 @@ class PoseBatch(Skins):
         shape = self.xfrc_applied.shape[:2]
         xpos, xmat, xipos = (
             _as(array, dtype, shape, name)
-            for name, array, dtype in (("xpos", xpos, wp.vec3), ("xmat", xmat, wp.mat33), ("xipos", xipos, wp.vec3))
+            for name, array, dtype in (
+                ("xpos", xpos, wp.vec3),
+                ("xmat", xmat, wp.mat33),
+                ("xipos", xipos, wp.vec3),
+            )
         )
-        self._launch(kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat])
+        self._launch(
+            kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat]
+        )
         self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
         bodies = [self._core, self._body, self.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
@@ -160,11 +186,14 @@ class PoseBatch(Skins):
     def readings(self):
         """{channel: (nworld, dim)} views of `sensordata`."""
         ends = np.cumsum(list(CHANNELS.values())).tolist()
-        return {name: self.sensordata[:, end - width : end] for (name, width), end in zip(CHANNELS.items(), ends)}
+        return {
+            name: self.sensordata[:, end - width : end] for (name, width), end in zip(CHANNELS.items(), ends)
+        }
 
 
 def _as(array, dtype, shape, name):
-    """A (nworld, nbody) wp.array of dtype over the memory of a wp.array or of another library's (nworld, nbody, ...) array."""
+    """A (nworld, nbody) wp.array of dtype over the memory of a wp.array or of another library's (nworld,
+    nbody, ...) array."""
     full = (*shape, *dtype._shape_)
     if isinstance(array, wp.array) and array.dtype is dtype:
         full, whole = shape, array
@@ -172,4 +201,6 @@ def _as(array, dtype, shape, name):
         whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
     if whole.shape != full or (full != shape and whole.dtype is not wp.float32):
         raise ValueError(f"{name} has shape {whole.shape} of {whole.dtype.__name__}: pass {full} of float32")
-    return wp.array(ptr=whole.ptr, shape=shape, dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False)
+    return wp.array(
+        ptr=whole.ptr, shape=shape, dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False
+    )

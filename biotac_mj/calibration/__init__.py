@@ -1,4 +1,5 @@
-"""The paper's four configurations, the fit of their parameters to force-deflection data, and their comparison with a reference."""
+"""The paper's four configurations, the fit of their parameters to force-deflection data, and their comparison
+with a reference."""
 
 from .comparison import Comparison, comparison_table, evaluate, plan_indentations
 from .configurations import CONFIGURATIONS, Configuration, configuration

@@ -1,4 +1,5 @@
-"""The paper's comparison: four configurations over many indentations of eight indenters, against a reference."""
+"""The paper's comparison: four configurations over many indentations of eight indenters, against a
+reference."""
 
 import dataclasses
 import math
@@ -14,7 +15,8 @@ from .reference import stand_in
 
 __all__ = ["PAPER", "Comparison", "comparison_table", "evaluate", "plan_indentations"]
 
-# Narang et al., ICRA 2021: force errors are means of the norm over time [N], nodal errors of the displacement norms [m].
+# Narang et al., ICRA 2021: force errors are means of the norm over time [N], nodal errors of the displacement
+# norms [m].
 PAPER = {
     "calibration_force": 0.125,
     "force_lowest_indenter": 0.0876,
@@ -36,8 +38,8 @@ class Comparison:
       configuration: name. calibration: of its material, or None where it was given.
       force: indenter -> mean over its indentations of the mean norm of the force error over time [N].
       relative: indenter -> the same over the indentation's largest reference force.
-      nodal_peak, nodal_mean: mean over indentations and time of the error of the largest norm and of the mean norm of the outer surface's
-        nodal displacements [m]; nan without a reference.
+      nodal_peak, nodal_mean: mean over indentations and time of the error of the largest norm and of the mean
+        norm of the outer surface's nodal displacements [m]; nan without a reference.
       rows: one dict for each indentation.
     """
 
@@ -58,8 +60,11 @@ class Comparison:
         return float(np.mean(list(self.force.values())))
 
 
-def plan_indentations(count: int, indenters=INDENTERS, seed: int = 0, samples: int = 10, skin: str = "coarse", progress=None):
-    """`count` random indentations for each indenter: place on the pad, depth, direction up to 25 degrees off the normal, and a slide.
+def plan_indentations(
+    count: int, indenters=INDENTERS, seed: int = 0, samples: int = 10, skin: str = "coarse", progress=None
+):
+    """`count` random indentations for each indenter: place on the pad, depth, direction up to 25 degrees off
+    the normal, and a slide.
 
     Raises:
       ValueError: unknown indenter, or no room.
@@ -72,7 +77,13 @@ def plan_indentations(count: int, indenters=INDENTERS, seed: int = 0, samples: i
             depth, slide = rng.uniform(*_DEPTH), rng.choice([0.0, 0.8e-3])
             turn = rng.uniform(0, 2 * math.pi)
             plan = plan_indentation(
-                name, place, depth, slide, (math.cos(turn), 0.3 * math.sin(turn), math.sin(turn)), samples=samples, skin=skin
+                name,
+                place,
+                depth,
+                slide,
+                (math.cos(turn), 0.3 * math.sin(turn), math.sin(turn)),
+                samples=samples,
+                skin=skin,
             )
             plans.append(dataclasses.replace(plan, name=f"{name} {number}"))
             if progress:
@@ -90,7 +101,9 @@ def references(plans, progress=None, **options) -> list[Indentation]:
     return answers
 
 
-def evaluate(configuration: Configuration, material, indentations, calibration=None, device="cpu", progress=None) -> Comparison:
+def evaluate(
+    configuration: Configuration, material, indentations, calibration=None, device="cpu", progress=None
+) -> Comparison:
     """Walks every indentation with one configuration and material.
 
     Raises:
@@ -98,7 +111,9 @@ def evaluate(configuration: Configuration, material, indentations, calibration=N
     """
     if not indentations:
         raise ValueError("there is no indentation to compare with: plan or read some")
-    options = dataclasses.replace(configuration.options, max_newton=max(100, configuration.options.max_newton))
+    options = dataclasses.replace(
+        configuration.options, max_newton=max(100, configuration.options.max_newton)
+    )
     rows = []
     for case in indentations:
         answer = simulate(configuration.geometry, options, [material], case, device)
@@ -110,8 +125,12 @@ def evaluate(configuration: Configuration, material, indentations, calibration=N
                 "indenter": case.indenter,
                 "force": float(error),
                 "peak_force": float(np.linalg.norm(case.force, axis=1).max()),
-                "nodal_peak": float(np.abs(answer.peak_norm[0] - case.peak_norm).mean()) if known else math.nan,
-                "nodal_mean": float(np.abs(answer.mean_norm[0] - case.mean_norm).mean()) if known else math.nan,
+                "nodal_peak": float(np.abs(answer.peak_norm[0] - case.peak_norm).mean())
+                if known
+                else math.nan,
+                "nodal_mean": float(np.abs(answer.mean_norm[0] - case.mean_norm).mean())
+                if known
+                else math.nan,
                 "nonconverged": int(answer.nonconverged[0]),
                 "steps": answer.steps,
             }
@@ -121,7 +140,9 @@ def evaluate(configuration: Configuration, material, indentations, calibration=N
 
     def by_indenter(value):
         names = dict.fromkeys(row["indenter"] for row in rows)
-        return {name: float(np.mean([value(row) for row in rows if row["indenter"] == name])) for name in names}
+        return {
+            name: float(np.mean([value(row) for row in rows if row["indenter"] == name])) for name in names
+        }
 
     return Comparison(
         configuration=configuration.name,
@@ -142,21 +163,40 @@ def comparison_table(comparisons, reference: str) -> str:
     names = list(comparisons[0].force)
     lines = [
         f"reference: {reference}",
-        f"{'force error [N]':<28}" + "".join(f"{c.configuration:>18}" for c in comparisons) + f"{'the paper':>18}",
+        f"{'force error [N]':<28}"
+        + "".join(f"{c.configuration:>18}" for c in comparisons)
+        + f"{'the paper':>18}",
     ]
 
     def line(name, cells, paper):
         lines.append(f"{name:<28}" + "".join(f"{cell:>18}" for cell in cells) + f"{paper:>18}")
 
     if all(c.calibration for c in comparisons):
-        line("calibration", [f"{c.calibration.mean:.4f}" for c in comparisons], f"{PAPER['calibration_force']:.3f}")
+        line(
+            "calibration",
+            [f"{c.calibration.mean:.4f}" for c in comparisons],
+            f"{PAPER['calibration_force']:.3f}",
+        )
     for name in names:
         line(name, [f"{c.force[name]:.4f} ({c.relative[name]:.0%})" for c in comparisons], "")
-    line("lowest indenter", [f"{min(c.force.values()):.4f}" for c in comparisons], f"{PAPER['force_lowest_indenter']:.4f}")
-    line("highest indenter", [f"{max(c.force.values()):.4f}" for c in comparisons], f"{PAPER['force_highest_indenter']:.3f}")
+    line(
+        "lowest indenter",
+        [f"{min(c.force.values()):.4f}" for c in comparisons],
+        f"{PAPER['force_lowest_indenter']:.4f}",
+    )
+    line(
+        "highest indenter",
+        [f"{max(c.force.values()):.4f}" for c in comparisons],
+        f"{PAPER['force_highest_indenter']:.3f}",
+    )
     line("mean of indenters", [f"{c.force_mean:.4f}" for c in comparisons], f"{PAPER['force_mean']:.3f}")
-    line("nodal, maximum norm [m]", [f"{c.nodal_peak:.2e}" for c in comparisons], f"{PAPER['nodal_peak']:.2e}")
+    line(
+        "nodal, maximum norm [m]", [f"{c.nodal_peak:.2e}" for c in comparisons], f"{PAPER['nodal_peak']:.2e}"
+    )
     line("nodal, mean norm [m]", [f"{c.nodal_mean:.2e}" for c in comparisons], f"{PAPER['nodal_mean']:.2e}")
     line("steps not converged", [f"{c.nonconverged}/{c.steps}" for c in comparisons], "")
-    lines.append("(in brackets: of each indentation's largest reference force; the paper compared with ANSYS over other indentations)")
+    lines.append(
+        "(in brackets: of each indentation's largest reference force; the paper compared with ANSYS over "
+        "other indentations)"
+    )
     return "\n".join(lines)

@@ -25,8 +25,9 @@ class Configuration:
     options: SkinOptions
 
 
-# The body's mesh (None: the skin asked for) and whether the inner surface can touch the rigid core. All are held where they lie on nail
-# and clamp plate. The shells are held where they are bonded to the core too; `solid_with_core` is bonded to all of it, `solid` fills it.
+# The body's mesh (None: the skin asked for) and whether the inner surface can touch the rigid core. All are
+# held where they lie on nail and clamp plate. The shells are held where they are bonded to the core too;
+# `solid_with_core` is bonded to all of it, `solid` fills it.
 CONFIGURATIONS = {
     "deformable_shell": (None, False),
     "shell_with_core": (None, True),
@@ -53,7 +54,12 @@ def configuration(name: str, skin: str = "coarse", **options) -> Configuration:
     if body is None:
         return Configuration(name, load_skin(skin), options)
     if options.liquid:
-        raise ValueError(f"configuration {name!r} has no space for a liquid: take a shell, or leave the liquid out")
+        raise ValueError(
+            f"configuration {name!r} has no space for a liquid: take a shell, or leave the liquid out"
+        )
     if skin != "coarse":
-        raise ValueError(f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: make others with scripts/make_solids.py")
+        raise ValueError(
+            f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: make others with "
+            "scripts/make_solids.py"
+        )
     return Configuration(name, SkinGeometry.load(asset_path(f"skins/{body}_coarse.npz")), options)

@@ -1,9 +1,9 @@
 """Fits material and solver parameters to the forces of one indentation, as Narang et al. (ICRA 2021) did.
 
-The cost is the root mean square over time of the norm of the force error. Sequential least squares (scipy's SLSQP) minimises its square,
-which has the same minimum and a round bottom; a trust-region Gauss-Newton (scipy's least_squares) finishes. The model's value and all
-finite-difference columns of its Jacobian are the worlds of one batch; parameters that a batch shares (solver options) take a batch each.
-"""
+The cost is the root mean square over time of the norm of the force error. Sequential least squares (scipy's
+SLSQP) minimises its square, which has the same minimum and a round bottom; a trust-region Gauss-Newton
+(scipy's least_squares) finishes. The model's value and all finite-difference columns of its Jacobian are the
+worlds of one batch; parameters that a batch shares (solver options) take a batch each."""
 
 import dataclasses
 
@@ -20,7 +20,8 @@ from .statistics import covariance, ljung_box
 __all__ = ["PARAMETERS", "Calibration", "Parameter", "calibrate", "forces_and_jacobian", "parameter"]
 
 _STEP = 0.01  # of a scaled parameter: 1 % of a positive one, far above the solver's error at TOLERANCE
-# Of the skin's solver: forces repeat to 1e-5 N. A step given up for want of iterations makes the cost jump, so there are many.
+# Of the skin's solver: forces repeat to 1e-5 N. A step given up for want of iterations makes the cost jump,
+# so there are many.
 TOLERANCE, MAX_NEWTON = 1e-6, 200
 _CONFIDENCE = 0.95
 
@@ -32,7 +33,8 @@ class Parameter:
     Attributes:
       name: a number of Material or of SkinOptions.
       lower, upper: bounds.
-      logarithmic: the fit moves in its logarithm (positive bounds), else in the number over the width of its bounds.
+      logarithmic: the fit moves in its logarithm (positive bounds), else in the number over the width of its
+        bounds.
     """
 
     name: str
@@ -61,11 +63,16 @@ PARAMETERS = {
 }
 _SHORT = {"E": "youngs_modulus", "nu": "poissons_ratio", "mu": "friction"}
 _MATERIAL = [f.name for f in dataclasses.fields(Material) if f.type in (float, "float")]
-_OPTIONS = [f.name for f in dataclasses.fields(SkinOptions) if f.type in (float, "float", float | None, "float | None")]
+_OPTIONS = [
+    f.name
+    for f in dataclasses.fields(SkinOptions)
+    if f.type in (float, "float", float | None, "float | None")
+]
 
 
 def parameter(text: str) -> Parameter:
-    """A Parameter from "NAME" or "NAME:LOWER:UPPER"; E, nu and mu are short for Young's modulus, Poisson's ratio and friction.
+    """A Parameter from "NAME" or "NAME:LOWER:UPPER"; E, nu and mu are short for Young's modulus, Poisson's
+    ratio and friction.
 
     Raises:
       ValueError: unknown name, bounds that are no interval, or none where none are known.
@@ -73,7 +80,9 @@ def parameter(text: str) -> Parameter:
     name, *bounds = text.split(":")
     name = _SHORT.get(name, name)
     if name not in (*_MATERIAL, *_OPTIONS):
-        raise ValueError(f"cannot fit {name!r}: choose E, nu, mu or one of {', '.join((*_MATERIAL, *_OPTIONS))}")
+        raise ValueError(
+            f"cannot fit {name!r}: choose E, nu, mu or one of {', '.join((*_MATERIAL, *_OPTIONS))}"
+        )
     if not bounds:
         if name not in PARAMETERS:
             raise ValueError(f"no bounds are known for {name}: give them as {name}:LOWER:UPPER")
@@ -83,7 +92,9 @@ def parameter(text: str) -> Parameter:
     except ValueError:
         raise ValueError(f"bounds of {text!r} are not two numbers: write {name}:LOWER:UPPER") from None
     if not (np.isfinite([lower, upper]).all() and lower < upper):
-        raise ValueError(f"bounds of {text!r} are no interval: write {name}:LOWER:UPPER with LOWER < UPPER, both finite")
+        raise ValueError(
+            f"bounds of {text!r} are no interval: write {name}:LOWER:UPPER with LOWER < UPPER, both finite"
+        )
     return Parameter(name, lower, upper, lower > 0 and upper > 10 * lower)
 
 
@@ -137,8 +148,16 @@ class Calibration:
     nonconverged: int
 
 
-def forces_and_jacobian(configuration: Configuration, material: Material, parameters, values, indentation: Indentation, device="cpu"):
-    """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one batch.
+def forces_and_jacobian(
+    configuration: Configuration,
+    material: Material,
+    parameters,
+    values,
+    indentation: Indentation,
+    device="cpu",
+):
+    """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one
+    batch.
 
     Returns:
       force (n, 3) [N], jacobian (n, 3, p) [N], nonconverged steps of the first world.
@@ -156,7 +175,9 @@ def forces_and_jacobian(configuration: Configuration, material: Material, parame
     cases = [_case(configuration.options, material, parameters, point) for point in points]
     for options in dict.fromkeys(options for options, _ in cases):
         members = [i for i, case in enumerate(cases) if case[0] == options]
-        response = simulate(configuration.geometry, options, [cases[i][1] for i in members], indentation, device)
+        response = simulate(
+            configuration.geometry, options, [cases[i][1] for i in members], indentation, device
+        )
         for i, f in zip(members, response.force):
             force[i] = f
         if 0 in members:
@@ -186,20 +207,22 @@ def calibrate(
 ) -> Calibration:
     """Fits parameters to the force of an indentation.
 
-    The contact stiffness stays that of the starting material, unless it is fitted: 180 E per millimetre is so stiff that twice as much
-    hardly changes the force, and the batch needs one.
+    The contact stiffness stays that of the starting material, unless it is fitted: 180 E per millimetre is so
+    stiff that twice as much hardly changes the force, and the batch needs one.
 
     Args:
       configuration: body and options; liquid is `options.liquid`, or the material's where that is None.
       material: law and starting values.
       parameters: names, as `parameter` takes them, or Parameters.
       progress: whether to show a bar.
-      finer: a finer mesh of the same body, or None. The fit on the configuration's mesh is then corrected by the difference of both meshes'
-        forces at the fitted values and repeated, `corrections` times (space mapping): it ends where the finer mesh fits the data, at the
-        price of `corrections` indentations of it.
+      finer: a finer mesh of the same body, or None. The fit on the configuration's mesh is then corrected by
+        the difference of both meshes' forces at the fitted values and repeated, `corrections` times (space
+        mapping): it ends where the finer mesh fits the data, at the price of `corrections` indentations of
+        it.
 
     Raises:
-      ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not tell the parameters apart.
+      ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not
+        tell the parameters apart.
     """
     import tqdm
     from scipy.optimize import least_squares, minimize
@@ -208,13 +231,21 @@ def calibrate(
     if not parameters or len({p.name for p in parameters}) != len(parameters):
         raise ValueError("name each parameter to fit once, and at least one")
     stiffness = configuration.options.contact_stiffness or 180e3 * material.youngs_modulus
-    exact = dict(tolerance=min(TOLERANCE, configuration.options.tolerance), max_newton=max(MAX_NEWTON, configuration.options.max_newton))
+    exact = dict(
+        tolerance=min(TOLERANCE, configuration.options.tolerance),
+        max_newton=max(MAX_NEWTON, configuration.options.max_newton),
+    )
     options = dataclasses.replace(configuration.options, contact_stiffness=stiffness, **exact)
     fixed = dataclasses.replace(configuration, options=options)
-    begin = np.array([getattr(material, p.name, None) or getattr(options, p.name, 0.0) for p in parameters], float)
+    begin = np.array(
+        [getattr(material, p.name, None) or getattr(options, p.name, 0.0) for p in parameters], float
+    )
     for p, value in zip(parameters, begin):
         if not p.lower <= value <= p.upper:
-            raise ValueError(f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: change the start or the bounds")
+            raise ValueError(
+                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: change the "
+                "start or the bounds"
+            )
     scale_force = np.sqrt((indentation.force**2).sum(1).mean())
     if not scale_force > 0:
         raise ValueError(f"indentation {indentation.name!r} has no force: measure it, or simulate it first")
@@ -225,8 +256,15 @@ def calibrate(
     def evaluate(scaled):
         key = scaled.tobytes()
         if key not in cache:
-            values = np.clip([p.value(s) for p, s in zip(parameters, scaled)], [p.lower for p in parameters], [p.upper for p in parameters])
-            cache[key] = values, *forces_and_jacobian(fixed, material, parameters, values, indentation, device)
+            values = np.clip(
+                [p.value(s) for p, s in zip(parameters, scaled)],
+                [p.lower for p in parameters],
+                [p.upper for p in parameters],
+            )
+            cache[key] = (
+                values,
+                *forces_and_jacobian(fixed, material, parameters, values, indentation, device),
+            )
             bar.update()
             bar.set_postfix(rms_N=f"{np.sqrt(((cache[key][1] - indentation.force) ** 2).sum(1).mean()):.4f}")
         return cache[key]
@@ -235,8 +273,12 @@ def calibrate(
     there = evaluate(start)[2]
     for p, column in zip(parameters, np.moveaxis(there, -1, 0)):
         if np.sqrt((column**2).sum(1).mean()) < 1e-6 * scale_force:
-            raise ValueError(f"the force of this indentation does not depend on {p.name}: leave it out, or load the skin so that it shows")
-    # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and this straightens their valley
+            raise ValueError(
+                f"the force of this indentation does not depend on {p.name}: leave it out, or load the skin "
+                "so that it shows"
+            )
+    # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and
+    # this straightens their valley
     metric = np.einsum("tip,tiq->pq", there, there) / scale_force**2 / len(indentation.time)
     metric += 1e-6 * np.diag(np.diag(metric))
     back = np.linalg.inv(np.linalg.cholesky(metric)).T  # scaled = start + back u
@@ -254,8 +296,11 @@ def calibrate(
         dict(type="ineq", fun=lambda u: upper - start - back @ u, jac=lambda u: -back),
     ]
     settings = dict(ftol=1e-5, maxiter=max_iterations)
-    rough = minimize(cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings)
-    # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and Newton's needs no history
+    rough = minimize(
+        cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings
+    )
+    # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and
+    # Newton's needs no history
 
     def finish(at, correction):
         return least_squares(
@@ -277,18 +322,38 @@ def calibrate(
         found = finish(found.x, correction)
     values, force, jacobian, lost = evaluate(found.x)
     bar.close()
-    result = _result(fixed, material, indentation, parameters, begin, values, force + correction, jacobian, lost, len(cache), found)
-    return result if finer is None else dataclasses.replace(result, skin=f"{result.skin}, corrected by {finer.name}")
+    result = _result(
+        fixed,
+        material,
+        indentation,
+        parameters,
+        begin,
+        values,
+        force + correction,
+        jacobian,
+        lost,
+        len(cache),
+        found,
+    )
+    return (
+        result
+        if finer is None
+        else dataclasses.replace(result, skin=f"{result.skin}, corrected by {finer.name}")
+    )
 
 
-def _result(configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found):
+def _result(
+    configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found
+):
     from scipy.stats import t as student
 
     residual = force - indentation.force
     by_value = jacobian / np.array([p.slope(v) for p, v in zip(parameters, values)])
     white, robust, lags = covariance(by_value, residual)
     error, error_robust = np.sqrt(np.diag(white)), np.sqrt(np.diag(robust))
-    half = student.ppf((1 + _CONFIDENCE) / 2, len(residual) - len(parameters)) * np.maximum(error, error_robust)
+    half = student.ppf((1 + _CONFIDENCE) / 2, len(residual) - len(parameters)) * np.maximum(
+        error, error_robust
+    )
     options, fitted = _case(configuration.options, material, parameters, values)
     norm = np.linalg.norm(residual, axis=1)
     width = [1e-6 * (p.upper - p.lower) for p in parameters]

@@ -21,7 +21,8 @@ class Response:
 
     Attributes:
       force: (k, n, 3) of the skin on the indenter [N].
-      peak_norm, mean_norm: (k, n) largest nodal displacement of the outer surface and its mean over the area [m].
+      peak_norm, mean_norm: (k, n) largest nodal displacement of the outer surface and its mean over the area
+        [m].
       nonconverged: (k,) steps that did not converge.
       steps: steps taken.
     """
@@ -33,10 +34,18 @@ class Response:
     steps: int
 
 
-def simulate(geometry: SkinGeometry, options: SkinOptions, materials, indentation: Indentation, device="cpu", progress=None) -> Response:
+def simulate(
+    geometry: SkinGeometry,
+    options: SkinOptions,
+    materials,
+    indentation: Indentation,
+    device="cpu",
+    progress=None,
+) -> Response:
     """Walks the indentation once, every material as a world of one batch.
 
-    The contact stiffness is `options.contact_stiffness`, or that which belongs to the first material: it is one number for the batch.
+    The contact stiffness is `options.contact_stiffness`, or that which belongs to the first material: it is
+    one number for the batch.
 
     Args:
       geometry, options: the body; its options count for all.
@@ -98,7 +107,12 @@ def _indenter(indentation, materials, device):
     shape, grid = _shape(indentation.indenter)
     mesh = grid is not None
     geoms = GeomSet(
-        [shape.type], [shape.size], rounding=[shape.rounding], grids=[grid] if mesh else (), nworld=len(materials), device=device
+        [shape.type],
+        [shape.size],
+        rounding=[shape.rounding],
+        grids=[grid] if mesh else (),
+        nworld=len(materials),
+        device=device,
     )
     geoms.set_friction([[m.friction] for m in materials])
     frame = _matrix(indentation.quat)

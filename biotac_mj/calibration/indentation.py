@@ -1,4 +1,5 @@
-"""One indentation: the way of an indenter and the force that was measured on it; read from CSV or from a press's skin.h5."""
+"""One indentation: the way of an indenter and the force that was measured on it; read from CSV or from a
+press's skin.h5."""
 
 import csv
 import dataclasses
@@ -8,7 +9,14 @@ import numpy as np
 
 from ..press_record import replacing
 
-__all__ = ["COLUMNS", "Indentation", "plan_indentation", "plan_shear", "read_indentation", "write_indentation"]
+__all__ = [
+    "COLUMNS",
+    "Indentation",
+    "plan_indentation",
+    "plan_shear",
+    "read_indentation",
+    "write_indentation",
+]
 
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
 _ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
@@ -26,7 +34,8 @@ class Indentation:
       tip: (n, 3) origin of the indenter's frame in the BioTac frame [m].
       quat: (4,) orientation of that frame, w x y z; its +y goes ahead.
       force: (n, 3) of the skin on the indenter [N].
-      peak_norm, mean_norm: (n,) largest nodal displacement of the outer surface and its mean over the area [m]; None where unknown.
+      peak_norm, mean_norm: (n,) largest nodal displacement of the outer surface and its mean over the area
+        [m]; None where unknown.
     """
 
     name: str
@@ -43,17 +52,28 @@ class Indentation:
         for name, shape in dict(tip=(n, 3), quat=(4,), force=(n, 3)).items():
             value = np.asarray(getattr(self, name), float)
             if value.shape != shape:
-                raise ValueError(f"{name} of indentation {self.name!r} has shape {value.shape}: {shape} is needed")
+                raise ValueError(
+                    f"{name} of indentation {self.name!r} has shape {value.shape}: {shape} is needed"
+                )
             if not np.isfinite(value).all():
-                raise ValueError(f"{name} of indentation {self.name!r} contains NaN or infinite numbers: remove those samples")
+                raise ValueError(
+                    f"{name} of indentation {self.name!r} contains NaN or infinite numbers: remove those "
+                    "samples"
+                )
             object.__setattr__(self, name, value)
         if n < 4:
-            raise ValueError(f"indentation {self.name!r} has {n} samples: at least 4 are needed, some of them under load")
+            raise ValueError(
+                f"indentation {self.name!r} has {n} samples: at least 4 are needed, some of them under load"
+            )
         if not (np.diff(self.time) > 0).all():
-            raise ValueError(f"time_s of indentation {self.name!r} does not increase: sort the rows and remove repeated ones")
+            raise ValueError(
+                f"time_s of indentation {self.name!r} does not increase: sort the rows and remove repeated "
+                "ones"
+            )
         if np.abs(self.tip).max() > _REACH:
             raise ValueError(
-                f"the tip of indentation {self.name!r} is up to {np.abs(self.tip).max():g} m from the BioTac's origin: positions must be "
+                f"the tip of indentation {self.name!r} is up to {np.abs(self.tip).max():g} m from the "
+                "BioTac's origin: positions must be "
                 "in metres (divide millimetres by 1000) and in the BioTac frame"
             )
 
@@ -68,7 +88,8 @@ def plan_indentation(
     samples=24,
     skin="coarse",
 ) -> Indentation:
-    """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along it.
+    """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along
+    it.
 
     Args:
       indenter: as `biotac press --indenter`.
@@ -86,17 +107,28 @@ def plan_indentation(
     from ..press_indenter import make_indenter
 
     stride = (depth + slide) / samples
-    options = PressOptions(indenter=indenter, location=tuple(location), depth=depth, slide=slide, slide_direction=tuple(slide_direction),
-                           direction=direction, speed=stride, timestep=1.0, hold=0.0)  # fmt: skip
+    options = PressOptions(
+        indenter=indenter,
+        location=tuple(location),
+        depth=depth,
+        slide=slide,
+        slide_direction=tuple(slide_direction),
+        direction=direction,
+        speed=stride,
+        timestep=1.0,
+        hold=0.0,
+    )
     path = plan_path(load_skin(skin), make_indenter(indenter), options)
     tip = np.array([path.position(*travel) for travel in zip(path.depth, path.slid)])
     time = 0.02 * np.arange(len(tip))
     return Indentation(indenter, indenter, time, tip, path.quat, np.zeros((len(tip), 3)))
 
 
-def plan_shear(indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4, **place) -> Indentation:
-    """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a press that squeezes the skin
-    on the core, in which the force hardly depends on nu.
+def plan_shear(
+    indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4, **place
+) -> Indentation:
+    """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a
+    press that squeezes the skin on the core, in which the force hardly depends on nu.
 
     Args:
       corners: (depth, slid) [m] that the tip visits after first touch.
@@ -104,7 +136,9 @@ def plan_shear(indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2
       place: location, slide_direction, direction and skin as `plan_indentation` has them.
     """
     plan = plan_indentation(indenter, depth=1e-3, slide=1e-3, samples=8, **place)
-    axes = np.array([step / np.linalg.norm(step) for step in (plan.tip[1] - plan.tip[0], plan.tip[-1] - plan.tip[-2])])
+    axes = np.array(
+        [step / np.linalg.norm(step) for step in (plan.tip[1] - plan.tip[0], plan.tip[-1] - plan.tip[-2])]
+    )
     travel = [np.zeros((1, 2))]
     for corner in np.asarray(corners, float):
         at = travel[-1][-1]
@@ -117,8 +151,10 @@ def plan_shear(indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2
 def read_indentation(path, indenter: str | None = None, direction=None) -> Indentation:
     """Reads force-deflection data.
 
-    CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is `direction`, or the columns quat_w
-    to quat_z, or the skin's inward normal where neither is given: along -y of the pad, so +y. A press's skin.h5 holds all of it.
+    CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is
+      `direction`, or the columns quat_w
+    to quat_z, or the skin's inward normal where neither is given: along -y of the pad, so +y. A press's
+    skin.h5 holds all of it.
 
     Args:
       path: .csv or .h5.
@@ -132,7 +168,8 @@ def read_indentation(path, indenter: str | None = None, direction=None) -> Inden
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no force-deflection data at {path}: give a CSV file with columns {', '.join(COLUMNS)}, or a press's skin.h5"
+            f"no force-deflection data at {path}: give a CSV file with columns {', '.join(COLUMNS)}, or a "
+            "press's skin.h5"
         )
     return _read_press(path, indenter) if path.suffix == ".h5" else _read_csv(path, indenter, direction)
 
@@ -140,7 +177,9 @@ def read_indentation(path, indenter: str | None = None, direction=None) -> Inden
 def write_indentation(indentation: Indentation, path) -> None:
     """Writes COLUMNS and the orientation as CSV (to a temporary name, then renamed)."""
     n = len(indentation.time)
-    rows = np.column_stack([indentation.time, indentation.tip, indentation.force, np.tile(indentation.quat, (n, 1))])
+    rows = np.column_stack(
+        [indentation.time, indentation.tip, indentation.force, np.tile(indentation.quat, (n, 1))]
+    )
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*COLUMNS, *_ORIENTATION])
@@ -149,7 +188,9 @@ def write_indentation(indentation: Indentation, path) -> None:
 
 def _read_csv(path, indenter, direction):
     if indenter is None:
-        raise ValueError(f"{path} does not say what pressed: name it with --indenter, as in --indenter sphere_7mm")
+        raise ValueError(
+            f"{path} does not say what pressed: name it with --indenter, as in --indenter sphere_7mm"
+        )
     with open(path, newline="", encoding="utf-8-sig") as file:
         rows = list(csv.reader(file))
     if not rows:
@@ -157,7 +198,14 @@ def _read_csv(path, indenter, direction):
     header = [name.strip() for name in rows[0]]
     columns = {name: _column(path, header, rows[1:], name) for name in COLUMNS}
     value = np.array([columns[name] for name in COLUMNS]).T
-    return Indentation(path.stem, indenter, value[:, 0], value[:, 1:4], _orientation(path, header, rows[1:], direction), value[:, 4:])
+    return Indentation(
+        path.stem,
+        indenter,
+        value[:, 0],
+        value[:, 1:4],
+        _orientation(path, header, rows[1:], direction),
+        value[:, 4:],
+    )
 
 
 def _column(path, header, rows, name):
@@ -167,16 +215,22 @@ def _column(path, header, rows, name):
         if other:
             given = other[len(stem) :].lstrip("_") or "none"
             raise ValueError(
-                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; convert the numbers and rename it"
+                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; convert the "
+                "numbers and rename it"
             )
-        raise ValueError(f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; it has {', '.join(header)}")
+        raise ValueError(
+            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; it has "
+            f"{', '.join(header)}"
+        )
     index, values = header.index(name), []
     for number, row in enumerate(rows, start=2):
         try:
             values.append(float(row[index]))
         except (ValueError, IndexError):
             cell = row[index] if index < len(row) else ""
-            raise ValueError(f"line {number} of {path}: {name} is {cell!r}, not a number; correct or remove the line") from None
+            raise ValueError(
+                f"line {number} of {path}: {name} is {cell!r}, not a number; correct or remove the line"
+            ) from None
     return values
 
 
@@ -186,13 +240,18 @@ def _orientation(path, header, rows, direction):
     if direction is not None:
         direction = np.asarray(direction, float)
         if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction):
-            raise ValueError(f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are not all zero")
+            raise ValueError(
+                f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are "
+                "not all zero"
+            )
         return _rotation_from_y(direction / np.linalg.norm(direction))
     if "quat_w" not in header:
         return np.array([1.0, 0, 0, 0])
     quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T
     if np.abs(quat - quat[0]).max() > 1e-3 or abs(np.linalg.norm(quat[0]) - 1) > 1e-3:
-        raise ValueError(f"the quaternions of {path} turn or are not of length one: the indenter must only translate")
+        raise ValueError(
+            f"the quaternions of {path} turn or are not of length one: the indenter must only translate"
+        )
     return quat[0] / np.linalg.norm(quat[0])
 
 

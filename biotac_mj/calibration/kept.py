@@ -1,4 +1,5 @@
-"""Finished parts of a long comparison, in a file: stopped and called again with the same settings, it goes on where it was."""
+"""Finished parts of a long comparison, in a file: stopped and called again with the same settings, it goes on
+where it was."""
 
 import pathlib
 import pickle
@@ -22,7 +23,16 @@ class Kept:
             content = pickle.loads(self._path.read_bytes())
             if content["settings"] == settings:
                 self._content = content
-        except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError):
+        except (
+            OSError,
+            pickle.UnpicklingError,
+            EOFError,
+            AttributeError,
+            ImportError,
+            IndexError,
+            KeyError,
+            TypeError,
+        ):
             pass  # nothing there, cut short, or of another version of this package
 
     @property

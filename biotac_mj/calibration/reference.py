@@ -1,4 +1,5 @@
-"""Indentations of known answer: the project's own rubber with liquid, which stands in for ANSYS where the paper's data are not at hand."""
+"""Indentations of known answer: the project's own rubber with liquid, which stands in for ANSYS where the
+paper's data are not at hand."""
 
 import dataclasses
 
@@ -16,8 +17,15 @@ STAND_IN = "own rubber with liquid, in place of ANSYS"
 
 
 def stand_in(
-    indentation: Indentation, material="rubber", skin="default", noise=0.0, seed=0, liquid=None, element=None, device="cpu"
-) -> Indentation:  # fmt: skip
+    indentation: Indentation,
+    material="rubber",
+    skin="default",
+    noise=0.0,
+    seed=0,
+    liquid=None,
+    element=None,
+    device="cpu",
+) -> Indentation:
     """The same way with the forces and displacements of a skin that we know.
 
     Args:
@@ -37,8 +45,11 @@ def stand_in(
     answer = simulate(named_skin(skin), options, [preset(material)], indentation, device)
     if answer.nonconverged[0]:
         raise ValueError(
-            f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not converge: "
+            f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not "
+            "converge: "
             "press less deep, or take more samples"
         )
     force = answer.force[0] + noise * np.random.default_rng(seed).standard_normal(answer.force[0].shape)
-    return dataclasses.replace(indentation, force=force, peak_norm=answer.peak_norm[0], mean_norm=answer.mean_norm[0])
+    return dataclasses.replace(
+        indentation, force=force, peak_norm=answer.peak_norm[0], mean_norm=answer.mean_norm[0]
+    )

@@ -1,4 +1,5 @@
-"""A finer mesh of the same body, for fits that are to know the material and not the stiffness of their own mesh."""
+"""A finer mesh of the same body, for fits that are to know the material and not the stiffness of their own
+mesh."""
 
 import dataclasses
 
@@ -20,19 +21,29 @@ def skin(name: str) -> SkinGeometry:
 
 
 def refined(geometry: SkinGeometry) -> SkinGeometry:
-    """Every ten-node tetrahedron cut into eight along its own curves; held where the new nodes, too, touch the rigid bodies.
+    """Every ten-node tetrahedron cut into eight along its own curves; held where the new nodes, too, touch
+    the rigid bodies.
 
     Raises:
       ValueError: four-node tetrahedra.
     """
     if geometry.element != "quadratic":
-        raise ValueError(f"skin {geometry.name!r} has four-node tetrahedra: pass one with ten nodes (`with_edge_nodes` makes them)")
+        raise ValueError(
+            f"skin {geometry.name!r} has four-node tetrahedra: pass one with ten nodes (`with_edge_nodes` "
+            "makes them)"
+        )
     barycentric = np.vstack([np.eye(4), np.eye(4)[EDGES].mean(1)])
     middle = barycentric[PARTS][:, EDGES].mean(2)  # (8 parts, 6 edges, 4)
-    shape = np.concatenate([middle * (2 * middle - 1), 4 * middle[..., EDGES[:, 0]] * middle[..., EDGES[:, 1]]], axis=2)
+    shape = np.concatenate(
+        [middle * (2 * middle - 1), 4 * middle[..., EDGES[:, 0]] * middle[..., EDGES[:, 1]]], axis=2
+    )
     fine = with_edge_nodes(dataclasses.replace(geometry, elem=geometry.tets))
     vert = fine.vert.copy()
-    vert[fine.elem.reshape(-1, 8, 10)[:, :, 4:]] = np.einsum("pmn,enk->epmk", shape, geometry.vert[geometry.elem])
+    vert[fine.elem.reshape(-1, 8, 10)[:, :, 4:]] = np.einsum(
+        "pmn,enk->epmk", shape, geometry.vert[geometry.elem]
+    )
     bodies = [(getattr(fine, f"{b}_vert"), getattr(fine, f"{b}_face")) for b in ("core", "nail", "clamp")]
     touching = held_nodes(vert, bodies) if len(fine.nail_vert) else fine.fixed
-    return dataclasses.replace(fine, name=_PREFIX + geometry.name, vert=vert, fixed=np.union1d(fine.fixed, touching))
+    return dataclasses.replace(
+        fine, name=_PREFIX + geometry.name, vert=vert, fixed=np.union1d(fine.fixed, touching)
+    )

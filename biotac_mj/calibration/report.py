@@ -10,26 +10,42 @@ from .fit import Calibration
 
 __all__ = ["calibration_table", "read_material", "write_json", "write_picture"]
 
-_UNITS = {"youngs_modulus": "Pa", "contact_stiffness": "Pa/m", "bulk_modulus": "Pa", "fill_volume": "m^3", "rest_pressure": "Pa"}
+_UNITS = {
+    "youngs_modulus": "Pa",
+    "contact_stiffness": "Pa/m",
+    "bulk_modulus": "Pa",
+    "fill_volume": "m^3",
+    "rest_pressure": "Pa",
+}
 
 
 def calibration_table(result: Calibration) -> str:
     """The result in words."""
     liquid = "with liquid" if result.liquid else "without liquid"
     lines = [
-        f"{result.configuration} on skin {result.skin}, {result.law}, {result.element} elements, {liquid}, pressed by {result.indenter}"
+        f"{result.configuration} on skin {result.skin}, {result.law}, {result.element} elements, {liquid}, "
+        f"pressed by {result.indenter}"
     ]
     lines.append(f"{'parameter':<20}{'start':>13}{'fitted':>13}   95 % confidence")
     for i, name in enumerate(result.parameters):
         low, high = result.interval[i]
         note = "  on its bound: the interval means little" if result.at_bound[i] else ""
-        lines.append(f"{name:<20}{result.start[i]:>13.6g}{result.value[i]:>13.6g}   {low:.6g} .. {high:.6g} {_UNITS.get(name, '')}{note}")
-    lines.append(f"force error: RMS {result.rms:.4f} N, mean {result.mean:.4f} N, of {result.peak:.3f} N at most (the paper: mean 0.125 N)")
+        lines.append(
+            f"{name:<20}{result.start[i]:>13.6g}{result.value[i]:>13.6g}   {low:.6g} .. {high:.6g} "
+            f"{_UNITS.get(name, '')}{note}"
+        )
+    lines.append(
+        f"force error: RMS {result.rms:.4f} N, mean {result.mean:.4f} N, of {result.peak:.3f} N at most "
+        "(the paper: mean 0.125 N)"
+    )
     values = ", ".join(f"{axis} {p:.3g}" for axis, p in zip("xyz", result.whiteness["p_value"]))
     verdict = "white" if result.whiteness["white"] else "not white: the model leaves something unexplained"
     lines.append(f"residual: Ljung-Box over {result.whiteness['lags']} lags, p = {values}: {verdict}")
     how = "converged" if result.success else f"did NOT converge ({result.message})"
-    lines.append(f"the fit {how} after {result.evaluations} batches; steps of the skin that did not converge: {result.nonconverged}")
+    lines.append(
+        f"the fit {how} after {result.evaluations} batches; steps of the skin that did not converge: "
+        f"{result.nonconverged}"
+    )
     return "\n".join(lines)
 
 
@@ -51,7 +67,8 @@ def plain(value):
 
 
 def write_json(content, path) -> None:
-    """A dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite become null."""
+    """A dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite become
+    null."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
 
@@ -69,11 +86,15 @@ def read_material(path):
 
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no calibration at {path}: give the JSON that `biotac calibrate` wrote, or a preset's name")
+        raise FileNotFoundError(
+            f"no calibration at {path}: give the JSON that `biotac calibrate` wrote, or a preset's name"
+        )
     try:
         return Material(**json.loads(path.read_text())["material"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is not a calibration ({error!r}): give the JSON that `biotac calibrate` wrote") from error
+        raise ValueError(
+            f"{path} is not a calibration ({error!r}): give the JSON that `biotac calibrate` wrote"
+        ) from error
 
 
 def write_picture(result: Calibration, path) -> None:
@@ -83,13 +104,17 @@ def write_picture(result: Calibration, path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, height_ratios=(3, 1), layout="constrained")
+    figure, (top, bottom) = plt.subplots(
+        2, 1, figsize=(7, 6), sharex=True, height_ratios=(3, 1), layout="constrained"
+    )
     for i, color in enumerate(("tab:red", "tab:green", "tab:blue")):
         top.plot(result.time, result.measured[:, i], "o", mfc="none", ms=4, color=color)
         top.plot(result.time, result.fitted[:, i], lw=1.2, color=color, label=f"F{'xyz'[i]}")
         bottom.plot(result.time, result.fitted[:, i] - result.measured[:, i], ".-", lw=0.8, ms=3, color=color)
     fitted = ", ".join(f"{name} {value:.4g}" for name, value in zip(result.parameters, result.value))
-    top.set_title(f"{result.configuration}, {result.indenter}: {fitted}\nRMS force error {result.rms:.4f} N", fontsize=8)
+    top.set_title(
+        f"{result.configuration}, {result.indenter}: {fitted}\nRMS force error {result.rms:.4f} N", fontsize=8
+    )
     top.set_ylabel("force on the indenter [N]\n(circles: measured, lines: fitted)")
     top.legend(fontsize=8)
     bottom.axhline(0, lw=0.5, color="black")

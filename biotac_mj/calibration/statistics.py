@@ -8,9 +8,9 @@ __all__ = ["covariance", "ljung_box"]
 def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
     """Covariance of least-squares parameters, for white residuals and for autocorrelated ones.
 
-    Gauss-Newton for white residuals: s^2 (J^T J)^-1. For others the sandwich (J^T J)^-1 S (J^T J)^-1 with S the long-run covariance of the
-    score J_t^T r_t after Newey and West (Econometrica 55, 1987): Bartlett weights, lag 4 (n/100)^(2/9) as in their 1994 rule, scaled by
-    n/(n-p).
+    Gauss-Newton for white residuals: s^2 (J^T J)^-1. For others the sandwich (J^T J)^-1 S (J^T J)^-1 with S
+    the long-run covariance of the score J_t^T r_t after Newey and West (Econometrica 55, 1987): Bartlett
+    weights, lag 4 (n/100)^(2/9) as in their 1994 rule, scaled by n/(n-p).
 
     Args:
       jacobian: (n, m, p) derivatives of m force components at n times.
@@ -28,7 +28,10 @@ def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
     normal = np.einsum("tip,tiq->pq", jacobian, jacobian)
     scale = np.sqrt(np.diag(normal))
     if (scale == 0).any() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
-        raise ValueError("the forces do not tell the parameters apart: fit fewer, or use an indentation with more shear and sliding")
+        raise ValueError(
+            "the forces do not tell the parameters apart: fit fewer, or use an indentation with more shear "
+            "and sliding"
+        )
     inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     score = np.einsum("tip,ti->tp", jacobian, residual)
     lags = min(n - 1, int(np.ceil(4 * (n / 100) ** (2 / 9))))
@@ -47,20 +50,24 @@ def ljung_box(residual, lags: int | None = None) -> dict:
       lags: None takes min(10, n // 5).
 
     Returns:
-      lags; statistic (m,) and p_value (m,), nan for a component that is zero; white: whether no component's p-value is below 0.05 / m
-      (Bonferroni).
+      lags; statistic (m,) and p_value (m,), nan for a component that is zero; white: whether no component's
+      p-value is below 0.05 / m (Bonferroni).
     """
     residual = np.asarray(residual, float)
     n, m = residual.shape
     lags = min(10, n // 5) if lags is None else lags
     if not 1 <= lags < n:
-        raise ValueError(f"{n} samples are too few for {lags} lags of the whiteness test: record at least 5 samples")
+        raise ValueError(
+            f"{n} samples are too few for {lags} lags of the whiteness test: record at least 5 samples"
+        )
     from scipy.stats import chi2
 
     centred = residual - residual.mean(0)
     power = (centred**2).sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.array([(centred[lag:] * centred[:-lag]).sum(0) for lag in range(1, lags + 1)]) / power
+        correlation = (
+            np.array([(centred[lag:] * centred[:-lag]).sum(0) for lag in range(1, lags + 1)]) / power
+        )
     statistic = n * (n + 2) * (correlation**2 / (n - np.arange(1, lags + 1))[:, None]).sum(0)
     p_value = chi2.sf(statistic, lags)
     return {"lags": lags, "statistic": statistic, "p_value": p_value, "white": not (p_value < 0.05 / m).any()}

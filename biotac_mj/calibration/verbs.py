@@ -16,7 +16,13 @@ from .report import calibration_table, read_material, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
 
-_NO_SETTINGS = ("configurations", "out", "quiet", "device", "verb")  # what finished parts of a comparison do not depend on
+_NO_SETTINGS = (
+    "configurations",
+    "out",
+    "quiet",
+    "device",
+    "verb",
+)  # what finished parts of a comparison do not depend on
 
 
 def _material(text):
@@ -31,15 +37,28 @@ def calibrate_verb(args) -> None:
     body = configuration(args.configuration, args.skin, liquid=args.liquid)
     if args.synthetic:
         plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction)
-        data = stand_in(plan, args.truth, args.truth_skin, args.noise, args.seed, args.truth_liquid, device=args.device)
+        data = stand_in(
+            plan, args.truth, args.truth_skin, args.noise, args.seed, args.truth_liquid, device=args.device
+        )
         write_indentation(data, out / "synthetic.csv")
         truth = material(args.truth)
-        print(f"data: our own skin, {args.truth} on mesh {args.truth_skin}, E {truth.youngs_modulus:g} Pa, nu {truth.poissons_ratio:g}, "
-              f"mu {truth.friction:g}, noise {args.noise:g} N; kept in {out / 'synthetic.csv'}")  # fmt: skip
+        print(
+            f"data: our own skin, {args.truth} on mesh {args.truth_skin}, E {truth.youngs_modulus:g} Pa, "
+            f"nu {truth.poissons_ratio:g}, "
+            f"mu {truth.friction:g}, noise {args.noise:g} N; kept in {out / 'synthetic.csv'}"
+        )
     else:
         data = read_indentation(args.data, args.indenter, args.direction)
     finer = refined(body.geometry) if args.correct else None
-    result = calibrate(body, _material(args.material), data, args.fit, device=args.device, progress=not args.quiet, finer=finer)
+    result = calibrate(
+        body,
+        _material(args.material),
+        data,
+        args.fit,
+        device=args.device,
+        progress=not args.quiet,
+        finer=finer,
+    )
     write_json(result, out / "calibration.json")
     write_picture(result, out / "calibration.png")
     print(calibration_table(result))
@@ -53,35 +72,64 @@ def compare_verb(args) -> None:
     """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
-    chosen = [configuration(name, args.skin if CONFIGURATIONS[name][0] is None else "coarse",
-                            liquid=args.liquid and CONFIGURATIONS[name][0] is None) for name in args.configurations]  # fmt: skip
+    chosen = [
+        configuration(
+            name,
+            args.skin if CONFIGURATIONS[name][0] is None else "coarse",
+            liquid=args.liquid and CONFIGURATIONS[name][0] is None,
+        )
+        for name in args.configurations
+    ]
     given = args.material and _material(args.material)
     out = pathlib.Path(args.out)
-    settings = {k: v for k, v in vars(args).items() if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS}
+    settings = {
+        k: v
+        for k, v in vars(args).items()
+        if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS
+    }
     if args.data:
         files = [pathlib.Path(text.partition("=")[2]) for text in args.data]
         settings["read"] = [file.stat().st_mtime_ns for file in files if file.is_file()]
     kept = Kept(out / "compare.kept", settings | {"given": given})
     if kept.names and not args.quiet:
-        print(f"goes on after {', '.join(kept.names)} (kept in {out / 'compare.kept'}; remove it to start anew)")
+        print(
+            f"goes on after {', '.join(kept.names)} (kept in {out / 'compare.kept'}; remove it to start anew)"
+        )
     if args.data:
         cases = [_measured(text) for text in args.data]
         calibration, cases = (None, cases) if given else (cases[0], cases[1:])
         reference = "measured data"
     else:
-        truth = dict(material=args.reference_material, skin=args.reference_skin, element=args.reference_element, device=args.device)
+        truth = dict(
+            material=args.reference_material,
+            skin=args.reference_skin,
+            element=args.reference_element,
+            device=args.device,
+        )
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
             cases = kept.get("reference", lambda: references(plans, bar.update, **truth))
-        calibration = None if given else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
-        reference = f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin {args.reference_skin})"
+        calibration = (
+            None
+            if given
+            else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
+        )
+        reference = (
+            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin "
+            f"{args.reference_skin})"
+        )
     results = []
     for body in chosen:
-        results.append(kept.get(body.name, lambda body=body: _compared(body, given, calibration, cases, kept, args)))
+        results.append(
+            kept.get(body.name, lambda body=body: _compared(body, given, calibration, cases, kept, args))
+        )
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
     for result in results:
         m = result.material
-        print(f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, mu {m.friction:.4f}")
+        print(
+            f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, mu "
+            f"{m.friction:.4f}"
+        )
     print(comparison_table(results, reference))
     print(f"wrote {out / 'compare.json'}")
 
@@ -91,7 +139,9 @@ def _compared(body, given, calibration, cases, kept, args):
     fitted = None
     if not given:
         settings = dict(device=args.device, progress=not args.quiet)
-        fitted = kept.get(f"calibration of {body.name}", lambda: calibrate(body, material("paper"), calibration, **settings))
+        fitted = kept.get(
+            f"calibration of {body.name}", lambda: calibrate(body, material("paper"), calibration, **settings)
+        )
         if not args.quiet:
             print(f"{body.name}\n{calibration_table(fitted)}", flush=True)
     with _bar(body.name, len(cases), args.quiet) as bar:
@@ -101,7 +151,9 @@ def _compared(body, given, calibration, cases, kept, args):
 def _measured(text):
     indenter, separator, path = text.partition("=")
     if not separator:
-        raise ValueError(f"--data {text!r} does not say what pressed: write INDENTER=FILE, as in sphere_7mm=press.csv")
+        raise ValueError(
+            f"--data {text!r} does not say what pressed: write INDENTER=FILE, as in sphere_7mm=press.csv"
+        )
     return read_indentation(path, indenter)
 
 

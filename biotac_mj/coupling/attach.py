@@ -42,9 +42,10 @@ class Handle:
         return self.prefix + channel
 
     def read(self, data, channel) -> np.ndarray:
-        """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m] on the BioTac in its frame;
-        status is (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier:
-        0 full, 1 condensed, -1 condensed where its error has not been measured)."""
+        """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m]
+        on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
+        converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
+        measured)."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
     def vert_xpos(self, model, data) -> np.ndarray:
@@ -52,7 +53,9 @@ class Handle:
         index = int(model.body_plugin[model.body(self.body).id])
         setup = _setup(model, index)
         start = model.plugin_stateadr[index]
-        return setup.skin.stepper.vert_xpos(setup.parts(data.plugin_state[start : start + setup.nstate])[2]).copy()
+        return setup.skin.stepper.vert_xpos(
+            setup.parts(data.plugin_state[start : start + setup.nstate])[2]
+        ).copy()
 
 
 _setups = weakref.WeakKeyDictionary()  # of each living model
@@ -94,15 +97,16 @@ def attach(
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
     Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching bodies as there are now
-        (see `slots`).
+      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching
+        bodies as there are now (see `slots`).
       site, body: name of the site or the body it is fixed to; neither is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds, so that a model may hold several.
       skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
       liquid, friction: None takes the material's choice.
-      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings, options: see `Config`.
+      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings,
+      options: see `Config`.
 
     Raises:
       ValueError: unknown site, body, coupling, geom or skin; the prefix is taken; site and body both given.
@@ -113,18 +117,33 @@ def attach(
     if stepper == "fem":
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
-        skin=text, stepper=stepper, tier=tier, readings=readings, material=material, liquid=liquid is None or bool(liquid),
-        coupling=coupling, geoms=geoms,
-        rounding=dict(rounding or {}), priority=int(priority), seed=int(seed), device=device, options=dict(options or {}),
+        skin=text,
+        stepper=stepper,
+        tier=tier,
+        readings=readings,
+        material=material,
+        liquid=liquid is None or bool(liquid),
+        coupling=coupling,
+        geoms=geoms,
+        rounding=dict(rounding or {}),
+        priority=int(priority),
+        seed=int(seed),
+        device=device,
+        options=dict(options or {}),
         **({} if friction is None else {"friction": float(friction)}),
-    )  # fmt: skip
+    )
     check_names(config)
     names = [g.name for g in spec.geoms]
     for name in (*(config.geoms or ()), *config.rounding):
         if name not in names:
-            raise ValueError(f"no geom {name!r} to touch: the model has {', '.join(n for n in names if n) or 'no named geom'}")
+            raise ValueError(
+                f"no geom {name!r} to touch: the model has "
+                f"{', '.join(n for n in names if n) or 'no named geom'}"
+            )
     if slots is None:
-        slots = max(4, len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1)
+        slots = max(
+            4, len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
+        )
     child = _model(geometry)
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:
@@ -153,10 +172,13 @@ def _check_place(spec, site, body, prefix):
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
         if name is not None and name not in [p.name for p in present]:
             raise ValueError(
-                f"no {kind} {name!r} to attach to: the model has {', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
+                f"no {kind} {name!r} to attach to: the model has "
+                f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
             )
     if any(b.name == prefix + "core" for b in spec.bodies):
-        raise ValueError(f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix")
+        raise ValueError(
+            f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
+        )
 
 
 def _model(geometry):
@@ -164,7 +186,11 @@ def _model(geometry):
     with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
         spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
     for part in ("core", "nail", "clamp"):
-        mesh, vert, face = spec.mesh(part), getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")
+        mesh, vert, face = (
+            spec.mesh(part),
+            getattr(geometry, f"{part}_vert"),
+            getattr(geometry, f"{part}_face"),
+        )
         if len(face) == 0:
             spec.delete(next(g for g in spec.geoms if g.name == part))
             spec.delete(mesh)
@@ -198,7 +224,8 @@ def _add_slots(spec, core, prefix, count):
             objtype=mujoco.mjtObj.mjOBJ_BODY,
             name1=core.name,
             active=False,
-            # as good as nothing wherever the plugin does not write the rows: no stiffness, no damping, least impedance
+            # as good as nothing wherever the plugin does not write the rows: no stiffness, no damping, least
+            # impedance
             solref=[0.0, 0.0],
             solimp=[1e-4, 1e-4, 1.0, 0.5, 1.0],
         )

@@ -17,9 +17,10 @@ _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting
 class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
 
-    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening and swelling, poses and motion of the geoms,
-    contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then sample, geom and anchor).
-    """
+    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening and swelling,
+      poses and motion of the geoms,
+    contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then
+    sample, geom and anchor)."""
 
     def __init__(self, config, geometry, geoms):
         super().__init__(config, geometry, geoms)
@@ -33,7 +34,10 @@ class CondensedStepper(FemStepper):
             "contacts": 1 + 5 * _MAX_CONTACTS,
         }
         ends = np.cumsum(list(sizes.values()))
-        self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self._slices = {
+            name: slice(int(end - size), int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
         self._slices["started"] = slice(0, 1)
         self.nstate = int(ends[-1])
 
@@ -85,7 +89,11 @@ class CondensedStepper(FemStepper):
         """All that a solve depends on: a state is mostly unused."""
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         head = state[: self._slices["forces"].start]
-        return head.tobytes() + forces[: 1 + 3 * int(forces[0])].tobytes() + contacts[: 1 + 5 * int(contacts[0])].tobytes()
+        return (
+            head.tobytes()
+            + forces[: 1 + 3 * int(forces[0])].tobytes()
+            + contacts[: 1 + 5 * int(contacts[0])].tobytes()
+        )
 
     def _read(self, state) -> Memory:
         head = self._part(state, "head")
@@ -114,7 +122,8 @@ class CondensedStepper(FemStepper):
         n, k = len(memory.coordinate), len(memory.contacts)
         if n > _MAX_FORCES or k > _MAX_CONTACTS:
             raise ValueError(
-                f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and {_MAX_FORCES}: "
+                f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and "
+                f"{_MAX_FORCES}: "
                 "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
             )
         head = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening, memory.swelling

@@ -16,16 +16,17 @@ class Config:
     Attributes:
       skin: name or file of the `SkinGeometry`.
       stepper: what solves the skin: a name known to `biotac_mj.coupling.stepper`.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/condensed.md); the number of its place in TIERS is in
-        the status sensor.
+      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/condensed.md); the
+        number of its place in TIERS is in the status sensor.
       readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
       material: name of the skin's material or a dict of its parameters; None is the default one.
       liquid: whether the space between skin and core is filled.
       coupling: "two-way" (the touching bodies and the BioTac feel the skin) or "one-way" (readings only).
-      geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own links.
+      geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own
+        links.
       rounding: geom name -> radius of its rounded edges [m].
-      friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with the geom's. Default: the
-        paper's 0.783 (Narang et al., ICRA 2021).
+      friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
+        the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
       seed: of the sensor's noise.
       device: Warp device of the skin.
@@ -53,7 +54,10 @@ class Config:
         if self.tier not in TIERS:
             raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
         if self.tier != "full" and self.stepper != "fem":
-            raise ValueError(f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: leave one of them out")
+            raise ValueError(
+                f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: leave one "
+                "of them out"
+            )
         if not self.friction >= 0:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
         if self.geoms is not None:
@@ -78,6 +82,7 @@ class Config:
                     values[field.name] = json.loads(text)
                 except json.JSONDecodeError as error:
                     raise ValueError(
-                        f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, as in '\"default\"'"
+                        f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, "
+                        "as in '\"default\"'"
                     ) from error
         return cls(**values)

@@ -1,4 +1,5 @@
-"""The finite-element skin as the coupling sees it: a function from a state and poses to a new state and wrenches."""
+"""The finite-element skin as the coupling sees it: a function from a state and poses to a new state and
+wrenches."""
 
 import dataclasses
 import functools
@@ -16,18 +17,25 @@ from .stepper import SkinResult
 __all__ = ["FemStepper", "rest_geometry"]
 
 _MAX_CONTACTS = 4096
-_CLEAR = 1e-3  # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms [m]
-_RESTS = 1e-8, 1.0  # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's error
+# geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
+# [m]
+_CLEAR = 1e-3
+_RESTS = (
+    1e-8,
+    1.0,
+    # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
+    # error
+)
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
 class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
-    The state holds: whether a step was made, whether the skin rests, nodal positions, the last increment, poses and motion of the
-    geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the liquid's pressure and, with
-    implicit dynamics, nodal velocities.
-    """
+    The state holds: whether a step was made, whether the skin rests, nodal positions, the last increment,
+      poses and motion of the
+    geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
+    liquid's pressure and, with implicit dynamics, nodal velocities."""
 
     def __init__(self, config, geometry, geoms):
         self._config, self._geometry, self._geoms = config, geometry, geoms
@@ -53,7 +61,10 @@ class FemStepper:
             points = 4 * len(solved.elem) if element == "quadratic" else len(solved.tets)
             sizes |= {"memory": StressMemory.size(self._material, points)}
         ends = np.cumsum(list(sizes.values()))
-        self._slices = {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self._slices = {
+            name: slice(int(end - size), int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
         self.nstate = int(ends[-1])
 
     @functools.cached_property
@@ -114,7 +125,9 @@ class FemStepper:
         if self.inertial:
             x = self._part(state, "x").reshape(-1, 3)
             rigid = (x @ (core_mat[1] - core_mat[0]).T + core_pos[1] - core_pos[0]) / dt
-            velocity = self._part(state, "velocity").reshape(-1, 3) if started else rigid  # begins at rest on a core that may move
+            velocity = (
+                self._part(state, "velocity").reshape(-1, 3) if started else rigid
+            )  # begins at rest on a core that may move
             d.load_motion(velocity, core_pos[0], core_mat[0])
             step(self._model, d, geoms, dt, core_pos[1:], core_mat[1:])
         else:
@@ -127,14 +140,16 @@ class FemStepper:
             state=new,
             wrench=d.wrench[0],
             tangent=d.tangent(geoms)[0],
-            vert_xpos=self.vert_xpos(new),  # not the skin's own memory, which another BioTac's solve overwrites
+            vert_xpos=self.vert_xpos(
+                new
+            ),  # not the skin's own memory, which another BioTac's solve overwrites
             pressure=float(d.pressure[0]),
             converged=bool(d.converged[0]),
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
         )
 
-    # --- a skin at rest ---------------------------------------------------------------------------------------------------------
+    # --- a skin at rest  ---
 
     @functools.cached_property
     def _search(self):
@@ -147,8 +162,13 @@ class FemStepper:
         return bool(self._part(state, "resting")[0])
 
     def clear(self, state, geom_pos, geom_mat) -> bool:
-        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they come in a step [BioTac frame]."""
-        return self.resting(state) and not self._model.device.is_cuda and self._search.clear(geom_pos, geom_mat, _CLEAR)
+        """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
+        come in a step [BioTac frame]."""
+        return (
+            self.resting(state)
+            and not self._model.device.is_cuda
+            and self._search.clear(geom_pos, geom_mat, _CLEAR)
+        )
 
     def stay(self, state, geom_pos, geom_mat):
         """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
@@ -158,7 +178,11 @@ class FemStepper:
         last[:], self._part(state, "geom_mat")[:], started[:] = new, np.ravel(geom_mat), 1.0
 
     def _untouched(self, state, geom_pos, geom_mat):
-        if not self.resting(state) or self._model.device.is_cuda or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all()):
+        if (
+            not self.resting(state)
+            or self._model.device.is_cuda
+            or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all())
+        ):
             return False
         if not self._search.clear(geom_pos, geom_mat, self._reach):
             return False
@@ -188,7 +212,7 @@ class FemStepper:
         used = start + 1 + 5 * int(state[start])
         return state[:used].tobytes() + state[end:].tobytes()
 
-    # --- the state as numbers ---------------------------------------------------------------------------------------------------
+    # --- the state as numbers  ---
 
     def _unpack(self, state):
         d, geoms = self._data, self._geom_set
@@ -201,7 +225,9 @@ class FemStepper:
         )
         if self._material.remembers:
             d.memory.load(self._part(state, "memory"), d.x)
-        geoms.set_pose(self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3))
+        geoms.set_pose(
+            self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
+        )
         geoms.advance()
 
     def _pack(self, state, geom_pos, geom_mat):
@@ -229,7 +255,8 @@ class FemStepper:
 
 
 def rest_geometry(config, geometry):
-    """The geometry with the nodes where the skin rests on its filling: what the sensor sees when nothing touches."""
+    """The geometry with the nodes where the skin rests on its filling: what the sensor sees when nothing
+    touches."""
     choice, options = _choices(config)
     if not _filled(options):
         return geometry
@@ -241,7 +268,9 @@ def _choices(config):
     # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
     liquid = {} if config.liquid is None else {"liquid": config.liquid}
     options = SkinOptions(**({"tolerance": 3e-4} | liquid | config.options.get("skin", {})))
-    return Material(**config.material) if isinstance(config.material, dict) else material(config.material or "default"), options
+    return Material(**config.material) if isinstance(config.material, dict) else material(
+        config.material or "default"
+    ), options
 
 
 def _filled(options):
@@ -255,15 +284,25 @@ def _contacts(buffer):
 
 @functools.lru_cache(maxsize=16)
 def _grid(vert, face):
-    return bake_distance_grid(np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3))
+    return bake_distance_grid(
+        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
+    )
 
 
 _models = {}
 
 
 def _model(geometry, material_choice, options, device):
-    """One SkinModel per geometry and settings: its factor and compliance are the same for every sensor in the process."""
-    key = (geometry.vert.tobytes(), geometry.elem.tobytes(), geometry.fixed.tobytes(), material_choice, options, device)
+    """One SkinModel per geometry and settings: its factor and compliance are the same for every sensor in the
+    process."""
+    key = (
+        geometry.vert.tobytes(),
+        geometry.elem.tobytes(),
+        geometry.fixed.tobytes(),
+        material_choice,
+        options,
+        device,
+    )
     if key not in _models:
         _models[key] = SkinModel(geometry, material_choice, options, device)
     return _models[key]

@@ -1,7 +1,7 @@
 """One BioTac in one mjData: poses in, skin solved, wrenches and readings out.
 
-What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from it, so that mj_getState,
-mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
+What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from
+it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
 """
 
 import ctypes
@@ -28,7 +28,8 @@ STATUS = ("converged", "failed_steps", "iterations", "residual", "tier")
 
 
 class _Skin:
-    """A stepper and readings with the lock that lets one thread at a time use them: they share constants and scratch memory."""
+    """A stepper and readings with the lock that lets one thread at a time use them: they share constants and
+    scratch memory."""
 
     def __init__(self, config, geoms):
         self.geometry = skins.load(config.skin)
@@ -77,7 +78,8 @@ def forget_skins():
 
 
 class Setup:
-    """What a plugin instance's model says: settings, bodies, geoms, sensors. The same for every mjData of the model.
+    """What a plugin instance's model says: settings, bodies, geoms, sensors. The same for every mjData of the
+    model.
 
     Raises:
       ValueError: no body refers to the instance, or its settings do not fit the model.
@@ -87,7 +89,10 @@ class Setup:
         self.model, self.index = model, index
         cores = np.flatnonzero(model.body_plugin == index)
         if len(cores) != 1:
-            raise ValueError(f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with biotac_mj.attach")
+            raise ValueError(
+                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with "
+                "biotac_mj.attach"
+            )
         self.core = int(cores[0])
         self.config = Config.parse(lambda attribute: model.config(index, attribute))
         self.touching = Touching(model, self.core, self.config, compiling)
@@ -99,7 +104,8 @@ class Setup:
         return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state):
-        """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin state, as views."""
+        """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin
+        state, as views."""
         a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate
         c = b + self.skin.readings.nstate
@@ -115,15 +121,23 @@ class Setup:
             self.skin.readings.reset(readings)
 
     def named(self, kind):
-        """{name inside the BioTac: id} of the model's objects of a kind, whatever prefixes and suffixes later attachments added."""
+        """{name inside the BioTac: id} of the model's objects of a kind, whatever prefixes and suffixes later
+        attachments added."""
         before, _, after = self.model.name("body", self.core).rpartition("core")
-        count = getattr(self.model, {"sensor": "nsensor", "site": "nsite", "skin": "nskin", "eq": "neq"}[kind])
+        count = getattr(
+            self.model, {"sensor": "nsensor", "site": "nsite", "skin": "nskin", "eq": "neq"}[kind]
+        )
         names = (self.model.name(kind, i) for i in range(count))
-        return {n[len(before) : len(n) - len(after)]: i for i, n in enumerate(names) if n.startswith(before) and n.endswith(after)}
+        return {
+            n[len(before) : len(n) - len(after)]: i
+            for i, n in enumerate(names)
+            if n.startswith(before) and n.endswith(after)
+        }
 
 
 def state_size(model, index):
-    """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the model."""
+    """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
+    model."""
     return Setup(model, index, compiling=True).nstate
 
 
@@ -149,12 +163,17 @@ class Instance:
         self._tier = TIERS.index(setup.config.tier)
         self.two_way = setup.config.coupling == "two-way"
         if self.two_way:
-            slots = sorted((int(n[6:]), i) for n, i in setup.named("eq").items() if n.startswith("couple") and n[6:].isdigit())
+            slots = sorted(
+                (int(n[6:]), i)
+                for n, i in setup.named("eq").items()
+                if n.startswith("couple") and n[6:].isdigit()
+            )
             self.metric = Metric(model, setup.touching, [i for _, i in slots])
         start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
         if size < setup.nstate:
             raise ValueError(
-                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile it again from its XML or MjSpec"
+                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile "
+                "it again from its XML or MjSpec"
             )
         self._state = slice(start, start + size)
         self._result = self._reading = self._pose = self._geom_pose = None
@@ -169,21 +188,33 @@ class Instance:
 
     @property
     def horizon(self):
-        """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set their own poses: explicit."""
-        return 0.0 if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else self.model.opt.timestep
+        """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set
+        their own poses: explicit."""
+        return (
+            0.0
+            if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+            else self.model.opt.timestep
+        )
 
     def begin(self):
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
         self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
-                "the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or Euler, or coupling='one-way'"
+                "the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or "
+                "Euler, or coupling='one-way'"
             )
 
     def last_model(self):
-        """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3), (ngroup, 3, 3)."""
+        """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
+        (ngroup, 3, 3)."""
         models = self.setup.parts(self.state)[1]
-        return models[:, :6], models[:, 6:42].reshape(-1, 6, 6), models[:, 42:45], models[:, 45:].reshape(-1, 3, 3)
+        return (
+            models[:, :6],
+            models[:, 6:42].reshape(-1, 6, 6),
+            models[:, 42:45],
+            models[:, 45:].reshape(-1, 3, 3),
+        )
 
     @property
     def inertial(self):
@@ -191,7 +222,8 @@ class Instance:
         return getattr(self.setup.skin.stepper, "inertial", False)
 
     def clear(self, pos, mat):
-        """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not reach it within the step."""
+        """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
+        reach it within the step."""
         stepper, skin = self.setup.skin.stepper, self.setup.parts(self.state)[2]
         if not hasattr(stepper, "clear") or not stepper.resting(skin):
             return False
@@ -200,21 +232,26 @@ class Instance:
             return stepper.clear(skin, *self._geom_pose)
 
     def rest(self, pos, mat):
-        """Instead of `solve`, after `clear` has found the skin so of bodies at these poses: costs next to nothing."""
+        """Instead of `solve`, after `clear` has found the skin so of bodies at these poses: costs next to
+        nothing."""
         skin = self.setup.skin
         with skin.lock:
             self._result = skin.untouched
         self._pose, self._reading = (pos, mat), None
 
     def solve(self, pos, mat, core=()):
-        """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps the result for the readings.
+        """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
+        the result for the readings.
 
-        An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the end of the step.
+        An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
+          end of the step.
         """
         self._pose = pos, mat
         dt = self.model.opt.timestep
         key = (pos.tobytes(), mat.tobytes(), dt, self._key(), *(c.tobytes() for c in core))
-        result = self._solved.get(key)  # solving is a function of the key, so a second mj_forward costs nothing
+        result = self._solved.get(
+            key
+        )  # solving is a function of the key, so a second mj_forward costs nothing
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
@@ -223,7 +260,9 @@ class Instance:
             if not result.converged:  # go on with what was last known to be good
                 wrench, _, pos, mat = self.last_model()
                 tangent = np.zeros((self.setup.ngroup, 6, 6))
-                result = dataclasses.replace(result, state=before.copy(), wrench=wrench.copy(), tangent=tangent)
+                result = dataclasses.replace(
+                    result, state=before.copy(), wrench=wrench.copy(), tangent=tangent
+                )
                 result.vert_xpos = skin.stepper.vert_xpos(result.state)
             if len(self._solved) > 8:
                 self._solved.clear()
@@ -242,7 +281,9 @@ class Instance:
             skin, result = self.setup.skin, self._result
             state = self.setup.parts(self.state)[3].copy()
             with skin.lock:
-                counts = skin.readings.advance(state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure)
+                counts = skin.readings.advance(
+                    state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure
+                )
             self._reading = state, counts
         return self._reading
 
@@ -259,7 +300,13 @@ class Instance:
         if "status" in self.sensor:
             failed = self.state[_FAILED] + (not result.converged)
             tier = self._tier if result.measured else -self._tier
-            out[self.sensor["status"]] = (float(result.converged), failed, result.iterations, result.residual, tier)
+            out[self.sensor["status"]] = (
+                float(result.converged),
+                failed,
+                result.iterations,
+                result.residual,
+                tier,
+            )
 
     def failed(self):
         """After an exception: the step's skin is unknown; the status sensor says -1."""
@@ -289,7 +336,8 @@ class Instance:
         self._solved.clear()
 
     def visualize(self):
-        """Shows the deformed outer surface and colours the electrodes; MuJoCo calls it while it updates a scene."""
+        """Shows the deformed outer surface and colours the electrodes; MuJoCo calls it while it updates a
+        scene."""
         from .show import Shown
 
         if self._shown is None:

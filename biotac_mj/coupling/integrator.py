@@ -1,9 +1,10 @@
-"""From the accelerations that MuJoCo's constraint solver finds to those with which its integrator moves the bodies.
+"""From the accelerations that MuJoCo's constraint solver finds to those with which its integrator moves the
+bodies.
 
-Euler, implicitfast and implicit treat velocity-dependent forces implicitly, after the solver: they advance with
-a' = (M - h D)^-1 M a, where D is the derivative of joint damping (Euler) or of all smooth forces (the other two) in the velocities.
-With h D much larger than M, as with a light object on a damped joint, a' is a small part of a.
-"""
+Euler, implicitfast and implicit treat velocity-dependent forces implicitly, after the solver: they advance
+with a' = (M - h D)^-1 M a, where D is the derivative of joint damping (Euler) or of all smooth forces (the
+other two) in the velocities. With h D much larger than M, as with a light object on a damped joint, a' is a
+small part of a."""
 
 import ctypes
 
@@ -15,16 +16,23 @@ from ..plugin.structs import LIBRARY
 __all__ = ["Integrator", "FixedPoint"]
 
 LIBRARY.mjd_smooth_vel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
-_EULER, _FAST, _IMPLICIT = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "IMPLICITFAST", "IMPLICIT"))
-_NO_DAMPER, _NO_EULERDAMP = int(mujoco.mjtDisableBit.mjDSBL_DAMPER), int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+_EULER, _FAST, _IMPLICIT = (
+    int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "IMPLICITFAST", "IMPLICIT")
+)
+_NO_DAMPER, _NO_EULERDAMP = (
+    int(mujoco.mjtDisableBit.mjDSBL_DAMPER),
+    int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP),
+)
 _MEMORY = 6
 _NEGLIGIBLE = 1e-9  # h D relative to M
 
 
 class Integrator:
-    """(M - h D)^-1 M of the kinematic trees that `bodies` belong to; the others' accelerations are left as they are.
+    """(M - h D)^-1 M of the kinematic trees that `bodies` belong to; the others' accelerations are left as
+    they are.
 
-    Left out: the gyroscopic derivative that implicitfast has for lone free bodies, and what Euler takes from the damping of actuators.
+    Left out: the gyroscopic derivative that implicitfast has for lone free bodies, and what Euler takes from
+      the damping of actuators.
     """
 
     def __init__(self, model, bodies):
@@ -37,22 +45,28 @@ class Integrator:
         self._derivative = self._entries(place, model.D_rownnz, model.D_colind)
 
     def _entries(self, place, count, column):
-        """Where a sparse matrix has entries in the rows of `dofs`, and their rows and columns there; trees have no entries in common."""
+        """Where a sparse matrix has entries in the rows of `dofs`, and their rows and columns there; trees
+        have no entries in common."""
         row = place[np.repeat(np.arange(len(count)), count)]
         entry = np.flatnonzero(row >= 0)
         return entry, row[entry], place[column[entry]]
 
     def begin(self, data):
-        """Takes M and D at this step's state, after MuJoCo's actuation stage; returns whether a' differs from a."""
+        """Takes M and D at this step's state, after MuJoCo's actuation stage; returns whether a' differs from
+        a."""
         size, h = len(self.dofs), self.model.opt.timestep
         derivative = np.zeros((size, size))
         if self.model.opt.integrator in (_FAST, _IMPLICIT):
-            LIBRARY.mjd_smooth_vel(self.model.address, data.address, int(self.model.opt.integrator == _IMPLICIT))
+            LIBRARY.mjd_smooth_vel(
+                self.model.address, data.address, int(self.model.opt.integrator == _IMPLICIT)
+            )
             entry, row, column = self._derivative
             derivative[row, column] = data.qDeriv[entry]
             if self.model.opt.integrator == _FAST:  # takes the lower triangle for both
                 derivative = np.tril(derivative) + np.tril(derivative, -1).T
-        elif self.model.opt.integrator == _EULER and not self.model.opt.disableflags & (_NO_DAMPER | _NO_EULERDAMP):
+        elif self.model.opt.integrator == _EULER and not self.model.opt.disableflags & (
+            _NO_DAMPER | _NO_EULERDAMP
+        ):
             speed, high = np.abs(data.qvel[self.dofs]), self.model.dof_dampingpoly[self.dofs]
             damping = self.model.dof_damping[self.dofs] + 2 * high[:, 0] * speed + 3 * high[:, 1] * speed**2
             derivative[np.diag_indices(size)] = -damping
@@ -72,7 +86,8 @@ class Integrator:
         return out
 
     def slope(self, jacobian, stiffness):
-        """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, where only the rows hold them.
+        """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, where
+        only the rows hold them.
 
         Of jacobians (n, 6, nv) and stiffnesses (n, 6, 6).
         """
@@ -96,6 +111,8 @@ class FixedPoint:
         """The x (n,) to try after x (n,) left the residual g(x) - x (n,)."""
         self._x, self._residual = [*self._x[-_MEMORY:], x], [*self._residual[-_MEMORY:], residual]
         moved, changed = np.diff(self._x, axis=0).T, np.diff(self._residual, axis=0).T
-        weight = 0.01 ** np.arange(changed.shape[1])[::-1] / np.maximum(np.linalg.norm(changed, axis=0), 1e-300)
+        weight = 0.01 ** np.arange(changed.shape[1])[::-1] / np.maximum(
+            np.linalg.norm(changed, axis=0), 1e-300
+        )
         share = weight * np.linalg.lstsq(changed * weight, residual, rcond=1e-13)[0]
         return x + residual - (moved + changed) @ share

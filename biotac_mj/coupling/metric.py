@@ -1,13 +1,15 @@
-"""The skin's stiffness in MuJoCo's dynamics: rows of constraints that add h^2 J' S J to the inertia, across kinematic trees.
+"""The skin's stiffness in MuJoCo's dynamics: rows of constraints that add h^2 J' S J to the inertia, across
+kinematic trees.
 
-The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached without acceleration,
-S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The rest is exactly what a
-constraint row with regularisation R = 1 / (h^2 s) and reference acceleration zero gives, one row for each of the six eigenvalues s of S.
-MuJoCo's solver so finds the accelerations of object and finger together, with every other contact and limit: equal and opposite forces
+The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached
+without acceleration, S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into
+`qfrc_passive`. The rest is exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference
+acceleration zero gives, one row for each of the six eigenvalues s of S. MuJoCo's solver so finds the
+accelerations of object and finger together, with every other contact and limit: equal and opposite forces
 whatever the masses, nothing at rest, where a = 0. `docs/coupling.md` compares this with the alternatives.
 
-`attach` leaves inactive weld constraints in the model ("slots") to make room for the rows; each body that can touch gets one.
-"""
+`attach` leaves inactive weld constraints in the model ("slots") to make room for the rows; each body that can
+touch gets one."""
 
 import mujoco
 import numpy as np
@@ -16,7 +18,12 @@ __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-_SILENT = 0.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its derivative: reference acceleration 0
+_SILENT = (
+    0.0,
+    0.0,
+    1.0,
+    0.0,
+)  # of a row: stiffness, damping, impedance, its derivative: reference acceleration 0
 
 
 class Metric:
@@ -34,8 +41,10 @@ class Metric:
         needed = sorted({root for root in roots if root or tree[self.core] >= 0})
         if len(needed) > len(slots):
             raise ValueError(
-                f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has room for {len(slots)}: "
-                "attach it after adding the objects, pass attach(slots=...), or name the geoms that may touch with attach(geoms=[...])"
+                f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has "
+                f"room for {len(slots)}: "
+                "attach it after adding the objects, pass attach(slots=...), or name the geoms that may "
+                "touch with attach(geoms=[...])"
             )
         self.root = roots
         self._layout = None
@@ -45,7 +54,8 @@ class Metric:
             model.eq_active0[slot] = 1
 
     def jacobians(self, data):
-        """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in that frame."""
+        """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in
+        that frame."""
         frame = data.xmat[self.core].reshape(3, 3)
         origin = np.ascontiguousarray(data.xpos[self.core])
         turn = np.zeros((6, 6))
@@ -86,7 +96,8 @@ class Metric:
             index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
             if len(index) != 6:
                 raise ValueError(
-                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and equality, "
+                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and "
+                    "equality, "
                     "or use coupling='one-way'"
                 )
             places[root] = slice(int(index[0]), int(index[0]) + 6)

@@ -25,7 +25,9 @@ class SensorReadings:
 
     @functools.cached_property
     def _physics(self):
-        geometry = rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
+        geometry = (
+            rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
+        )
         film = _film(_Skin(geometry), self._options.get("sensor", "1"))
         return PhysicsReadings(geometry, seed=self._seed, film=film, **self._options)
 

@@ -1,4 +1,5 @@
-"""`SensorBioTac`: one place to say where the counts of the electrodes come from, for MuJoCo, dm-control and batches alike."""
+"""`SensorBioTac`: one place to say where the counts of the electrodes come from, for MuJoCo, dm-control and
+batches alike."""
 
 import dataclasses
 
@@ -14,8 +15,8 @@ class SensorBioTac:
         handle = biotac_mj.attach(spec, site="tip", **SensorBioTac(signal="latent_projection").settings())
 
     Attributes:
-      signal: "physics": conduction in the liquid film; "latent_projection": the learned model that did best on unseen objects,
-        trained on synthetic data (docs/learning.md).
+      signal: "physics": conduction in the liquid film; "latent_projection": the learned model that did best
+        on unseen objects, trained on synthetic data (docs/learning.md).
       sensor: "1" | "2" | "3", whose published rest counts are shown.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
@@ -34,7 +35,10 @@ class SensorBioTac:
         if self.signal not in SIGNALS:
             raise ValueError(f"unknown signal {self.signal!r}: choose one of {', '.join(SIGNALS)}")
         if self.signal == "physics" and self.weights is not None:
-            raise ValueError(f"weights {self.weights!r} are given but the signal is 'physics': take signal='latent_projection'")
+            raise ValueError(
+                f"weights {self.weights!r} are given but the signal is 'physics': take "
+                "signal='latent_projection'"
+            )
 
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
@@ -42,7 +46,8 @@ class SensorBioTac:
         return out if self.weights is None else out | {"weights": str(self.weights)}
 
     def settings(self, options=None) -> dict:
-        """Arguments for `biotac_mj.attach` and `tasks.BioTac`: readings and options; `options` are further ones to keep."""
+        """Arguments for `biotac_mj.attach` and `tasks.BioTac`: readings and options; `options` are further
+        ones to keep."""
         name = "biotac" if self.signal == "physics" else self.signal
         return {"readings": name, "options": {**(options or {}), "readings": self.options()}}
 

@@ -1,4 +1,5 @@
-"""What a renderer sees: the deformed outer surface as a MuJoCo skin, the electrodes coloured by their change from rest."""
+"""What a renderer sees: the deformed outer surface as a MuJoCo skin, the electrodes coloured by their change
+from rest."""
 
 import numpy as np
 
@@ -9,7 +10,8 @@ _NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]
 
 
 def electrode_colors(change):
-    """(n, 4) RGBA of (n,) changes in counts: red where the film gets thinner (counts fall), blue where it bulges, grey at rest."""
+    """(n, 4) RGBA of (n,) changes in counts: red where the film gets thinner (counts fall), blue where it
+    bulges, grey at rest."""
     amount = np.clip(np.abs(change) / _FULL_SCALE, 0.0, 1.0)[:, None]
     end = np.where(np.asarray(change)[:, None] < 0, _LESS, _MORE)
     return np.concatenate([_NEUTRAL + amount * (end - _NEUTRAL), np.ones_like(amount)], axis=1)
@@ -38,4 +40,6 @@ class Shown:
                 instance.model.skin_vert[self.vert] = skin.stepper.vert_xpos(state)[self.node]
         if self.rest is not None and len(self.site) == 19 and "electrodes" in instance.sensor:
             counts = instance.data.sensordata[instance.sensor["electrodes"]]
-            instance.model.site_rgba[self.site] = electrode_colors(counts - self.rest if counts.any() else np.zeros(19))
+            instance.model.site_rgba[self.site] = electrode_colors(
+                counts - self.rest if counts.any() else np.zeros(19)
+            )

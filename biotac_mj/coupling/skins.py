@@ -20,7 +20,8 @@ def load(name) -> SkinGeometry:
 
 
 def reference(skin):
-    """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache, named by its content.
+    """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache,
+    named by its content.
 
     Raises:
       FileNotFoundError, ValueError: no such skin.
@@ -30,8 +31,14 @@ def reference(skin):
         if text.endswith(".npz"):
             text = str(pathlib.Path(text).resolve())
         return text, load(text)
-    digest = hashlib.sha256(skin.vert.tobytes() + skin.elem.tobytes() + skin.outer_face.tobytes() + skin.fixed.tobytes()).hexdigest()[:16]
-    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "biotac_mj" / "skins"
+    digest = hashlib.sha256(
+        skin.vert.tobytes() + skin.elem.tobytes() + skin.outer_face.tobytes() + skin.fixed.tobytes()
+    ).hexdigest()[:16]
+    cache = (
+        pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+        / "biotac_mj"
+        / "skins"
+    )
     if not os.access(next(p for p in (cache, *cache.parents) if p.exists()), os.W_OK):
         cache = pathlib.Path(tempfile.gettempdir()) / "biotac_mj_skins"
     path = cache / f"{digest}.npz"

@@ -1,4 +1,5 @@
-"""The two doors of the coupling: a skin that takes poses and gives wrenches, and readings that take the deformed skin and give counts."""
+"""The two doors of the coupling: a skin that takes poses and gives wrenches, and readings that take the
+deformed skin and give counts."""
 
 import dataclasses
 import importlib
@@ -48,9 +49,12 @@ class SkinResult:
     """A skin solved for the poses at the end of a step, in the BioTac frame.
 
     Attributes:
-      state: (nstate,) the new state, committed by the caller; None: the skin rests as before (see `SkinStepper.stay`).
-      wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin [N, N m].
-      tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric positive semi-definite.
+      state: (nstate,) the new state, committed by the caller; None: the skin rests as before (see
+        `SkinStepper.stay`).
+      wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin
+        [N, N m].
+      tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric
+        positive semi-definite.
       vert_xpos: (nvert, 3) deformed nodes [m].
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
@@ -69,8 +73,9 @@ class SkinResult:
 
 
 class SkinStepper(Protocol):
-    """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions are not yet known, perhaps with
-    more geoms than there will be (so more geoms may not need less state). Heavy work belongs into the first `reset` or `solve`."""
+    """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions
+    are not yet known, perhaps with more geoms than there will be (so more geoms may not need less state).
+    Heavy work belongs into the first `reset` or `solve`."""
 
     nstate: int
 
@@ -78,9 +83,10 @@ class SkinStepper(Protocol):
         """Writes the rest state into state (nstate,)."""
 
     def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
-        """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its arguments alone, which keeps
-        `state` as it is. A stepper with a true attribute `inertial` gets core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac
-        frame in the world at the start and at the end of the step."""
+        """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its
+        arguments alone, which keeps `state` as it is. A stepper with a true attribute `inertial` gets
+        core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
+        end of the step."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
@@ -106,7 +112,9 @@ class Readings(Protocol):
     def reset(self, state: np.ndarray) -> None:
         """Writes the state at time zero into state (nstate,)."""
 
-    def advance(self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float) -> dict:
+    def advance(
+        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+    ) -> dict:
         """Advances state in place over [time, time + dt] and returns channel -> counts."""
 
 
@@ -137,7 +145,8 @@ _readings = {
 
 
 def register_stepper(name, factory):
-    """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)` takes."""
+    """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)`
+    takes."""
     _steppers[name] = factory
 
 
@@ -155,10 +164,14 @@ def _factory(table, name):
 
 def check_names(config):
     """Raises ValueError if the settings name a stepper or readings that nobody registered."""
-    for table, name, what in ((_steppers, config.stepper, "stepper"), (_readings, config.readings, "readings")):
+    for table, name, what in (
+        (_steppers, config.stepper, "stepper"),
+        (_readings, config.readings, "readings"),
+    ):
         if name not in table:
             raise ValueError(
-                f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper"
+                f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in "
+                "biotac_mj.coupling.stepper"
             )
 
 

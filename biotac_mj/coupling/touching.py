@@ -29,21 +29,27 @@ class Touching:
       body: (ngroup,) ids of the touching bodies.
 
     Raises:
-      ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the skin cannot touch.
+      ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the
+        skin cannot touch.
     """
 
     def __init__(self, model, core, config, compiling=False):
         self.core = core
         ids = _select(model, core, config.geoms)
-        if config.geoms is None and not compiling:  # contact exclusions are not yet in the model while it is compiled
+        if (
+            config.geoms is None and not compiling
+        ):  # contact exclusions are not yet in the model while it is compiled
             ids = _not_excluded(model, core, ids)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
-        self.geoms = [_describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)]
+        self.geoms = [
+            _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)
+        ]
         self.group = group
-        # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees' centres of mass
+        # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
+        # centres of mass
         self._body = np.concatenate([[core], self.body]).astype(np.int64)
         self._root = model.body_rootid[self._body]
         self._geom_pos, self._geom_mat = model.geom_pos[ids], _matrix(model.geom_quat[ids])
@@ -58,7 +64,8 @@ class Touching:
         return b"|".join(parts)
 
     def predict(self, data, horizon):
-        """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity for `horizon` [s].
+        """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity
+        for `horizon` [s].
 
         Returns:
           (ngroup, 3) positions [m], (ngroup, 3, 3) rotations.
@@ -73,7 +80,8 @@ class Touching:
         return pos, mat
 
     def core_motion(self, data, horizon):
-        """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present velocity."""
+        """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present
+        velocity."""
         now, then = (self._ahead(data, self._body[:1], self._root[:1], h) for h in (0.0, horizon))
         return np.concatenate([now[0], then[0]]), np.concatenate([now[1], then[1]])
 
@@ -104,7 +112,9 @@ class Touching:
             return
         bad = ~np.isfinite(pos.sum(axis=1) + mat.sum(axis=(1, 2)))
         names = [g.name or f"#{i}" for g, i in zip(self.geoms, self.geom) if bad[g.group]]
-        raise ValueError(f"NaN in the pose of the BioTac or of geom {', '.join(names)}: check mocap_pos, qpos and qvel")
+        raise ValueError(
+            f"NaN in the pose of the BioTac or of geom {', '.join(names)}: check mocap_pos, qpos and qvel"
+        )
 
 
 # positions of a cross product's factors: faster than np.cross on a few vectors
@@ -142,7 +152,8 @@ def _matrix(quat):
 
 
 def displacement(pos, mat, pos0, mat0):
-    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0 (n, 3, 3) to pos, mat."""
+    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0
+    (n, 3, 3) to pos, mat."""
     turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
     vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
     sine = np.sqrt((vector * vector).sum(axis=1))
@@ -165,9 +176,14 @@ def _select(model, core, names):
         ids = [_resolve(model, name) for name in names]
         for i in ids:
             if weld[model.geom_bodyid[i]] == own and own:
-                raise ValueError(f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: leave it out of geoms")
+                raise ValueError(
+                    f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: leave it "
+                    "out of geoms"
+                )
         return np.array(sorted(ids), dtype=np.int64)
-    parent = model.body_weldid[model.body_parentid]  # as in MuJoCo's filter: links joined by one joint do not collide
+    parent = model.body_weldid[
+        model.body_parentid
+    ]  # as in MuJoCo's filter: links joined by one joint do not collide
     out = []
     for i in range(model.ngeom):
         body = model.geom_bodyid[i]
@@ -181,8 +197,14 @@ def _select(model, core, names):
 
 def _not_excluded(model, core, ids):
     pairs = {tuple(sorted((core, int(model.geom_bodyid[i])))) for i in ids}
-    excluded = {pair for pair in pairs if model.nexclude and np.any(model.exclude_signature == (pair[0] << 16) + pair[1])}
-    return np.array([i for i in ids if tuple(sorted((core, int(model.geom_bodyid[i])))) not in excluded], dtype=np.int64)
+    excluded = {
+        pair
+        for pair in pairs
+        if model.nexclude and np.any(model.exclude_signature == (pair[0] << 16) + pair[1])
+    }
+    return np.array(
+        [i for i in ids if tuple(sorted((core, int(model.geom_bodyid[i])))) not in excluded], dtype=np.int64
+    )
 
 
 def _resolve(model, name):
@@ -193,7 +215,8 @@ def _resolve(model, name):
     if len(matches) != 1:
         found = "none" if not matches else ", ".join(names[i] for i in matches)
         raise ValueError(
-            f"geom {name!r} of the BioTac's settings matches {found}: the model has {', '.join(n for n in names if n) or 'no named geom'}"
+            f"geom {name!r} of the BioTac's settings matches {found}: the model has "
+            f"{', '.join(n for n in names if n) or 'no named geom'}"
         )
     return matches[0]
 
@@ -203,11 +226,16 @@ def _describe(model, index, group, rounding, config):
     if kind not in _TYPES:
         label = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
         raise ValueError(
-            f"geom {name or index!r} is of type {label}, which a BioTac cannot touch: it knows {', '.join(_TYPES.values())}; "
+            f"geom {name or index!r} is of type {label}, which a BioTac cannot touch: it knows "
+            f"{', '.join(_TYPES.values())}; "
             "name the geoms that may touch with attach(geoms=[...]) or clear its contype and conaffinity"
         )
     other, priority = float(model.geom_friction[index, 0]), int(model.geom_priority[index])
-    friction = max(other, config.friction) if priority == config.priority else (other if priority > config.priority else config.friction)
+    friction = (
+        max(other, config.friction)
+        if priority == config.priority
+        else (other if priority > config.priority else config.friction)
+    )
     vert = face = None
     if _TYPES[kind] == "mesh":
         mesh = model.geom_dataid[index]

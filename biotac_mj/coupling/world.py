@@ -1,11 +1,11 @@
 """All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
 
-A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, the accelerations a with which
-MuJoCo's integrator moves the bodies under it (`integrator`). Newton's method on x': every round asks MuJoCo for the accelerations with the
-skins' linear models in force (`metric`), which says where the bodies go, and solves the skins there, which gives new linear models. The
-models of the last step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a light object
-that meets the skin within the step, two or three.
-"""
+A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, the
+accelerations a with which MuJoCo's integrator moves the bodies under it (`integrator`). Newton's method on
+x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which
+says where the bodies go, and solves the skins there, which gives new linear models. The models of the last
+step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a
+light object that meets the skin within the step, two or three."""
 
 import mujoco
 import numpy as np
@@ -17,9 +17,11 @@ from .touching import displace, displacement, rotation
 __all__ = ["World"]
 
 MAX_ROUNDS = 4
-TOLERANCE = 2e-6  # [m] change of the predicted pose, rotations over a lever of _LEVER, below which the skin is not solved again
+# [m] change of the predicted pose, rotations over a lever of _LEVER, below which the skin is not solved again
+TOLERANCE = 2e-6
 MAX_CORRECTIONS = 12
-CORRECTED = 1e-6  # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
+# of the skins' wrenches: how well the rows and the passive forces together must give the linear model
+CORRECTED = 1e-6
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _LEVER = 0.01  # [m] about the size of a fingertip
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / _LEVER] * 3])  # compares torques with forces
@@ -33,11 +35,16 @@ class World:
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         self.first = self.coupled[0].index if self.coupled else -1
-        self._damped = None  # whether the integrator's accelerations differ from the constraint solver's in this step
-        self.integrator = Integrator(model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)})
+        self._damped = (
+            None  # whether the integrator's accelerations differ from the constraint solver's in this step
+        )
+        self.integrator = Integrator(
+            model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
+        )
 
     def passive(self, index):
-        """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is asked."""
+        """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
+        asked."""
         instance = self.instances[index]
         if not instance.two_way:
             instance.begin()
@@ -87,10 +94,11 @@ class World:
             self._forces(skins, outside)
 
     def _accelerations(self, skins, outside):
-        """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the forces that do this in place.
+        """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
+        forces that do this in place.
 
-        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J (a - a') corrects it.
-        """
+        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
+        (a - a') corrects it."""
         self._forces(skins, outside)
         found = self.data.acceleration()
         if self._damped is None:  # known only after the actuation stage
@@ -100,7 +108,8 @@ class World:
         if not any(s.tangent.any() for s in skins):
             return self.integrator.advance(found)
         jacobian, tangent, wrench0, correction = (
-            np.concatenate([getattr(s, name) for s in skins]) for name in ("jacobian", "tangent", "wrench0", "correction")
+            np.concatenate([getattr(s, name) for s in skins])
+            for name in ("jacobian", "tangent", "wrench0", "correction")
         )
         stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
         search = slope = None
@@ -114,7 +123,9 @@ class World:
             if search is None:
                 search, slope = FixedPoint(), self.integrator.slope(jacobian, stiffness)
             step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
-            correction = search.next((_SCALE * correction).ravel(), (_SCALE * step).ravel()).reshape(-1, 6) / _SCALE
+            correction = (
+                search.next((_SCALE * correction).ravel(), (_SCALE * step).ravel()).reshape(-1, 6) / _SCALE
+            )
             for skin, part in zip(skins, np.split(correction, ends)):
                 skin.correction = part
             self._forces(skins, outside)

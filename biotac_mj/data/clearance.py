@@ -1,4 +1,5 @@
-"""How far objects are from the skin and from the core, for many poses at once: where they first touch and how deep they may go."""
+"""How far objects are from the skin and from the core, for many poses at once: where they first touch and how
+deep they may go."""
 
 import numpy as np
 import warp as wp
@@ -57,15 +58,21 @@ class Placed:
         self.geoms.set_pose(*self.pose(pos, mat))
 
     def pose(self, pos, mat):
-        """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's frame."""
+        """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's
+        frame."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
         return (pos + mat @ self._pos)[:, None], (mat @ self._mat)[:, None]
 
     def nearest(self, points: wp.array) -> np.ndarray:
         """(nworld,) signed distance to the nearest of points (n,) vec3 [m], at most 2 mm."""
         out = wp.full(self.geoms.nworld, _FAR, dtype=real, device=self.geoms.device)
-        wp.launch(nearest, dim=(len(points), self.geoms.nworld), inputs=[points, self.geoms.struct, _FAR], outputs=[out],
-                  device=self.geoms.device)  # fmt: skip
+        wp.launch(
+            nearest,
+            dim=(len(points), self.geoms.nworld),
+            inputs=[points, self.geoms.struct, _FAR],
+            outputs=[out],
+            device=self.geoms.device,
+        )
         return out.numpy()
 
 
@@ -76,11 +83,11 @@ def surface_samples(vert, face, device, order: int = 3) -> wp.array:
 
 
 def first_touch(placed: Placed, points: wp.array, start, mat, direction, reach: float = 0.12) -> np.ndarray:
-    """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of the points.
+    """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of
+    the points.
 
-    Each step goes as far as the nearest point is away, so it cannot pass one. NaN where none is met within `reach`, or where the object
-    starts in touch.
-    """
+    Each step goes as far as the nearest point is away, so it cannot pass one. NaN where none is met within
+    `reach`, or where the object starts in touch."""
     travel = np.zeros(len(start))
     for _ in range(400):
         placed.place(start + travel[:, None] * direction, mat)

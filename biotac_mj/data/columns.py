@@ -8,18 +8,20 @@ __all__ = ["read_columns"]
 
 
 def read_columns(path, names) -> np.ndarray:
-    """(n, len(names)) numbers of a text file, blanks, tabs, commas or semicolons between them; lines that begin with # or % are comments.
+    """(n, len(names)) numbers of a text file, blanks, tabs, commas or semicolons between them; lines that
+    begin with # or % are comments.
 
-    Without a header the file has these columns in this order and no others. A header (one line without any number) that has all the names,
-    in any order and among others, says which columns they are, upper or lower case; one of other words is passed over.
+    Without a header the file has these columns in this order and no others. A header (one line without any
+    number) that has all the names, in any order and among others, says which columns they are, upper or lower
+    case; one of other words is passed over.
 
     Args:
       path: file. names: of the columns.
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: no rows, another number of columns, a header without some of the names, or a cell that is no finite number; the text
-        names line, column and remedy.
+      ValueError: no rows, another number of columns, a header without some of the names, or a cell that is no
+        finite number; the text names line, column and remedy.
     """
     path, wanted = pathlib.Path(path), [name.lower() for name in names]
     range_ = f"{names[0]}..{names[-1]}" if len(names) > 3 else " ".join(names)
@@ -37,11 +39,14 @@ def read_columns(path, names) -> np.ndarray:
         elif len(missing) < len(names):
             raise ValueError(f"{path} has no columns {', '.join(missing)}: its header must name {range_}")
     if not rows:
-        raise ValueError(f"{path} is empty: {len(names)} columns of numbers, {range_}, one row per sample, are needed")
+        raise ValueError(
+            f"{path} is empty: {len(names)} columns of numbers, {range_}, one row per sample, are needed"
+        )
     for i, row in rows:
         if len(row) != width:
             raise ValueError(
-                f"{path}, line {i}: {len(row)} columns, {width} are needed ({range_}); leave out times and other channels, or name all "
+                f"{path}, line {i}: {len(row)} columns, {width} are needed ({range_}); leave out times and "
+                "other channels, or name all "
                 "columns in a header"
             )
     cells = [[row[k] for k in order] for _, row in rows]
@@ -53,7 +58,8 @@ def read_columns(path, names) -> np.ndarray:
     if not good.all():
         (r, c), count = np.argwhere(~good)[0], (~good).sum()
         raise ValueError(
-            f"{path}, line {rows[r][0]}: {names[c]} is {cells[r][c]!r}, not a finite number ({count} such cells): a gap cannot be guessed; "
+            f"{path}, line {rows[r][0]}: {names[c]} is {cells[r][c]!r}, not a finite number ({count} such "
+            "cells): a gap cannot be guessed; "
             "cut the recording there or log it again"
         )
     return value

@@ -1,4 +1,5 @@
-"""`biotac generate`: plans, simulates, reads and stores synthetic interactions, one shard for each batch of worlds."""
+"""`biotac generate`: plans, simulates, reads and stores synthetic interactions, one shard for each batch of
+worlds."""
 
 import dataclasses
 import json
@@ -17,27 +18,32 @@ from .store import TactileSet, shard_path
 
 __all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate"]
 
-RECORDINGS = "recordings"  # folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
+# folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
+RECORDINGS = "recordings"
 
 
 @dataclasses.dataclass(frozen=True)
 class GenerateOptions:
-    """What is generated. All of it but `device` is kept with the set and must be the same when an interrupted run goes on.
+    """What is generated. All of it but `device` is kept with the set and must be the same when an interrupted
+    run goes on.
 
     Attributes:
-      count: interactions. labelled: of them, how many also get the readings of the synthetic measured sensor; the paper's indenters only.
-      recordings: further interactions, with pegs and table, of which the synthetic measured sensor's readings alone are kept, as if logged
-        by hand; in a set of their own, the folder `recordings` in this one.
+      count: interactions. labelled: of them, how many also get the readings of the synthetic measured sensor;
+        the paper's indenters only.
+      recordings: further interactions, with pegs and table, of which the synthetic measured sensor's readings
+        alone are kept, as if logged by hand; in a set of their own, the folder `recordings` in this one.
       steps: time steps of each. rate: of them [Hz].
       seed: of everything.
       objects, kinds: to draw from.
-      skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid None: the material's.
+      skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
+        None: the material's.
       sensor: whose published rest counts the simulated electrodes show.
-      batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes part in: on a fine mesh a step
-        costs a GPU the same for 20 or 100 worlds, so such a batch mixes its objects. A shard holds one batch.
+      batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
+        part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
+        objects. A shard holds one batch.
       measured_seed, measured_skin: number and mesh of the synthetic measured sensor.
-      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as they come free. Devices of one
-        kind make the same files, however many they are.
+      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as
+        they come free. Devices of one kind make the same files, however many they are.
     """
 
     count: int = 2600
@@ -65,13 +71,19 @@ class GenerateOptions:
         object.__setattr__(self, "kinds", tuple(self.kinds))
         if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
             raise ValueError(
-                f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: all must be at least 1"
+                f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: "
+                "all must be at least 1"
             )
         kinds = {name.split(":")[0] for name in self.devices}
         if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
-            raise ValueError(f"device is {self.device!r}: choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1")
+            raise ValueError(
+                f"device is {self.device!r}: choose cpu, cuda:0, or several GPUs once each, as in "
+                "cuda:0,cuda:1"
+            )
         if not 0 <= self.labelled <= self.count:
-            raise ValueError(f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}")
+            raise ValueError(
+                f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}"
+            )
         if self.recordings < 0:
             raise ValueError(f"recordings is {self.recordings}: it must not be negative")
         if not (np.isfinite(self.rate) and self.rate > 0):
@@ -82,9 +94,15 @@ class GenerateOptions:
             raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
         unknown = [name for name in self.objects if name not in OBJECTS]
         if unknown or not self.objects:
-            raise ValueError(f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: choose from {', '.join(OBJECTS)}")
+            raise ValueError(
+                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: choose from "
+                f"{', '.join(OBJECTS)}"
+            )
         if self.labelled and not set(self.objects) & set(INDENTERS):
-            raise ValueError("labelled interactions are made with the eight indenters: add one of them to the objects, or take 0 labelled")
+            raise ValueError(
+                "labelled interactions are made with the eight indenters: add one of them to the objects, "
+                "or take 0 labelled"
+            )
 
     @property
     def devices(self) -> list[str]:
@@ -98,7 +116,8 @@ class Report:
     Attributes:
       interactions, steps: in the set. recordings: in that beside it. nonconverged: of these steps.
       made: shards made by this run; those that were there are kept.
-      seconds: wall time of this run, once and per stage (of several devices together). bytes: of the shards. device: its name.
+      seconds: wall time of this run, once and per stage (of several devices together). bytes: of the shards.
+        device: its name.
       devices: how many worked at once.
     """
 
@@ -131,7 +150,8 @@ class Batch:
 
 
 def batches(options: GenerateOptions) -> list[Batch]:
-    """Labelled interactions first, then the others, then recordings; objects take turns, so a part of a set is a smaller one like it."""
+    """Labelled interactions first, then the others, then recordings; objects take turns, so a part of a set
+    is a smaller one like it."""
     indenters = [name for name in options.objects if name in INDENTERS]
     others = [name for name in options.objects if name not in INDENTERS] or indenters
     ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
@@ -149,7 +169,9 @@ def batches(options: GenerateOptions) -> list[Batch]:
     return out
 
 
-def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | None = None, progress: bool = True) -> Report:  # noqa: B008 - frozen
+def generate(
+    out, options: GenerateOptions = GenerateOptions(), workers: int | None = None, progress: bool = True
+) -> Report:  # noqa: B008 - frozen
     """Makes a set in folder `out`, or what is missing of it.
 
     Args:
@@ -166,7 +188,9 @@ def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | N
 
     out = pathlib.Path(out)
     load_skin(options.skin)  # refuses one that is not there
-    settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {"device": options.device.split(":")[0]}
+    settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {
+        "device": options.device.split(":")[0]
+    }
     settings = json.loads(json.dumps(settings))
     todo = [batch for batch in batches(options) if not _is_there(out / batch.path, settings)]
     begin = time.perf_counter()
@@ -188,7 +212,9 @@ def generate(out, options: GenerateOptions = GenerateOptions(), workers: int | N
         )
     if todo:
         with replacing(out / "generate.json") as temporary:
-            temporary.write_text(json.dumps({**dataclasses.asdict(report), "settings": settings}, indent=1) + "\n")
+            temporary.write_text(
+                json.dumps({**dataclasses.asdict(report), "settings": settings}, indent=1) + "\n"
+            )
     return report
 
 
@@ -200,5 +226,8 @@ def _is_there(path, settings):
         found = data.attributes.get("settings", {})
     different = [f"{k} {found.get(k)!r} there, {v!r} now" for k, v in settings.items() if found.get(k) != v]
     if different:
-        raise ValueError(f"{path} was generated with other options ({'; '.join(different)}): use another --out, or delete that set")
+        raise ValueError(
+            f"{path} was generated with other options ({'; '.join(different)}): use another --out, or "
+            "delete that set"
+        )
     return True

@@ -1,4 +1,5 @@
-"""Recordings of real sensors, as they were published or logged, into the native store: interactions of kind "recorded", no simulation."""
+"""Recordings of real sensors, as they were published or logged, into the native store: interactions of kind
+"recorded", no simulation."""
 
 import csv
 import pathlib
@@ -17,14 +18,30 @@ __all__ = ["FORMATS", "RUPPEL_COLUMNS", "import_recordings", "read_nvidia", "rea
 _NVIDIA = {"electrode_vals": 19, "contact_loc": 3, "force_vec": 3, "indenter_type": 1}
 _JUMP = 0.5e-3  # [m] between two samples of one trajectory of NVIDIA's files
 _GAP = 0.5  # [s] without a sample ends an interaction of a log with times
-RUPPEL_COLUMNS = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *CHANNELS[:19])
+RUPPEL_COLUMNS = (
+    "time",
+    "px",
+    "py",
+    "pz",
+    "fx",
+    "fy",
+    "fz",
+    "pac0",
+    "pac1",
+    "pdc",
+    "tac",
+    "tdc",
+    *CHANNELS[:19],
+)
 
 
 def read_nvidia(path, rate: float = 100.0, objects=None) -> list[Interaction]:
-    """NVIDIA's biotac{1,2,3}.hdf5 (Sundaralingam et al., ICRA 2019; Narang et al., 2021): one interaction for each trajectory.
+    """NVIDIA's biotac{1,2,3}.hdf5 (Sundaralingam et al., ICRA 2019; Narang et al., 2021): one interaction for
+    each trajectory.
 
-    Keys electrode_vals/data (n, 19), contact_loc/data (n, 3) [m], force_vec/data (n, 3) [N], indenter_type/data (n,) or (n, 1); the last
-    may be missing. A trajectory ends where contact_loc jumps by more than 0.5 mm or the indenter changes.
+    Keys electrode_vals/data (n, 19), contact_loc/data (n, 3) [m], force_vec/data (n, 3) [N],
+    indenter_type/data (n,) or (n, 1); the last may be missing. A trajectory ends where contact_loc jumps by
+    more than 0.5 mm or the indenter changes.
 
     Args:
       path: the file.
@@ -32,17 +49,22 @@ def read_nvidia(path, rate: float = 100.0, objects=None) -> list[Interaction]:
       objects: names of indenter types 0, 1, ...; None calls them indenter_0 and so on.
 
     Returns:
-      Interactions: contact points as `indenter_pos` and forces as `measured_wrench`, both in the file's frame (the torque is NaN).
+      Interactions: contact points as `indenter_pos` and forces as `measured_wrench`, both in the file's frame
+        (the torque is NaN).
 
     Raises:
       FileNotFoundError, ValueError: no such file, or one of another layout; the text names the key.
     """
-    path = _file(path, "an HDF5 file with electrode_vals/data, contact_loc/data, force_vec/data and indenter_type/data")
+    path = _file(
+        path, "an HDF5 file with electrode_vals/data, contact_loc/data, force_vec/data and indenter_type/data"
+    )
     try:
         with h5py.File(path) as file:
             data = {name: file[f"{name}/data"][:] for name in _NVIDIA if f"{name}/data" in file}
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error}): it is no HDF5 file or it is damaged; fetch it again") from error
+        raise ValueError(
+            f"{path} cannot be read ({error}): it is no HDF5 file or it is damaged; fetch it again"
+        ) from error
     missing = [f"{name}/data" for name in _NVIDIA if name not in data and name != "indenter_type"]
     if missing:
         raise ValueError(f"{path} has no {', '.join(missing)}: it is not one of NVIDIA's BioTac files")
@@ -50,65 +72,108 @@ def read_nvidia(path, rate: float = 100.0, objects=None) -> list[Interaction]:
     kind = data.pop("indenter_type", np.zeros(n)).reshape(-1).astype(int)
     for name, value in data.items():
         if value.shape != (n, _NVIDIA[name]):
-            raise ValueError(f"{name}/data of {path} has shape {value.shape}: ({n}, {_NVIDIA[name]}) is needed")
+            raise ValueError(
+                f"{name}/data of {path} has shape {value.shape}: ({n}, {_NVIDIA[name]}) is needed"
+            )
     if len(kind) != n:
-        raise ValueError(f"indenter_type/data of {path} has {len(kind)} entries for {n} samples: it must have one each")
+        raise ValueError(
+            f"indenter_type/data of {path} has {len(kind)} entries for {n} samples: it must have one each"
+        )
     jump = np.linalg.norm(np.diff(data["contact_loc"], axis=0), axis=1) > _JUMP
     pieces = _pieces(jump | (np.diff(kind) != 0), n)
     out = []
     for number, (a, b) in enumerate(pieces):
         k = kind[a]
         if objects is not None and not 0 <= k < len(objects):
-            raise ValueError(f"{path} has indenter type {k}, but {len(objects)} object names were given: name all of them")
+            raise ValueError(
+                f"{path} has indenter type {k}, but {len(objects)} object names were given: name all of them"
+            )
         name = f"indenter_{k}" if objects is None else objects[k]
         out.append(
-            _recorded(f"{path.stem}-{number:05d}", name, np.arange(b - a) / rate, data["electrode_vals"][a:b], data["force_vec"][a:b],
-                      data["contact_loc"][a:b], {"format": "nvidia", "rows": [a, b], "rate": rate, "frame": "the file's"}, path)
-        )  # fmt: skip
+            _recorded(
+                f"{path.stem}-{number:05d}",
+                name,
+                np.arange(b - a) / rate,
+                data["electrode_vals"][a:b],
+                data["force_vec"][a:b],
+                data["contact_loc"][a:b],
+                {"format": "nvidia", "rows": [a, b], "rate": rate, "frame": "the file's"},
+                path,
+            )
+        )
     return out
 
 
 def read_ruppel(path, object="sphere_4mm") -> list[Interaction]:  # noqa: A002 - the column's name
-    """Ruppel et al.'s CSV (IAS-15, 2019): time, contact point, force, pac0, pac1, pdc, tac, tdc, e1..e19; a sphere of 2 mm radius.
+    """Ruppel et al.'s CSV (IAS-15, 2019): time, contact point, force, pac0, pac1, pdc, tac, tdc, e1..e19; a
+    sphere of 2 mm radius.
 
-    With or without a header (RUPPEL_COLUMNS in any order, or these 31 columns in this order). An interaction ends where time jumps by more
-    than 0.5 s or runs back. Of the two PAC samples the later is kept.
+    With or without a header (RUPPEL_COLUMNS in any order, or these 31 columns in this order). An interaction
+    ends where time jumps by more than 0.5 s or runs back. Of the two PAC samples the later is kept.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, a missing column, a row that is no numbers; the text names it.
+      FileNotFoundError, ValueError: no such file, a missing column, a row that is no numbers; the text names
+        it.
     """
     path = _file(path, f"a CSV file with columns {', '.join(RUPPEL_COLUMNS)}")
     with open(path, newline="", encoding="utf-8-sig") as file:
         rows = [row for row in csv.reader(file) if row]
     if not rows:
-        raise ValueError(f"{path} is empty: it needs {len(RUPPEL_COLUMNS)} columns, {', '.join(RUPPEL_COLUMNS)}")
+        raise ValueError(
+            f"{path} is empty: it needs {len(RUPPEL_COLUMNS)} columns, {', '.join(RUPPEL_COLUMNS)}"
+        )
     order, first = list(range(len(RUPPEL_COLUMNS))), 0
     if not _is_number(rows[0][0]):
         header, first = [name.strip().lower() for name in rows[0]], 1
         missing = [name for name in RUPPEL_COLUMNS if name not in header]
         if missing:
-            raise ValueError(f"{path} has no column {', '.join(missing)}: its header must have {', '.join(RUPPEL_COLUMNS)}")
+            raise ValueError(
+                f"{path} has no column {', '.join(missing)}: its header must have {', '.join(RUPPEL_COLUMNS)}"
+            )
         order = [header.index(name) for name in RUPPEL_COLUMNS]
-    value = _numbers(path, [[row[i] if i < len(row) else "" for i in order] for row in rows[first:]], first + 1, RUPPEL_COLUMNS)
+    value = _numbers(
+        path,
+        [[row[i] if i < len(row) else "" for i in order] for row in rows[first:]],
+        first + 1,
+        RUPPEL_COLUMNS,
+    )
     column = {name: value[:, i] for i, name in enumerate(RUPPEL_COLUMNS)}
     step = np.diff(column["time"])
     out = []
     for number, (a, b) in enumerate(_pieces((step > _GAP) | (step <= 0), len(value))):
-        extra = {"pdc": column["pdc"][a:b], "pac": column["pac1"][a:b], "tac": column["tac"][a:b], "tdc": column["tdc"][a:b]}
+        extra = {
+            "pdc": column["pdc"][a:b],
+            "pac": column["pac1"][a:b],
+            "tac": column["tac"][a:b],
+            "tdc": column["tdc"][a:b],
+        }
         out.append(
-            _recorded(f"{path.stem}-{number:05d}", object, column["time"][a:b], value[a:b, 12:], value[a:b, 4:7], value[a:b, 1:4],
-                      {"format": "ruppel", "rows": [a, b], "frame": "the file's"}, path, extra)
-        )  # fmt: skip
+            _recorded(
+                f"{path.stem}-{number:05d}",
+                object,
+                column["time"][a:b],
+                value[a:b, 12:],
+                value[a:b, 4:7],
+                value[a:b, 1:4],
+                {"format": "ruppel", "rows": [a, b], "frame": "the file's"},
+                path,
+                extra,
+            )
+        )
     return out
 
 
-def read_text(path, force=None, rate: float = 100.0, block: float | None = None, object="plate") -> list[Interaction]:  # noqa: A002
-    """A log of 19 columns e1..e19 without times, and perhaps one of 3 columns Fx Fy Fz [N] beside it (`data.columns`).
+def read_text(
+    path, force=None, rate: float = 100.0, block: float | None = None, object="plate"
+) -> list[Interaction]:  # noqa: A002
+    """A log of 19 columns e1..e19 without times, and perhaps one of 3 columns Fx Fy Fz [N] beside it
+    (`data.columns`).
 
     Args:
       path: electrodes. force: forces, as many rows.
       rate: of the rows [Hz].
-      block: cuts the log into interactions of this length [s]; None keeps it whole. Cutting hides drift: neighbours are alike.
+      block: cuts the log into interactions of this length [s]; None keeps it whole. Cutting hides drift:
+        neighbours are alike.
       object: what touched.
 
     Raises:
@@ -120,16 +185,27 @@ def read_text(path, force=None, rate: float = 100.0, block: float | None = None,
     counts = read_columns(path, CHANNELS[:19])
     newtons = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
     if newtons is not None and len(newtons) != len(counts):
-        raise ValueError(f"{path} has {len(counts)} rows and {force} has {len(newtons)}: they must be samples of the same instants")
+        raise ValueError(
+            f"{path} has {len(counts)} rows and {force} has {len(newtons)}: they must be samples of the "
+            "same instants"
+        )
     n = len(counts)
     size = n if block is None else max(1, int(round(block * rate)))
     out = []
     for number, a in enumerate(range(0, n, size)):
         b = min(a + size, n)
         out.append(
-            _recorded(f"{path.stem}-{number:05d}", object, np.arange(a, b) / rate, counts[a:b], None if newtons is None else newtons[a:b],
-                      None, {"format": "text", "rows": [a, b], "rate": rate}, path)
-        )  # fmt: skip
+            _recorded(
+                f"{path.stem}-{number:05d}",
+                object,
+                np.arange(a, b) / rate,
+                counts[a:b],
+                None if newtons is None else newtons[a:b],
+                None,
+                {"format": "text", "rows": [a, b], "rate": rate},
+                path,
+            )
+        )
     return out
 
 
@@ -164,7 +240,9 @@ def import_recordings(paths, out, format: str | None = None, seed: int = 0, **op
     for number, group in enumerate(groups):
         for one in group:
             one.split = str(next(part))
-        write_shard(shard_path(out, number), group, attributes={"format": format, "source": paths[number].name})
+        write_shard(
+            shard_path(out, number), group, attributes={"format": format, "source": paths[number].name}
+        )
     return sum(len(group) for group in groups)
 
 
@@ -174,7 +252,8 @@ def _recorded(name, what, time, electrodes, force, point, parameters, path, extr
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise ValueError(
-            f"{path}: {CHANNELS[column]} of row {parameters['rows'][0] + row} is {electrodes[row, column]:g}: raw counts between "
+            f"{path}: {CHANNELS[column]} of row {parameters['rows'][0] + row} is "
+            f"{electrodes[row, column]:g}: raw counts between "
             "0 and 4095 are needed; undo scaling and tare"
         )
     counts = np.full((len(time), len(CHANNELS)), np.nan, np.float32)
@@ -186,8 +265,18 @@ def _recorded(name, what, time, electrodes, force, point, parameters, path, extr
         wrench = np.full((len(time), 6), np.nan, np.float32)
         wrench[:, :3] = force
     parameters = {**parameters, "rows": [int(row) for row in parameters["rows"]], "source": path.name}
-    return Interaction(name, what, "recorded", "train", 0, parameters, np.asarray(time, float), indenter_pos=point,
-                       measured_counts=counts, measured_wrench=wrench)  # fmt: skip
+    return Interaction(
+        name,
+        what,
+        "recorded",
+        "train",
+        0,
+        parameters,
+        np.asarray(time, float),
+        indenter_pos=point,
+        measured_counts=counts,
+        measured_wrench=wrench,
+    )
 
 
 def _pieces(cut, n):
@@ -213,7 +302,10 @@ def _numbers(path, rows, first, names):
     for i, row in enumerate(rows):
         for name, cell in zip(names, row):
             if not (_is_number(cell) and np.isfinite(float(cell))):
-                raise ValueError(f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; correct or remove the line")
+                raise ValueError(
+                    f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; correct or "
+                    "remove the line"
+                )
     raise ValueError(f"{path} has rows of different length: every row needs {len(names)} columns")
 
 

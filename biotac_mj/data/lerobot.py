@@ -1,8 +1,8 @@
-"""Export to the directory layout of LeRobotDataset v3.0 (Parquet and JSON), written with pyarrow alone; the skin's nodes stay in HDF5.
+"""Export to the directory layout of LeRobotDataset v3.0 (Parquet and JSON), written with pyarrow alone; the
+skin's nodes stay in HDF5.
 
-An interaction is an episode. Layout as `lerobot` 0.4 reads it: meta/info.json, meta/stats.json, meta/tasks.parquet,
-meta/episodes/chunk-000/file-000.parquet and data/chunk-000/file-000.parquet.
-"""
+An interaction is an episode. Layout as `lerobot` 0.4 reads it: meta/info.json, meta/stats.json,
+meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet and data/chunk-000/file-000.parquet."""
 
 import json
 import pathlib
@@ -27,17 +27,22 @@ _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99
 def export_lerobot(data, out, counts: str = "counts", progress: bool = True) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
-    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc, .pac, .tdc, .tac (1 each)
-    [counts], observation.force (6, of the skin on the object) and action (7), the pose at the next time step. The task says what is done
-    with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that (episode_index, frame_index) leads to
+    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc,
+      .pac, .tdc, .tac (1 each)
+    [counts], observation.force (6, of the skin on the object) and action (7), the pose at the next time step.
+    The task says what is done
+    with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that
+      (episode_index, frame_index) leads to
     the nodes in the HDF5 shards.
 
     Args:
       data: TactileSet with poses.
-      counts: "counts" for simulated readings of all interactions, "measured_counts" for those that have measured ones.
+      counts: "counts" for simulated readings of all interactions, "measured_counts" for those that have
+        measured ones.
 
     Raises:
-      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, or a folder that is there.
+      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, or a folder
+        that is there.
       ImportError: no pyarrow; the text says how to get it.
     """
     _pyarrow()
@@ -84,7 +89,11 @@ class _Export:
             "action": _feature(_POSE),
         }
         index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}
-        self.all_features = {**self.features, "timestamp": {"dtype": "float32", "shape": [1], "names": None}, **index}
+        self.all_features = {
+            **self.features,
+            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+            **index,
+        }
         tasks = [f"{kind} with {name}" for kind, name in zip(data.kind[chosen], data.object[chosen])]
         self.tasks = sorted(set(tasks))
         self.task = [self.tasks.index(task) for task in tasks]
@@ -93,14 +102,19 @@ class _Export:
         steps = [np.diff(self.data["time"][self.data.start[i] : self.data.stop[i]]) for i in self.chosen[:50]]
         step = np.concatenate(steps)
         if not len(step) or np.ptp(step) > 1e-4:
-            raise ValueError("the time steps of the set are not even: LeRobot's layout has one frame rate; resample the recordings first")
+            raise ValueError(
+                "the time steps of the set are not even: LeRobot's layout has one frame rate; resample the "
+                "recordings first"
+            )
         rate = 1 / step.mean()
         return int(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)
 
     def write(self, progress):
         pa, rows, episodes, moments = _pyarrow(), [], [], []
         first, file_index, size = 0, 0, 0
-        for number, i in enumerate(tqdm.tqdm(self.chosen, desc="export", unit="interaction", disable=not progress, leave=False)):
+        for number, i in enumerate(
+            tqdm.tqdm(self.chosen, desc="export", unit="interaction", disable=not progress, leave=False)
+        ):
             columns = self._episode(number, int(i), first)
             n = len(columns["index"])
             rows.append(columns)
@@ -114,9 +128,15 @@ class _Export:
                 rows, size, file_index = [], 0, file_index + 1
         self._parquet(f"meta/episodes/{_chunk(0)}", pa.Table.from_pylist(episodes))
         self._tasks(pa)
-        self._json("meta/stats.json", {name: _merge([m[name] for m in moments]) for name in self.all_features})
+        self._json(
+            "meta/stats.json", {name: _merge([m[name] for m in moments]) for name in self.all_features}
+        )
         self._json("meta/info.json", self._info(len(episodes), first))
-        source = {"set": self.data.path.name, "interaction": self.data.id[self.chosen].tolist(), "counts": self.counts}
+        source = {
+            "set": self.data.path.name,
+            "interaction": self.data.id[self.chosen].tolist(),
+            "counts": self.counts,
+        }
         synthetic = bool((self.data.kind[self.chosen] != "recorded").any())
         self._json("source.json", source | {"synthetic": synthetic, "versions": self.data.versions})
 
@@ -125,7 +145,9 @@ class _Export:
         data = self.data
         rows = slice(data.start[i], data.stop[i])
         n = int(data.stop[i] - data.start[i])
-        pose = np.concatenate([data["indenter_pos"][rows], data["indenter_quat"][rows]], axis=1).astype(np.float32)
+        pose = np.concatenate([data["indenter_pos"][rows], data["indenter_quat"][rows]], axis=1).astype(
+            np.float32
+        )
         counts = data[self.counts][rows].astype(np.float32)
         out = {
             "observation.state": pose,
@@ -151,7 +173,9 @@ class _Export:
             "dataset_from_index": first,
             "dataset_to_index": first + n,
         }
-        row |= {f"stats/{name}/{key}": statistics[name][key].tolist() for name in statistics for key in _STATS}
+        row |= {
+            f"stats/{name}/{key}": statistics[name][key].tolist() for name in statistics for key in _STATS
+        }
         return row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
 
     def _table(self, pa, rows):
@@ -165,10 +189,33 @@ class _Export:
     def _tasks(self, pa):
         """The tasks' texts are the index of a pandas frame: its metadata says so."""
         table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), "task": self.tasks})
-        column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
-        text = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-        header = {"field_name": None, "name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": {"encoding": "UTF-8"}}
-        pandas = {"index_columns": ["task"], "column_indexes": [header], "columns": [column, text], "pandas_version": "2.0.0"}
+        column = {
+            "field_name": "task_index",
+            "name": "task_index",
+            "pandas_type": "int64",
+            "numpy_type": "int64",
+            "metadata": None,
+        }
+        text = {
+            "field_name": "task",
+            "name": "task",
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": None,
+        }
+        header = {
+            "field_name": None,
+            "name": None,
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": {"encoding": "UTF-8"},
+        }
+        pandas = {
+            "index_columns": ["task"],
+            "column_indexes": [header],
+            "columns": [column, text],
+            "pandas_version": "2.0.0",
+        }
         self._parquet("meta/tasks", table.replace_schema_metadata({"pandas": json.dumps(pandas)}))
 
     def _info(self, episodes, frames):
@@ -213,12 +260,19 @@ def _statistics(value):
     """Of a column (n, k) or (n,): each (k,) or (1,)."""
     value = np.asarray(value, float).reshape(len(value), -1)
     quantile = np.quantile(value, (0.01, 0.10, 0.50, 0.90, 0.99), axis=0)
-    return {"min": value.min(0), "max": value.max(0), "mean": value.mean(0), "std": value.std(0), "count": np.array([len(value)]),
-            **dict(zip(_STATS[5:], quantile))}  # fmt: skip
+    return {
+        "min": value.min(0),
+        "max": value.max(0),
+        "mean": value.mean(0),
+        "std": value.std(0),
+        "count": np.array([len(value)]),
+        **dict(zip(_STATS[5:], quantile)),
+    }
 
 
 def _merge(parts):
-    """Statistics of all episodes; mean and standard deviation are exact, quantiles are means of the episodes' (as in lerobot)."""
+    """Statistics of all episodes; mean and standard deviation are exact, quantiles are means of the episodes'
+    (as in lerobot)."""
     count = np.array([p["count"][0] for p in parts], float)[:, None]
     mean = np.array([p["mean"] for p in parts])
     total = (count * mean).sum(0) / count.sum()

@@ -1,10 +1,11 @@
-"""Three-dimensional conduction in the liquid between core and skin: the transduction of the synthetic measured sensor.
+"""Three-dimensional conduction in the liquid between core and skin: the transduction of the synthetic
+measured sensor.
 
-It shares nothing with `sensor.film` but the places of the electrodes: the liquid is meshed with tetrahedra between the core and the
-deformed skin, electrodes are discs of one potential (so floating ones shunt the liquid along them), and the potential is solved with
-scikit-fem. The mesh is made once: columns stand on the core along fixed directions and end where they meet the skin, wherever it is, so
-no tetrahedron turns over when the skin slides over the electrodes or is pressed onto the core.
-"""
+It shares nothing with `sensor.film` but the places of the electrodes: the liquid is meshed with tetrahedra
+between the core and the deformed skin, electrodes are discs of one potential (so floating ones shunt the
+liquid along them), and the potential is solved with scikit-fem. The mesh is made once: columns stand on the
+core along fixed directions and end where they meet the skin, wherever it is, so no tetrahedron turns over
+when the skin slides over the electrodes or is pressed onto the core."""
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -14,7 +15,12 @@ from ..sensor.core_surface import CoreSurface
 
 __all__ = ["LiquidConduction", "column_tetrahedra"]
 
-_RINGS = ((0.25e-3, 6), (0.5e-3, 12), (0.75e-3, 14), (1.1e-3, 14))  # radius [m] and points around each electrode; 0.5 mm is its rim
+_RINGS = (
+    (0.25e-3, 6),
+    (0.5e-3, 12),
+    (0.75e-3, 14),
+    (1.1e-3, 14),
+)  # radius [m] and points around each electrode; 0.5 mm is its rim
 _LAYERS = (0.0, 0.2, 0.5, 1.0)  # of the gap: fine at the core, where the electrodes are
 _SPACING = 0.2e-3  # [m] points nearer than that are left out
 _WET = 0.1e-3  # [m] less liquid than that at rest is none: the skin is bonded there, or lies on the core
@@ -27,12 +33,14 @@ class LiquidConduction:
 
     Args:
       geometry: the skin with its core and electrodes.
-      excitation: (4, 2) x [m] and angle from the pad's midline [rad] of X1..X4, which are shorted and grounded.
+      excitation: (4, 2) x [m] and angle from the pad's midline [rad] of X1..X4, which are shorted and
+        grounded.
       conductivity: of the liquid [S/m].
       residual_film: liquid that stays where the skin lies on the core [m].
 
     Attributes:
-      core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's wet surface.
+      core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's
+      wet surface.
       elem (9 m, 4): tetrahedra over nodes layer * n + column.
 
     Raises:
@@ -47,7 +55,9 @@ class LiquidConduction:
         seed = np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], 1)
         _, foot, owner = core.closest(seed)
         centre = np.concatenate([geometry.electrode_pos, foot])
-        point, disc = _points(core, centre, np.concatenate([geometry.electrode_normal, core.normal[owner]]), geometry.core_vert)
+        point, disc = _points(
+            core, centre, np.concatenate([geometry.electrode_normal, core.normal[owner]]), geometry.core_vert
+        )
         triangle = _triangulate(point, core)
         normal = _smooth_normals(point, triangle)
         self.core_point, self.normal = point, normal
@@ -56,26 +66,39 @@ class LiquidConduction:
         triangle, keep = _wet_part(triangle, gap > _WET, disc)
         number = np.full(len(point), -1)
         number[keep] = np.arange(len(keep))
-        self.core_point, self.normal, self.triangle, disc = point[keep], normal[keep], number[triangle], disc[keep]
+        self.core_point, self.normal, self.triangle, disc = (
+            point[keep],
+            normal[keep],
+            number[triangle],
+            disc[keep],
+        )
         missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in range(23) if (disc == e).sum() < 10]
         if missing:
-            raise ValueError(f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move the electrode")
+            raise ValueError(
+                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move "
+                "the electrode"
+            )
         self._pair = self._near(np.arange(len(keep)))
         self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
         self._elem = np.ascontiguousarray(self.elem.T)
         self._set_unknowns(disc)
 
     def impedance(self, vert_xpos) -> np.ndarray:
-        """(19,) [ohm] of e1..e19 for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1..X4 sink, the others float."""
+        """(19,) [ohm] of e1..e19 for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1..X4 sink, the
+        others float."""
         from cholespy import CholeskySolverD, MatrixType
 
         matrix = self.matrix(self.nodes(self.gap(vert_xpos))).tocoo()
         row, column = self._unknown[matrix.row], self._unknown[matrix.col]
         inside = (row >= 0) & (column >= 0)
-        reduced = coo_matrix((matrix.data[inside], (row[inside], column[inside])), shape=(self._size, self._size)).tocsc()
+        reduced = coo_matrix(
+            (matrix.data[inside], (row[inside], column[inside])), shape=(self._size, self._size)
+        ).tocsc()
         reduced.sum_duplicates()
         coo = reduced.tocoo()
-        solver = CholeskySolverD(self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO)
+        solver = CholeskySolverD(
+            self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO
+        )
         current = np.zeros((self._size, 19))
         current[np.arange(19), np.arange(19)] = 1
         potential = np.empty_like(current)
@@ -83,7 +106,8 @@ class LiquidConduction:
         return potential[np.arange(19), np.arange(19)] / self.conductivity
 
     def matrix(self, nodes):
-        """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m] (scikit-fem, linear tetrahedra)."""
+        """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
+        (scikit-fem, linear tetrahedra)."""
         import skfem
         from skfem.models.poisson import laplace
 
@@ -96,8 +120,8 @@ class LiquidConduction:
         return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
 
     def gap(self, vert_xpos, rest=False) -> np.ndarray:
-        """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets no skin takes its nearest
-        node's height, or nan at `rest`."""
+        """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets
+        no skin takes its nearest node's height, or nan at `rest`."""
         column, face = self._pair
         corner = np.asarray(vert_xpos, float)[self.geometry.inner_face]
         a, ab, ac = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -122,11 +146,15 @@ class LiquidConduction:
         return gap
 
     def _near(self, columns):
-        """Pairs (column, inner face) that may meet: the face is over the column at rest, give or take what the skin may slide."""
+        """Pairs (column, inner face) that may meet: the face is over the column at rest, give or take what
+        the skin may slide."""
         centre = self.geometry.vert[self.geometry.inner_face].mean(1)
         tree = cKDTree(centre)
         lists = tree.query_ball_point(self.core_point[columns] + 1.2e-3 * self.normal[columns], 2.6e-3)
-        column, face = np.repeat(columns, [len(l) for l in lists]), np.concatenate([np.array(l, int) for l in lists])
+        column, face = (
+            np.repeat(columns, [len(l) for l in lists]),
+            np.concatenate([np.array(l, int) for l in lists]),
+        )
         offset = centre[face] - self.core_point[column]
         height = np.einsum("ij,ij->i", offset, self.normal[column])
         aside = np.linalg.norm(offset - height[:, None] * self.normal[column], axis=1)
@@ -147,10 +175,11 @@ class LiquidConduction:
 
 
 def column_tetrahedra(triangle, n, layers):
-    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n + column.
+    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
+    column.
 
-    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides alike.
-    """
+    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides
+    alike."""
     turn = np.argsort(triangle, axis=1)
     odd = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], bool)  # whether a permutation that begins so is odd
     flip = odd[turn[:, 0], turn[:, 1]]
@@ -158,7 +187,11 @@ def column_tetrahedra(triangle, n, layers):
     out = []
     for layer in range(layers):
         low, high = layer * n, (layer + 1) * n
-        for tet in ((a + low, b + low, c + low, c + high), (a + low, b + low, c + high, b + high), (a + low, b + high, c + high, a + high)):
+        for tet in (
+            (a + low, b + low, c + low, c + high),
+            (a + low, b + low, c + high, b + high),
+            (a + low, b + high, c + high, a + high),
+        ):
             tet = np.stack(tet, 1)
             tet[flip, :2] = tet[flip, 1::-1]
             out.append(tet)
@@ -166,7 +199,8 @@ def column_tetrahedra(triangle, n, layers):
 
 
 def _points(core, centre, direction, core_vert):
-    """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for none."""
+    """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for
+    none."""
     ring, disc = [centre], [np.arange(len(centre))]
     helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
     first = np.cross(direction, helper)
@@ -174,7 +208,9 @@ def _points(core, centre, direction, core_vert):
     second = np.cross(direction, first)
     for k, (radius, count) in enumerate(_RINGS):
         angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
-        around = centre[:, None] + radius * (np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None])
+        around = centre[:, None] + radius * (
+            np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+        )
         ring.append(core.closest(around.reshape(-1, 3))[1])
         disc.append(np.where(radius <= 0.5e-3, np.repeat(np.arange(len(centre)), count), -1))
     disc = np.concatenate([*disc, np.full(len(core_vert), -1)])
@@ -191,7 +227,8 @@ def _points(core, centre, direction, core_vert):
 
 
 def _triangulate(point, core):
-    """Triangles (m, 3) over points of the core, normals outwards: Delaunay on the sphere that the core is drawn onto."""
+    """Triangles (m, 3) over points of the core, normals outwards: Delaunay on the sphere that the core is
+    drawn onto."""
     middle = (point.max(0) + point.min(0)) / 2
     flat = (point - middle) * [0.5, 1, 1]  # about as long as it is wide
     triangle = ConvexHull(flat / np.linalg.norm(flat, axis=1, keepdims=True)).simplices
@@ -220,6 +257,8 @@ def _wet_part(triangle, wet, disc):
 
     triangle = triangle[wet[triangle].all(1)]
     edge = np.concatenate([triangle[:, :2], triangle[:, 1:]])
-    label = connected_components(coo_matrix((np.ones(len(edge)), edge.T), shape=(len(wet),) * 2), directed=False)[1]
+    label = connected_components(
+        coo_matrix((np.ones(len(edge)), edge.T), shape=(len(wet),) * 2), directed=False
+    )[1]
     triangle = triangle[label[triangle[:, 0]] == label[np.flatnonzero(disc == 0)[0]]]
     return triangle, np.unique(triangle)

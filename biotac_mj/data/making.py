@@ -31,7 +31,8 @@ def make_shards(out, options, settings, todo, workers, progress) -> dict:
     """Makes the shards of batches `todo` in folder `out`, on all of the options' devices.
 
     Args:
-      settings: kept with every shard. workers: processes for film and readings, shared by the devices. progress: whether to show a bar.
+      settings: kept with every shard. workers: processes for film and readings, shared by the devices.
+        progress: whether to show a bar.
 
     Returns:
       seconds of each stage, of all devices together.
@@ -55,7 +56,8 @@ def make_shards(out, options, settings, todo, workers, progress) -> dict:
 
 
 def _make_on_all(out, options, settings, todo, workers, update, tell, seen="cuda:0"):
-    """A process for each device, in which it is the only one and called `seen`; what they tell comes through one queue."""
+    """A process for each device, in which it is the only one and called `seen`; what they tell comes through
+    one queue."""
     context = multiprocessing.get_context("spawn")
     batches, news = context.Queue(), context.Queue()
     heavy_first = sorted(todo, key=lambda batch: not batch.measured)
@@ -76,9 +78,14 @@ def _make_on_all(out, options, settings, todo, workers, update, tell, seen="cuda
             try:
                 device, what, value = news.get(timeout=2.0)
             except queue.Empty:
-                gone = [f"{d} (exit code {p.exitcode})" for d, p in running.items() if p.exitcode not in (None, 0)]
+                gone = [
+                    f"{d} (exit code {p.exitcode})" for d, p in running.items() if p.exitcode not in (None, 0)
+                ]
                 if gone:
-                    raise RuntimeError(f"the process of {', '.join(gone)} ended: run the command again, what is there is kept") from None
+                    raise RuntimeError(
+                        f"the process of {', '.join(gone)} ended: run the command again, what is there is "
+                        "kept"
+                    ) from None
                 continue
             if what == "step":
                 update(value)
@@ -102,7 +109,14 @@ def _make_on_one(out, options, settings, device, batches, news, workers, name):
     """What the process of one device does."""
     signal.signal(signal.SIGTERM, _leave)
     try:
-        maker = Maker(out, options, settings, device, lambda n: news.put((name, "step", n)), lambda text: news.put((name, "text", text)))
+        maker = Maker(
+            out,
+            options,
+            settings,
+            device,
+            lambda n: news.put((name, "step", n)),
+            lambda text: news.put((name, "text", text)),
+        )
         maker.run(iter(batches.get, None), workers)
         news.put((name, "end", maker.seconds))
     except ValueError as error:
@@ -151,17 +165,31 @@ class Maker:
         from ..skin import SkinModel, SkinOptions
 
         self.out, self.options, self.update, self.tell = out, options, update, tell
-        self.seconds = {"start": 0.0, "plan": 0.0, "skin": 0.0, "measured skin": 0.0, "waiting for readings": 0.0}
+        self.seconds = {
+            "start": 0.0,
+            "plan": 0.0,
+            "skin": 0.0,
+            "measured skin": 0.0,
+            "waiting for readings": 0.0,
+        }
         clock = time.perf_counter()
         self.geometry = load_skin(options.skin)
         skin = SkinOptions(element=options.element, liquid=options.liquid)
         model = self.model = SkinModel(self.geometry, options.material, skin, device)
-        self.attributes = {"settings": settings, "skin": options.skin, "material": dataclasses.asdict(model.material),
-                           "element": model.element, "tier": options.tier, "liquid": model.has_liquid,
-                           "device": _device_name(model.device)}  # fmt: skip
+        self.attributes = {
+            "settings": settings,
+            "skin": options.skin,
+            "material": dataclasses.asdict(model.material),
+            "element": model.element,
+            "tier": options.tier,
+            "liquid": model.has_liquid,
+            "device": _device_name(model.device),
+        }
         self.time = np.arange(options.steps) / options.rate
         ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
-        parts = [assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))]
+        parts = [
+            assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))
+        ]
         self.split = np.concatenate(parts)
         self.measured = None
         if options.labelled or options.recordings:
@@ -176,7 +204,9 @@ class Maker:
 
         o = self.options
         args = (self.geometry, o.sensor, self.measured and self.measured.meter())
-        with readings.readings_pool(self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args) as pool:
+        with readings.readings_pool(
+            self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args
+        ) as pool:
             waiting, written = [], []
             for batch in todo:
                 waiting.append(self._begin(batch, pool))
@@ -201,17 +231,23 @@ class Maker:
         for name in dict.fromkeys(batch.names):
             mine = [k for k, other in enumerate(batch.names) if other == name]
             seeds = [[o.seed, batch.members[k]] for k in mine]
-            for k, motion in zip(mine, plan_motions(self.geometry, name, seeds, o.steps, o.kinds, self.model.device)):
+            for k, motion in zip(
+                mine, plan_motions(self.geometry, name, seeds, o.steps, o.kinds, self.model.device)
+            ):
                 motions[k] = motion
         running = _Running(batch, motions)
         clock = self._count("plan", clock)
-        noise = [int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members]
+        noise = [
+            int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members
+        ]
         if batch.simulated:
             walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
             fields = running.fields = walk(self.model, batch.names, motions, self.update)
             clock = self._count("skin", clock)
             running.reads = [
-                pool.submit(readings.read_in_worker, fields.displacement[k], self.time, fields.pressure[k], noise[k])
+                pool.submit(
+                    readings.read_in_worker, fields.displacement[k], self.time, fields.pressure[k], noise[k]
+                )
                 for k in range(len(motions))
             ]
         if batch.measured:
@@ -220,15 +256,25 @@ class Maker:
             self._count("measured skin", clock)
             # each contact of the session begins some seconds after the last one, while the sensor warms up
             running.labels = [
-                pool.submit(synthetic_sensor.measure_in_worker, answer.displacement[k], self.time, answer.pressure[k], i, noise[k])
+                pool.submit(
+                    synthetic_sensor.measure_in_worker,
+                    answer.displacement[k],
+                    self.time,
+                    answer.pressure[k],
+                    i,
+                    noise[k],
+                )
                 for k, i in enumerate(batch.members)
             ]
-        spent = ", ".join(f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05)
+        spent = ", ".join(
+            f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05
+        )
         self.tell(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
     def _free(self):
-        """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch keeps what it once had."""
+        """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch
+        keeps what it once had."""
         gc.collect()
         if self.model.device.is_cuda:
             import torch
@@ -241,11 +287,16 @@ class Maker:
         return now
 
     def _end(self, running, pool):
-        """Waits for the readings of a batch and has its shard written: compressing it takes a core some seconds."""
+        """Waits for the readings of a batch and has its shard written: compressing it takes a core some
+        seconds."""
         batch, ones = running.batch, []
         clock = time.perf_counter()
         for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):
-            columns = {"indenter_pos": motion.pos, "indenter_quat": _quaternions(motion.mat), "converged": np.ones(len(self.time), bool)}
+            columns = {
+                "indenter_pos": motion.pos,
+                "indenter_quat": _quaternions(motion.mat),
+                "converged": np.ones(len(self.time), bool),
+            }
             if batch.simulated:
                 fields, read = running.fields, running.reads[k].result()
                 columns |= {
@@ -258,7 +309,10 @@ class Maker:
                 }
                 columns["converged"] &= fields.converged[k] & ~read.failed
             if batch.measured:
-                columns |= {"measured_counts": running.labels[k].result(), "measured_wrench": running.answer.wrench[k]}
+                columns |= {
+                    "measured_counts": running.labels[k].result(),
+                    "measured_wrench": running.answer.wrench[k],
+                }
                 columns["converged"] &= running.answer.converged[k]
             ones.append(
                 Interaction(
@@ -273,7 +327,13 @@ class Maker:
                 )
             )
         self._count("waiting for readings", clock)
-        return pool.submit(write_shard, self.out / batch.path, ones, self.geometry if batch.simulated else None, self.attributes)
+        return pool.submit(
+            write_shard,
+            self.out / batch.path,
+            ones,
+            self.geometry if batch.simulated else None,
+            self.attributes,
+        )
 
 
 def _quaternions(mat):

@@ -1,6 +1,8 @@
-"""The seventeen things that touch the sensor: the paper's eight indenters, six pegs and three features of a table.
+"""The seventeen things that touch the sensor: the paper's eight indenters, six pegs and three features of a
+table.
 
-Narang et al. (ICRA 2021) name pegs and table features without their sizes: those here are chosen. Frames are those of
+Narang et al. (ICRA 2021) name pegs and table features without their sizes: those here are chosen. Frames are
+those of
 `press_indenter`: the tip at the origin, +y ahead.
 """
 
@@ -21,7 +23,14 @@ _TABLE = 20e-3  # [m] half width of the block that stands for the table: beyond 
 _UPRIGHT = np.array([1.0, 0, 0, 0])
 _Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])
 
-PEGS = ("peg_round_4mm", "peg_round_8mm", "peg_square_5mm", "peg_square_10mm", "peg_hexagon_8mm", "peg_triangle_8mm")
+PEGS = (
+    "peg_round_4mm",
+    "peg_round_8mm",
+    "peg_square_5mm",
+    "peg_square_10mm",
+    "peg_hexagon_8mm",
+    "peg_triangle_8mm",
+)
 TABLE = ("table_surface", "table_edge", "table_corner")
 OBJECTS = (*INDENTERS, *PEGS, *TABLE)
 
@@ -31,30 +40,41 @@ def _box(name, half, turn):
     from ..press import _rotation_from_y
 
     half, inner = np.array(half), np.array(half) - _EDGE
-    quat = _UPRIGHT if turn is None else _rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
+    quat = (
+        _UPRIGHT
+        if turn is None
+        else _rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
+    )
     rotation = trimesh.transformations.quaternion_matrix(quat)[:3, :3]
     reach = np.abs(rotation[1]) @ inner + _EDGE
     pos = np.array([0.0, -reach, 0.0])
     mesh = trimesh.creation.box(extents=2 * half)  # for rays and pictures: its edges are sharp
-    return Indenter(name, "box", tuple(half), _EDGE, pos, quat, mesh.vertices @ rotation.T + pos, np.asarray(mesh.faces))
+    return Indenter(
+        name, "box", tuple(half), _EDGE, pos, quat, mesh.vertices @ rotation.T + pos, np.asarray(mesh.faces)
+    )
 
 
 def _cylinder(name, radius):
     pos = np.array([0.0, -_LENGTH / 2, 0.0])
     mesh = trimesh.creation.cylinder(radius=radius, height=_LENGTH, sections=96)
     vert = mesh.vertices @ trimesh.transformations.quaternion_matrix(_Z_TO_Y)[:3, :3].T + pos
-    return Indenter(name, "cylinder", (radius, _LENGTH / 2), _EDGE, pos, _Z_TO_Y, vert, np.asarray(mesh.faces))
+    return Indenter(
+        name, "cylinder", (radius, _LENGTH / 2), _EDGE, pos, _Z_TO_Y, vert, np.asarray(mesh.faces)
+    )
 
 
 def _prism(name, corners, width):
-    """A regular prism as a mesh: the hull of balls at its corners, so that its edges are round; `width` is the circle around it [m]."""
+    """A regular prism as a mesh: the hull of balls at its corners, so that its edges are round; `width` is
+    the circle around it [m]."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=_EDGE).vertices
     angle = 2 * np.pi * np.arange(corners) / corners
     radius = width / 2 - _EDGE
     ring = radius * np.stack([np.cos(angle), np.zeros(corners), np.sin(angle)], axis=1)
     centre = np.concatenate([ring + [0, y, 0] for y in (-_EDGE, _EDGE - _LENGTH)])
     hull = trimesh.Trimesh((centre[:, None] + ball).reshape(-1, 3)).convex_hull
-    return Indenter(name, "mesh", (), 0.0, np.zeros(3), _UPRIGHT, np.asarray(hull.vertices), np.asarray(hull.faces))
+    return Indenter(
+        name, "mesh", (), 0.0, np.zeros(3), _UPRIGHT, np.asarray(hull.vertices), np.asarray(hull.faces)
+    )
 
 
 @functools.lru_cache(maxsize=32)
@@ -67,10 +87,15 @@ def make_object(name: str) -> Indenter:
     if name in INDENTERS or name.startswith(("geom:", "mesh:")):
         return make_indenter(name)
     if name not in OBJECTS:
-        raise ValueError(f"unknown object {name!r}: choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE")
+        raise ValueError(
+            f"unknown object {name!r}: choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or "
+            "mesh:FILE"
+        )
     if name in TABLE:
         half = 3 * [_TABLE]
-        return _box(name, half, {"table_surface": None, "table_edge": (0, 1, 1), "table_corner": (1, 1, 1)}[name])
+        return _box(
+            name, half, {"table_surface": None, "table_edge": (0, 1, 1), "table_corner": (1, 1, 1)}[name]
+        )
     kind, width = name.split("_")[1], float(name.split("_")[2][:-2]) * 1e-3
     if kind == "round":
         return _cylinder(name, width / 2)

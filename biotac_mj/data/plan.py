@@ -1,4 +1,5 @@
-"""Where the objects go: random presses, slides, twists and taps all over the sensing surface, kept clear of the core."""
+"""Where the objects go: random presses, slides, twists and taps all over the sensing surface, kept clear of
+the core."""
 
 import dataclasses
 
@@ -15,12 +16,18 @@ __all__ = ["Motion", "plan_motions", "sensing_faces"]
 KINDS = ("press", "slide", "twist", "tap")
 _SHARE = (0.4, 0.3, 0.15, 0.15)
 _TILT = np.radians(25.0)  # largest angle between the way of the press and the skin's inward normal
-_DEPTH = {"press": (0.4e-3, 2.4e-3), "slide": (0.4e-3, 1.6e-3), "twist": (0.4e-3, 1.6e-3), "tap": (0.2e-3, 1.2e-3)}  # [m]
+_DEPTH = {
+    "press": (0.4e-3, 2.4e-3),
+    "slide": (0.4e-3, 1.6e-3),
+    "twist": (0.4e-3, 1.6e-3),
+    "tap": (0.2e-3, 1.2e-3),
+}  # [m]
 _SLIDE = (0.8e-3, 3e-3)  # [m]
 _TWIST = np.radians((10.0, 35.0))
 _BACK = 0.05  # [m] the objects come from there
 _LEAD = 5e-6  # [m] before first touch: where row 0 is
-_CLEAR = 0.6e-3  # [m] never nearer to the core: the skin is 1.5 mm thick there; forces then reach some 20 N, as the paper's
+# [m] never nearer to the core: the skin is 1.5 mm thick there; forces then reach some 20 N, as the paper's
+_CLEAR = 0.6e-3
 _FILM = 0.1e-3  # [m] less liquid under the skin is none
 _SHALLOW = 0.1e-3  # [m] less is no contact worth keeping
 
@@ -41,7 +48,8 @@ class Motion:
 
 
 def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
-    """(k,) outer faces over liquid: in front of the clamp (x < 3 mm), below the nail (y < 0.5 mm), more than 0.1 mm of film beneath."""
+    """(k,) outer faces over liquid: in front of the clamp (x < 3 mm), below the nail (y < 0.5 mm), more than
+    0.1 mm of film beneath."""
     centre = geometry.vert[geometry.outer_face].mean(1)
     inner = np.unique(geometry.inner_face)
     gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inner])[0]
@@ -50,7 +58,9 @@ def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
     return np.flatnonzero((centre[:, 0] < 3e-3) & (centre[:, 1] < 0.5e-3) & wet[beneath])
 
 
-def plan_motions(geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KINDS, device="cpu", progress=None) -> list[Motion]:
+def plan_motions(
+    geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KINDS, device="cpu", progress=None
+) -> list[Motion]:
     """One motion for each seed; the same seed gives the same motion whatever the others are.
 
     Args:
@@ -76,7 +86,9 @@ def plan_motions(geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KIN
             return motions
         for i, motion in zip(open_, planner.draw([[*seeds[i], attempt] for i in open_])):
             motions[i] = motion
-    raise ValueError(f"object {name!r} finds no room to touch the skin without meeting the core: make it smaller")
+    raise ValueError(
+        f"object {name!r} finds no room to touch the skin without meeting the core: make it smaller"
+    )
 
 
 class _Planner:
@@ -100,7 +112,9 @@ class _Planner:
         travel = first_touch(placed, self.skin, point - _BACK * direction, mat, direction)
         start = point + (travel - _BACK)[:, None] * direction
         depth = np.array([d["depth"] for d in drawn])
-        met = np.isfinite(travel) & (np.abs(travel - _BACK) < 4e-3)  # the object's tip touches, not its far end
+        met = np.isfinite(travel) & (
+            np.abs(travel - _BACK) < 4e-3
+        )  # the object's tip touches, not its far end
         start[~met] = 1.0  # [m] far away
         paths = Placed(self.name, len(drawn) * self.steps, self.device)
         for _ in range(8):
@@ -113,7 +127,11 @@ class _Planner:
         good = met & (lack <= 1e-5) & (depth >= _SHALLOW)
         out = []
         for i, d in enumerate(drawn):
-            parameters = {key: np.asarray(value).tolist() for key, value in d.items() if key not in ("mat", "kind", "profile")}
+            parameters = {
+                key: np.asarray(value).tolist()
+                for key, value in d.items()
+                if key not in ("mat", "kind", "profile")
+            }
             parameters |= {"depth": float(depth[i]), "start": start[i].tolist()}
             out.append(Motion(d["kind"], parameters, pos[i], turned[i]) if good[i] else None)
         return out
@@ -153,7 +171,9 @@ class _Planner:
             down, along = d["profile"]
             travel = down * deep
             travel[0] = -_LEAD
-            pos.append(at + travel[:, None] * d["direction"] + (along * d["slide"])[:, None] * d["slide_direction"])
+            pos.append(
+                at + travel[:, None] * d["direction"] + (along * d["slide"])[:, None] * d["slide_direction"]
+            )
             mat.append(np.array([_rotation(d["direction"], a * d["twist"]) @ d["mat"] for a in along]))
         return np.array(pos), np.array(mat)
 
@@ -169,7 +189,9 @@ def _profile(kind, steps, rng):
     if kind == "press":
         # down only, or down and up again
         turn = last if rng.random() < 0.5 else int(round(rng.uniform(0.5, 0.8) * last))
-        return np.interp(step, [0, turn, last], [0, 1, 1 if turn == last else rng.uniform(0, 0.6)]), np.zeros(steps)
+        return np.interp(step, [0, turn, last], [0, 1, 1 if turn == last else rng.uniform(0, 0.6)]), np.zeros(
+            steps
+        )
     turn = int(round(rng.uniform(0.35, 0.5) * last))
     return np.minimum(step / turn, 1), np.maximum(step - turn, 0) / (last - turn)
 

@@ -1,4 +1,5 @@
-"""Impedances and counts of whole interactions, in worker processes: one reading of the film costs a core some milliseconds."""
+"""Impedances and counts of whole interactions, in worker processes: one reading of the film costs a core some
+milliseconds."""
 
 import contextlib
 import dataclasses
@@ -35,7 +36,8 @@ class Readings:
 
 
 def sample(time, impedance, pressure, seed: int, temperature=None) -> np.ndarray:
-    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time; of PAC's 22 the latest.
+    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time; of PAC's 22 the
+    latest.
 
     Args:
       time: (n,) [s]; impedance: (n, 19) [ohm]; pressure: (n,) above rest [Pa]; linear between samples.
@@ -61,7 +63,8 @@ def read_motion(film: FilmConduction, vert_xpos, time, pressure, seed: int) -> R
     """Film and acquisition along one interaction.
 
     Args:
-      film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa]. seed: of the noise.
+      film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa]. seed:
+        of the noise.
     """
     impedance, failed = np.empty((len(time), 19)), np.zeros(len(time), bool)
     last = film.impedance(film.geometry.vert)
@@ -98,15 +101,20 @@ class _Now:
 
 
 @contextlib.contextmanager
-def readings_pool(geometry: SkinGeometry, sensor: str | None, workers: int, start=prepare_worker, start_args=None):
-    """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0 workers: this process.
+def readings_pool(
+    geometry: SkinGeometry, sensor: str | None, workers: int, start=prepare_worker, start_args=None
+):
+    """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0
+    workers: this process.
 
     New processes are spawned, since CUDA does not survive a fork.
     """
     args = (geometry, sensor) if start_args is None else start_args
     if not workers:
         start(*args)
-        with threadpool_limits(1, "blas"):  # as in the workers, so that the numbers are the same to the last bit
+        with threadpool_limits(
+            1, "blas"
+        ):  # as in the workers, so that the numbers are the same to the last bit
             yield _Now()
         return
     kept = {name: os.environ.get(name) for name in _THREADS}

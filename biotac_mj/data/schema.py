@@ -1,4 +1,5 @@
-"""What a data set of tactile interactions holds: names, shapes, units. The file's layout is in `docs/data.md`."""
+"""What a data set of tactile interactions holds: names, shapes, units. The file's layout is in
+`docs/data.md`."""
 
 import dataclasses
 
@@ -11,9 +12,12 @@ __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Intera
 SCHEMA = "biotac_mj.data/1"
 KINDS = ("press", "slide", "twist", "tap", "recorded")
 SPLITS = ("train", "validation", "test")
-DISPLACEMENT_SCALE = 2.5e-7  # [m] of one unit of the stored integers: rounding of at most 0.125 um, reach of 8.19 mm
+DISPLACEMENT_SCALE = (
+    2.5e-7  # [m] of one unit of the stored integers: rounding of at most 0.125 um, reach of 8.19 mm
+)
 
-# Of each time step: name -> (shape, stored type, unit). "nvert" and "nouter" stand for the skin's node numbers.
+# Of each time step: name -> (shape, stored type, unit). "nvert" and "nouter" stand for the skin's node
+# numbers.
 COLUMNS = {
     "time": ((), "f8", "s"),
     "displacement": (("nvert", 3), "i2", "2.5e-7 m"),
@@ -50,7 +54,8 @@ class Interaction:
       counts: (n, 23) simulated readings in the order of sensor.channels.CHANNELS [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
-      measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it has no such channel.
+      measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it
+        has no such channel.
       measured_wrench: (n, 6) measured with it; NaN where it was not.
     """
 
@@ -82,7 +87,8 @@ class Interaction:
         """Returns itself.
 
         Raises:
-          ValueError: a wrong kind, split, shape, a time that does not increase, or NaN where none may be; the text names it.
+          ValueError: a wrong kind, split, shape, a time that does not increase, or NaN where none may be; the
+            text names it.
         """
         where = f"interaction {self.id!r}"
         if self.kind not in KINDS:
@@ -99,11 +105,18 @@ class Interaction:
                 continue
             wanted = (n, *(sizes.get(s, s) if isinstance(s, str) else s for s in shape))
             if None in wanted:
-                raise ValueError(f"{where} has {name} but its set has no skin: pass the geometry that the nodes belong to")
+                raise ValueError(
+                    f"{where} has {name} but its set has no skin: pass the geometry that the nodes belong to"
+                )
             if np.shape(value) != wanted:
-                raise ValueError(f"{name} of {where} has shape {np.shape(value)}: {wanted} is needed [{unit}]")
+                raise ValueError(
+                    f"{name} of {where} has shape {np.shape(value)}: {wanted} is needed [{unit}]"
+                )
             if not name.startswith("measured") and not np.isfinite(value).all():
-                raise ValueError(f"{name} of {where} contains NaN or infinite numbers: drop those steps, or keep the last good ones")
+                raise ValueError(
+                    f"{name} of {where} contains NaN or infinite numbers: drop those steps, or keep the "
+                    "last good ones"
+                )
         if n > 1 and not (np.diff(self.time) > 0).all():
             raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")
         return self

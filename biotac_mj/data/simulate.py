@@ -16,7 +16,9 @@ __all__ = ["Fields", "Scene", "simulate", "simulate_condensed"]
 
 wp.set_module_options({"enable_backward": False})
 
-_STRIDE = 1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
+_STRIDE = (
+    1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
+)
 _ARM = 4e-3  # [m] lever arm that turns of an object count with
 _AWAY = 1.0  # [m] where a world keeps the objects of other worlds
 
@@ -26,7 +28,8 @@ class Fields:
     """What the skin did: k interactions of n time steps.
 
     Attributes:
-      displacement: (k, n, nvert, 3) int16, in units of schema.DISPLACEMENT_SCALE; nodes against the unstressed skin.
+      displacement: (k, n, nvert, 3) int16, in units of schema.DISPLACEMENT_SCALE; nodes against the
+        unstressed skin.
       contact_force: (k, n, nouter, 3) float32 [N]; None where the condensed tier does not know it.
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
     """
@@ -43,8 +46,9 @@ class Fields:
 
 
 def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
-    """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a batch takes as many iterations
-    as its worst world, with nothing won. A step that does not converge keeps the last good state and is marked.
+    """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
+    batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
+    the last good state and is marked.
 
     Args:
       model: the skin, on any device.
@@ -58,7 +62,12 @@ def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     if not model.device.is_cuda:
         ones = [_simulate(model, [name], [motion], progress) for name, motion in zip(names, motions)]
-        return Fields(*(np.concatenate([getattr(one, field.name) for one in ones]) for field in dataclasses.fields(Fields)))
+        return Fields(
+            *(
+                np.concatenate([getattr(one, field.name) for one in ones])
+                for field in dataclasses.fields(Fields)
+            )
+        )
     return _simulate(model, names, motions, progress)
 
 
@@ -79,7 +88,8 @@ def _simulate(model, names, motions, progress):
         if not len(there):
             continue
         who, row = there.T
-        # whether what is stored is in balance with the object where it is: failures on the way that were made good do not count
+        # whether what is stored is in balance with the object where it is: failures on the way that were made
+        # good do not count
         fields.converged[who, row] = data.converged[who]
         fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
         fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
@@ -89,7 +99,8 @@ def _simulate(model, names, motions, progress):
 
 
 def simulate_condensed(model: SkinModel, names, motions, progress=None) -> Fields:
-    """The same with the condensed skin, one interaction after another on one core; it has no contact forces of nodes.
+    """The same with the condensed skin, one interaction after another on one core; it has no contact forces
+    of nodes.
 
     Raises:
       ValueError: the skin is inflated at rest, or an object deep inside the rigid core.
@@ -111,7 +122,11 @@ def simulate_condensed(model: SkinModel, names, motions, progress=None) -> Field
             out = skin.solve(memory, at[0], turn[0])
             memory = out.memory
             if row >= 0:
-                fields.converged[k, row], fields.wrench[k, row], fields.pressure[k, row] = out.converged, out.wrench[0], memory.pressure
+                fields.converged[k, row], fields.wrench[k, row], fields.pressure[k, row] = (
+                    out.converged,
+                    out.wrench[0],
+                    memory.pressure,
+                )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
         if progress:
             progress(nstep)
@@ -133,9 +148,15 @@ class Scene:
         self._which = np.array([kinds.index(name) for name in names])
         self._placed = [Placed(name, 1) for name in kinds]
         shapes, grids = [make_object(name) for name in kinds], [grid_of(name) for name in kinds]
-        self.geoms = GeomSet([s.type for s in shapes], [s.size for s in shapes], friction=[friction] * len(kinds),
-                             rounding=[s.rounding for s in shapes], grids=[g for g in grids if g is not None],
-                             nworld=len(names), device=device)  # fmt: skip
+        self.geoms = GeomSet(
+            [s.type for s in shapes],
+            [s.size for s in shapes],
+            friction=[friction] * len(kinds),
+            rounding=[s.rounding for s in shapes],
+            grids=[g for g in grids if g is not None],
+            nworld=len(names),
+            device=device,
+        )
 
     def place(self, pos, mat):
         """Puts each world's object at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
@@ -192,8 +213,13 @@ class _Reader:
         displacement = wp.zeros((len(worlds), m.nvert), dtype=wp.vec3s, device=device)
         force = wp.zeros((len(worlds), self.count), dtype=wp.vec3, device=device)
         chosen = wp.array(np.asarray(worlds, np.int32), dtype=int, device=device)
-        wp.launch(gather, (len(worlds), m.nvert), [data.x, data.outer.node_force, self.vert, self.outer, chosen, DISPLACEMENT_SCALE],
-                  [displacement, force], device=device)  # fmt: skip
+        wp.launch(
+            gather,
+            (len(worlds), m.nvert),
+            [data.x, data.outer.node_force, self.vert, self.outer, chosen, DISPLACEMENT_SCALE],
+            [displacement, force],
+            device=device,
+        )
         return displacement.numpy(), force.numpy()
 
 
@@ -212,8 +238,8 @@ def _units(displacement):
 
 
 def _walk(pos, mat):
-    """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations (m, 3, 3) and the time step
-    (m,) that each pose ends, -1 where it is on the way."""
+    """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations
+    (m, 3, 3) and the time step (m,) that each pose ends, -1 where it is on the way."""
     vector = Rotation.from_matrix(mat[1:] @ np.swapaxes(mat[:-1], 1, 2)).as_rotvec()
     way = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
     out = [(pos[0], mat[0], 0)]

@@ -1,4 +1,5 @@
-"""Which interactions train, choose and judge a model. Whole interactions or whole objects, never time steps: neighbours are alike."""
+"""Which interactions train, choose and judge a model. Whole interactions or whole objects, never time steps:
+neighbours are alike."""
 
 import dataclasses
 
@@ -21,7 +22,10 @@ class Split:
         """Returns itself; ValueError where a part is empty."""
         for name in ("train", "validation", "test"):
             if not len(getattr(self, name)):
-                raise ValueError(f"the {name} part of the split is empty: more interactions are needed, or another object or fractions")
+                raise ValueError(
+                    f"the {name} part of the split is empty: more interactions are needed, or another "
+                    "object or fractions"
+                )
         return self
 
 
@@ -29,14 +33,17 @@ def assign(count: int, seed: int = 0, fractions=FRACTIONS) -> np.ndarray:
     """(count,) of "train", "validation", "test" in random order and the given fractions, rounded."""
     fractions = np.asarray(fractions, float)
     if fractions.shape != (3,) or (fractions < 0).any() or abs(fractions.sum() - 1) > 1e-9:
-        raise ValueError(f"fractions {fractions.tolist()} must be three numbers that add up to 1: train, validation, test")
+        raise ValueError(
+            f"fractions {fractions.tolist()} must be three numbers that add up to 1: train, validation, test"
+        )
     bound = np.rint(np.cumsum(fractions) * count).astype(int)
     part = np.searchsorted(bound, np.arange(count), side="right")
     return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
 
 
 def split_by_interaction(data, seed: int = 0, fractions=FRACTIONS) -> Split:
-    """Random interactions; labelled and unlabelled ones are divided each on their own, so that both appear in every part.
+    """Random interactions; labelled and unlabelled ones are divided each on their own, so that both appear in
+    every part.
 
     Args:
       data: TactileSet.
@@ -53,7 +60,8 @@ def split_by_interaction(data, seed: int = 0, fractions=FRACTIONS) -> Split:
 
 
 def split_by_object(data, unseen="ring_7mm", seed: int = 0, validation: float = 0.2) -> Split:
-    """All interactions of the unseen object (or objects) test; of the others a share chooses and the rest train.
+    """All interactions of the unseen object (or objects) test; of the others a share chooses and the rest
+    train.
 
     Raises:
       ValueError: an object that the set does not have; the text lists those it has.

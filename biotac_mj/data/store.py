@@ -1,4 +1,5 @@
-"""A data set on disk: a folder of HDF5 shards. `write_shard` writes one, `TactileSet` reads all of them as if they were one array."""
+"""A data set on disk: a folder of HDF5 shards. `write_shard` writes one, `TactileSet` reads all of them as if
+they were one array."""
 
 import bisect
 import dataclasses
@@ -16,7 +17,17 @@ from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
 
 _GEOMETRY = tuple(f.name for f in dataclasses.fields(SkinGeometry) if f.name != "name")
-_TABLE = ("id", "object", "kind", "split", "seed", "labelled", "parameters", "start", "stop")  # of each interaction
+_TABLE = (
+    "id",
+    "object",
+    "kind",
+    "split",
+    "seed",
+    "labelled",
+    "parameters",
+    "start",
+    "stop",
+)  # of each interaction
 _TEXT = ("id", "object", "kind", "split", "parameters")
 
 
@@ -25,8 +36,11 @@ def shard_path(folder, number: int) -> pathlib.Path:
     return pathlib.Path(folder) / f"shard-{number:05d}.h5"
 
 
-def write_shard(path, interactions, geometry: SkinGeometry | None = None, attributes: dict | None = None) -> None:
-    """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the versions alone.
+def write_shard(
+    path, interactions, geometry: SkinGeometry | None = None, attributes: dict | None = None
+) -> None:
+    """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the
+    versions alone.
 
     Args:
       path: see `shard_path`.
@@ -35,8 +49,8 @@ def write_shard(path, interactions, geometry: SkinGeometry | None = None, attrib
       attributes: what holds for all of them: material, element, tier, device, settings; JSON's types.
 
     Raises:
-      ValueError: no interactions, one that does not fit (see `Interaction.check`), different columns, a name that occurs twice, or a
-        displacement beyond 8.19 mm.
+      ValueError: no interactions, one that does not fit (see `Interaction.check`), different columns, a name
+        that occurs twice, or a displacement beyond 8.19 mm.
     """
     interactions = list(interactions)
     if not interactions:
@@ -51,16 +65,32 @@ def write_shard(path, interactions, geometry: SkinGeometry | None = None, attrib
     columns = [name for name in COLUMNS if getattr(interactions[0], name) is not None]
     for one in interactions:
         if [name for name in COLUMNS if getattr(one, name) is not None] != columns:
-            raise ValueError(f"interaction {one.id!r} has other columns than {interactions[0].id!r}: write them to different sets")
+            raise ValueError(
+                f"interaction {one.id!r} has other columns than {interactions[0].id!r}: write them to "
+                "different sets"
+            )
     length = np.array([len(one.time) for one in interactions])
     stop = np.cumsum(length)
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        file.attrs.update({"schema": SCHEMA, "frame": "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x", "channels": CHANNELS})
+        file.attrs.update(
+            {
+                "schema": SCHEMA,
+                "frame": "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x",
+                "channels": CHANNELS,
+            }
+        )
         file.attrs["attributes"] = json.dumps(attributes or {}, sort_keys=True)
         file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
         table = file.create_group("interaction", track_order=True)
-        values = {name: [getattr(one, name) for one in interactions] for name in ("id", "object", "kind", "split", "seed", "labelled")}
-        values |= {"parameters": [json.dumps(one.parameters, sort_keys=True) for one in interactions], "start": stop - length, "stop": stop}
+        values = {
+            name: [getattr(one, name) for one in interactions]
+            for name in ("id", "object", "kind", "split", "seed", "labelled")
+        }
+        values |= {
+            "parameters": [json.dumps(one.parameters, sort_keys=True) for one in interactions],
+            "start": stop - length,
+            "stop": stop,
+        }
         for name in _TABLE:
             table[name] = np.array(values[name], dtype=h5py.string_dtype() if name in _TEXT else None)
         steps = file.create_group("step", track_order=True)
@@ -81,7 +111,9 @@ def _write_column(steps, name, parts, length):
     value = np.concatenate([np.asarray(part) for part in parts]).astype(kind)
     wide = value.ndim > 1 and value[0].size > 64
     chunks = (int(min(length.max(), len(value))), *value.shape[1:]) if wide else True
-    steps.create_dataset(name, data=value, chunks=chunks, compression="gzip", compression_opts=2, shuffle=True)
+    steps.create_dataset(
+        name, data=value, chunks=chunks, compression="gzip", compression_opts=2, shuffle=True
+    )
     steps[name].attrs["unit"] = unit
 
 
@@ -89,13 +121,15 @@ def _integers(displacement):
     units = np.rint(np.asarray(displacement) / DISPLACEMENT_SCALE)
     if np.abs(units).max(initial=0) > 32767:
         raise ValueError(
-            f"a node is displaced by {np.abs(displacement).max() * 1e3:.2f} mm: the store reaches 8.19 mm; check units (metres) and the run"
+            f"a node is displaced by {np.abs(displacement).max() * 1e3:.2f} mm: the store reaches 8.19 mm; "
+            "check units (metres) and the run"
         )
     return units.astype(np.int16)
 
 
 class Column:
-    """One column of all shards, read when it is indexed: `column[3]`, `column[10:20]`, `column[mask]`, `column[indices]`.
+    """One column of all shards, read when it is indexed: `column[3]`, `column[10:20]`, `column[mask]`,
+    `column[indices]`.
 
     Attributes:
       name; shape (nstep, ...); dtype of what indexing returns.
@@ -104,7 +138,11 @@ class Column:
     def __init__(self, name, parts, shape, offsets):
         self.name, self._parts, self._offsets = name, parts, offsets
         self.shape = shape
-        self.dtype = np.dtype("f4") if name == "displacement" else np.dtype(bool if name == "converged" else COLUMNS[name][1])
+        self.dtype = (
+            np.dtype("f4")
+            if name == "displacement"
+            else np.dtype(bool if name == "converged" else COLUMNS[name][1])
+        )
 
     def __len__(self):
         return self.shape[0]
@@ -152,9 +190,10 @@ class TactileSet:
 
     Attributes:
       path; geometry: SkinGeometry, or None; attributes, versions: dicts of the first shard.
-      id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each interaction, its time steps are
-        start..stop-1 of every column.
-      columns: names of the columns that are there; "measured_counts" and "measured_wrench" are NaN in interactions without a label.
+      id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each
+        interaction, its time steps are start..stop-1 of every column.
+      columns: names of the columns that are there; "measured_counts" and "measured_wrench" are NaN in
+        interactions without a label.
 
     Raises:
       FileNotFoundError: no such folder or file, or no shards in it.
@@ -165,7 +204,10 @@ class TactileSet:
         self.path = pathlib.Path(path)
         files = sorted(self.path.glob("shard-*.h5")) if self.path.is_dir() else [self.path]
         if not files or not files[0].is_file():
-            raise FileNotFoundError(f"no shards (shard-*.h5) at {self.path}: make a set with `biotac generate` or `biotac import-data`")
+            raise FileNotFoundError(
+                f"no shards (shard-*.h5) at {self.path}: make a set with `biotac generate` or `biotac "
+                "import-data`"
+            )
         self._files = []
         try:
             for name in files:
@@ -177,19 +219,33 @@ class TactileSet:
 
     def _read_tables(self):
         first = self._files[0]
-        self.attributes, self.versions = json.loads(first.attrs["attributes"]), json.loads(first.attrs["versions"])
+        self.attributes, self.versions = (
+            json.loads(first.attrs["attributes"]),
+            json.loads(first.attrs["versions"]),
+        )
         self.geometry = _geometry(first)
         self.columns = tuple(name for name in COLUMNS if any(name in f["step"] for f in self._files))
         for file in self._files[1:]:
-            missing = [c for c in self.columns if not c.startswith("measured") and (c in first["step"]) != (c in file["step"])]
+            missing = [
+                c
+                for c in self.columns
+                if not c.startswith("measured") and (c in first["step"]) != (c in file["step"])
+            ]
             if missing or not _same_skin(first, file):
                 what = f"columns {', '.join(missing)}" if missing else "skin"
-                raise ValueError(f"{file.filename} differs from {first.filename} in its {what}: keep different sets in different folders")
+                raise ValueError(
+                    f"{file.filename} differs from {first.filename} in its {what}: keep different sets in "
+                    "different folders"
+                )
         nstep = [len(f["step/time"]) for f in self._files]
         self._offsets = np.concatenate([[0], np.cumsum(nstep)])
         self.nstep = int(self._offsets[-1])
         for name in ("id", "object", "kind", "split"):
-            setattr(self, name, np.concatenate([f["interaction"][name].asstr()[:] for f in self._files]).astype(str))
+            setattr(
+                self,
+                name,
+                np.concatenate([f["interaction"][name].asstr()[:] for f in self._files]).astype(str),
+            )
         self.seed = np.concatenate([f["interaction/seed"][:] for f in self._files])
         self.labelled = np.concatenate([f["interaction/labelled"][:] for f in self._files]).astype(bool)
         for name in ("start", "stop"):
@@ -198,7 +254,8 @@ class TactileSet:
         names, count = np.unique(self.id, return_counts=True)
         if (count > 1).any():
             raise ValueError(
-                f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: one of them is left from another run"
+                f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: one of them "
+                "is left from another run"
             )
 
     def __len__(self):
@@ -226,7 +283,9 @@ class TactileSet:
 
     def _skin(self):
         if self.geometry is None:
-            raise ValueError(f"{self.path} has no skin: it holds recordings only; use a set made by `biotac generate`")
+            raise ValueError(
+                f"{self.path} has no skin: it holds recordings only; use a set made by `biotac generate`"
+            )
         return self.geometry
 
     def __getitem__(self, name) -> Column:
@@ -266,23 +325,41 @@ class TactileSet:
         """Interaction i, all of it."""
         i = range(len(self))[i]
         rows = slice(self.start[i], self.stop[i])
-        columns = {name: self[name][rows] for name in self.columns if self.labelled[i] or not name.startswith("measured")}
-        return Interaction(str(self.id[i]), str(self.object[i]), str(self.kind[i]), str(self.split[i]), int(self.seed[i]),
-                           self.parameters(i), **columns)  # fmt: skip
+        columns = {
+            name: self[name][rows]
+            for name in self.columns
+            if self.labelled[i] or not name.startswith("measured")
+        }
+        return Interaction(
+            str(self.id[i]),
+            str(self.object[i]),
+            str(self.kind[i]),
+            str(self.split[i]),
+            int(self.seed[i]),
+            self.parameters(i),
+            **columns,
+        )
 
 
 def _open(path):
     try:
         file = h5py.File(path)
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; delete it and run the command again") from error
+        raise ValueError(
+            f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; delete it and run the "
+            "command again"
+        ) from error
     try:
         if file.attrs.get("schema") != SCHEMA:
-            raise ValueError(f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; generate or import it again")
+            raise ValueError(
+                f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; generate "
+                "or import it again"
+            )
         channels = tuple(str(name) for name in file.attrs["channels"])
         if channels != CHANNELS:
             raise ValueError(
-                f"{path} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is needed; reorder the counts"
+                f"{path} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is "
+                "needed; reorder the counts"
             )
     except BaseException:
         file.close()
@@ -301,5 +378,6 @@ def _same_skin(a, b):
     if ("geometry" in a) != ("geometry" in b):
         return False
     return "geometry" not in a or (
-        a["geometry/vert"].shape == b["geometry/vert"].shape and (a["geometry/vert"][:] == b["geometry/vert"][:]).all()
+        a["geometry/vert"].shape == b["geometry/vert"].shape
+        and (a["geometry/vert"][:] == b["geometry/vert"][:]).all()
     )

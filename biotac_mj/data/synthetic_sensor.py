@@ -1,12 +1,12 @@
 """A synthetic 'real sensor': where measured data are wanted and none are at hand, and never anything else.
 
-The simulator does not use it. It differs from the simulator in everything that a real sensor differs in: another mesh, another law and
-constants of the skin, three-dimensional conduction with electrodes in slightly other places, and what no simulation here has: warm-up
-drift, slow temperature, relaxation. What learns on its counts is trained on synthetic data, whatever it is called.
+The simulator does not use it. It differs from the simulator in everything that a real sensor differs in:
+another mesh, another law and constants of the skin, three-dimensional conduction with electrodes in slightly
+other places, and what no simulation here has: warm-up drift, slow temperature, relaxation. What learns on its
+counts is trained on synthetic data, whatever it is called.
 
-Sizes of the effects are those measured on real sensors (a real unloaded sensor beside a flat press, EPFL, 22508 rows, and published
-grasps); what is chosen says so.
-"""
+Sizes of the effects are those measured on real sensors (a real unloaded sensor beside a flat press, EPFL,
+22508 rows, and published grasps); what is chosen says so."""
 
 import dataclasses
 import importlib.util
@@ -32,14 +32,20 @@ class SensorVariation:
     """What makes one sensor different from the next; `draw(seed)` gives sensor number `seed`.
 
     Attributes:
-      youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. rest_pressure: of its liquid [Pa]. Chosen ranges.
+      youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. rest_pressure: of its liquid [Pa].
+        Chosen ranges.
       residual_film: where the skin lies on the core [m], catalogue range 20-100 um.
-      excitation: (4, 2) of X1..X4, within 0.7 mm of the estimate (chosen: it is known to some millimetres at best).
-      rest_counts: (19,) at rest: the mean pattern in ln Z of three published sensors, with the spread that they have.
-      drift: of ln Z, all electrodes together, while warming up, and drift_time [s]: -0.38 and 205 s were fitted to the unloaded sensor.
-      ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards (chosen).
-      overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure answer a step by these shares too much and
-        relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a constant grip, electrodes undershoot 5-25 counts after release.
+      excitation: (4, 2) of X1..X4, within 0.7 mm of the estimate (chosen: it is known to some millimetres at
+        best).
+      rest_counts: (19,) at rest: the mean pattern in ln Z of three published sensors, with the spread that
+        they have.
+      drift: of ln Z, all electrodes together, while warming up, and drift_time [s]: -0.38 and 205 s were
+        fitted to the unloaded sensor.
+      ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
+        (chosen).
+      overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure answer a step by
+        these shares too much and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a constant
+        grip, electrodes undershoot 5-25 counts after release.
     """
 
     youngs_modulus: float
@@ -103,7 +109,10 @@ class SyntheticSensor:
 
         for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
             if importlib.util.find_spec(module) is None:
-                raise ValueError(f"the synthetic measured sensor needs {name}: pip install 'biotac-mj[data]', or take --labelled 0")
+                raise ValueError(
+                    f"the synthetic measured sensor needs {name}: pip install 'biotac-mj[data]', or take "
+                    "--labelled 0"
+                )
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
         options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
@@ -123,7 +132,8 @@ class SyntheticSensor:
 
 @dataclasses.dataclass
 class Meter:
-    """Liquid, electrodes and electronics of a synthetic sensor: geometry and rest_vert (nvert, 3) [m] are of its own skin."""
+    """Liquid, electrodes and electronics of a synthetic sensor: geometry and rest_vert (nvert, 3) [m] are of
+    its own skin."""
 
     variation: SensorVariation
     geometry: object
@@ -134,7 +144,8 @@ class Meter:
         self._conduction = None
 
     def impedance(self, vert_xpos) -> np.ndarray:
-        """(n, 19) [ohm] for nodes (n, nvert, 3) [m]; with the cell constants that give the sensor's counts at rest."""
+        """(n, 19) [ohm] for nodes (n, nvert, 3) [m]; with the cell constants that give the sensor's counts at
+        rest."""
         if self._conduction is None:
             v = self.variation
             self._conduction = LiquidConduction(self.geometry, v.excitation, residual_film=v.residual_film)
@@ -142,13 +153,19 @@ class Meter:
             self._cell = impedance_from_counts(v.rest_counts) / rest
         out = []
         for i, x in enumerate(vert_xpos):  # a skin that stands still is solved once
-            out.append(out[-1] if i and np.array_equal(x, vert_xpos[i - 1]) else self._cell * self._conduction.impedance(x))
+            out.append(
+                out[-1]
+                if i and np.array_equal(x, vert_xpos[i - 1])
+                else self._cell * self._conduction.impedance(x)
+            )
         return np.array(out)
 
     def measure(self, vert_xpos, time, pressure, start: float, seed: int) -> np.ndarray:
-        """(n, 23) counts, in the order of sensor.channels.CHANNELS, of one contact that begins `start` seconds into the session.
+        """(n, 23) counts, in the order of sensor.channels.CHANNELS, of one contact that begins `start`
+        seconds into the session.
 
-        Row 0 is the mean of 50 frames before the contact, so it has fractions; the others are whole numbers with their noise.
+        Row 0 is the mean of 50 frames before the contact, so it has fractions; the others are whole numbers
+        with their noise.
 
         Args:
           vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]; row 0 at rest.
@@ -168,11 +185,13 @@ class Meter:
 
     @property
     def _warm_up(self):
-        """[C] by which the sensor is cold at the start of a session: its counts there are those of `rest_counts`."""
+        """[C] by which the sensor is cold at the start of a session: its counts there are those of
+        `rest_counts`."""
         return self.variation.drift / _PER_DEGREE
 
     def temperature(self, t) -> np.ndarray:
-        """(n,) [C] at times (n,) of the session [s]: warming up, then wandering as slow sines, the same for every contact."""
+        """(n,) [C] at times (n,) of the session [s]: warming up, then wandering as slow sines, the same for
+        every contact."""
         v = self.variation
         rng = np.random.default_rng([self.seed, 23])
         slow = 2 * np.pi / (v.ambient_time * rng.uniform(0.5, 4.0, 8))
@@ -182,7 +201,8 @@ class Meter:
 
 
 def relax(time, value, share, tau) -> np.ndarray:
-    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of share (value - its low-pass), exact between samples (linear).
+    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of share (value - its low-pass), exact
+    between samples (linear).
 
     Args:
       time: (n,) [s]; value: the signal; share, tau: (m,), (m,) [s], of each part.
@@ -203,7 +223,8 @@ _meter = {}  # what a worker keeps
 
 
 def start_worker(geometry, sensor, meter: Meter | None):
-    """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to make."""
+    """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to
+    make."""
     from . import readings
 
     readings.prepare_worker(geometry, sensor)
@@ -211,7 +232,8 @@ def start_worker(geometry, sensor, meter: Meter | None):
 
 
 def measure_in_worker(displacement, time, pressure, number: int, seed: int) -> np.ndarray:
-    """`Meter.measure` of contact `number` of the session; displacement (n, nvert, 3) int16 of the synthetic sensor's skin."""
+    """`Meter.measure` of contact `number` of the session; displacement (n, nvert, 3) int16 of the synthetic
+    sensor's skin."""
     meter = _meter["one"]
     vert = meter.geometry.vert + displacement * DISPLACEMENT_SCALE
     return meter.measure(vert, time, pressure, _CLEARING * number, seed ^ 0x5EED)

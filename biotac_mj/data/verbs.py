@@ -29,10 +29,16 @@ def generate_verb(args) -> None:
     )
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
-    print(f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not converged")
+    print(
+        f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not "
+        "converged"
+    )
     if report.recordings:
         print(f"{report.recordings} recordings of the synthetic measured sensor beside them")
-    print(f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.devices} x {report.device}")
+    print(
+        f"{report.made} shards made in {report.seconds['all']:g} s ({stages}) on {report.devices} x "
+        f"{report.device}"
+    )
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
 
 
@@ -41,12 +47,20 @@ def import_verb(args) -> None:
     from .importers import import_recordings
     from .store import TactileSet
 
-    given = {"force": args.force, "rate": args.rate, "block": args.block, "object": args.object, "objects": args.objects}
+    given = {
+        "force": args.force,
+        "rate": args.rate,
+        "block": args.block,
+        "object": args.object,
+        "objects": args.objects,
+    }
     options = {name: value for name, value in given.items() if value is not None}
     try:
         count = import_recordings(args.files, args.out, args.format, args.seed, **options)
     except TypeError as error:
-        raise ValueError(f"an option does not go with this format ({error}): see `biotac import-data --help`") from error
+        raise ValueError(
+            f"an option does not go with this format ({error}): see `biotac import-data --help`"
+        ) from error
     with TactileSet(args.out) as data:
         objects = ", ".join(sorted(set(data.object.tolist())))
         print(f"{count} interactions, {data.nstep} time steps, objects {objects}; in {args.out}")
@@ -59,7 +73,9 @@ def export_verb(args) -> None:
 
     with TactileSet(args.set) as data:
         try:
-            out = export_lerobot(data, args.out, "measured_counts" if args.measured else "counts", not args.quiet)
+            out = export_lerobot(
+                data, args.out, "measured_counts" if args.measured else "counts", not args.quiet
+            )
         except ImportError as error:
             raise ValueError(str(error)) from error
     print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")

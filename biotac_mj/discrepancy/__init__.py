@@ -1,4 +1,5 @@
-"""Finds where simulation and measurement disagree, names the missing effect, adds it, and shows that the gap shrinks."""
+"""Finds where simulation and measurement disagree, names the missing effect, adds it, and shows that the gap
+shrinks."""
 
 _HOME = {
     "CATALOGUE": "catalogue",

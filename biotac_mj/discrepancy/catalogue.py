@@ -36,10 +36,34 @@ from .effects_skin import (
 __all__ = ["CATALOGUE", "by_id"]
 
 CATALOGUE = (
-    Relaxation(), PowerCreep(), Hysteresis(), Mullins(), Stiffening(), Inhomogeneity(), Bubble(), FluidLoss(), Friction(), FrictionLoad(),
-    Adhesion(), Radius(), Misalignment(), DepthZero(), Mount(), Rocking(), Thermal(), WarmUp(), Asperities(), Gain(), CrossTalk(), Saturation(),  # noqa: E501
-    LowPass(), Latency(), Drift(), PressureGain(), ForceZero(),
-)  # fmt: skip
+    Relaxation(),
+    PowerCreep(),
+    Hysteresis(),
+    Mullins(),
+    Stiffening(),
+    Inhomogeneity(),
+    Bubble(),
+    FluidLoss(),
+    Friction(),
+    FrictionLoad(),
+    Adhesion(),
+    Radius(),
+    Misalignment(),
+    DepthZero(),
+    Mount(),
+    Rocking(),
+    Thermal(),
+    WarmUp(),
+    Asperities(),
+    Gain(),
+    CrossTalk(),
+    Saturation(),  # noqa: E501
+    LowPass(),
+    Latency(),
+    Drift(),
+    PressureGain(),
+    ForceZero(),
+)
 
 
 def by_id(name: str, extra=()) -> Effect:
@@ -51,4 +75,6 @@ def by_id(name: str, extra=()) -> Effect:
     for effect in (*extra, *CATALOGUE):
         if effect.id == name:
             return effect
-    raise ValueError(f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}, or pass your own Effect")
+    raise ValueError(
+        f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}, or pass your own Effect"
+    )

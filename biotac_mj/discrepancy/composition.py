@@ -1,5 +1,5 @@
-"""Which effects together: round after round the best one is refitted and tested; ties are carried on as further beams; at the end each has
-to be needed."""
+"""Which effects together: round after round the best one is refitted and tested; ties are carried on as
+further beams; at the end each has to be needed."""
 
 import dataclasses
 
@@ -21,9 +21,12 @@ class Candidate:
     """An effect refitted on top of others.
 
     Attributes:
-      effect, fit. gain: (chosen,) evidence on trajectories left out over the model without it; nats: its mean; p, q: of sign flips.
-      held: (chosen,) that evidence itself. share: of the closable log mean square. energy: of the mean square taken away by all effects so
-      far, what this one took. refused: reasons. ties: ids that do as well. lead: over the runner-up, in standard errors.
+      effect, fit. gain: (chosen,) evidence on trajectories left out over the model without it; nats: its
+        mean; p, q: of sign flips.
+      held: (chosen,) that evidence itself. share: of the closable log mean square. energy: of the mean square
+        taken away by all effects so
+      far, what this one took. refused: reasons. ties: ids that do as well. lead: over the runner-up, in
+        standard errors.
     """
 
     effect: object
@@ -50,7 +53,8 @@ def compose(comparison, null, usable, chosen, seed, tick=lambda: None):
     """The composition that trajectories left out like best.
 
     Returns:
-      fit: Fit; found: list of Candidate, in the order of their acceptance; rounds: lists of Candidate of the winning beam, best first.
+      fit: Fit; found: list of Candidate, in the order of their acceptance; rounds: lists of Candidate of the
+        winning beam, best first.
     """
     first = _round(comparison, null, null, usable, chosen, seed)
     tick()
@@ -90,26 +94,36 @@ def compose(comparison, null, usable, chosen, seed, tick=lambda: None):
 
 
 def _simplest(options) -> int:
-    """Index of the one with the fewest parameters among those (evidence (chosen,), parameters) that the best does not lead by much."""
+    """Index of the one with the fewest parameters among those (evidence (chosen,), parameters) that the best
+    does not lead by much."""
     best = max(options, key=lambda o: o[0].mean())[0]
     near = [k for k, (e, _) in enumerate(options) if not _ahead(best - e, THRESHOLDS["simpler"])]
     return min(near, key=lambda k: (options[k][1], -options[k][0].mean()))
 
 
 def _ahead(lead, by=None):
-    return bool(lead.mean() > (THRESHOLDS["tie"] if by is None else by) * lead.std(ddof=1) / np.sqrt(len(lead)))
+    return bool(
+        lead.mean() > (THRESHOLDS["tie"] if by is None else by) * lead.std(ddof=1) / np.sqrt(len(lead))
+    )
 
 
 def _tied(gain, other) -> bool:
-    """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than laws are known."""
+    """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than
+    laws are known."""
     return not _ahead(gain - other) or other.mean() > THRESHOLDS["alike"] * gain.mean()
 
 
 def _rank(best, step):
     """Ties of the best one, and its lead over the runner-up."""
     leads = {c.effect.id: best.gain - c.gain for c in step if c is not best}
-    best.ties = [c.effect.id for c in step if c is not best and c.nats >= THRESHOLDS["gain"] and _tied(best.gain, c.gain)]
-    best.lead = min((float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0)
+    best.ties = [
+        c.effect.id
+        for c in step
+        if c is not best and c.nats >= THRESHOLDS["gain"] and _tied(best.gain, c.gain)
+    ]
+    best.lead = min(
+        (float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0
+    )
 
 
 def _round(comparison, current, null, effects, chosen, seed):
@@ -118,7 +132,11 @@ def _round(comparison, current, null, effects, chosen, seed):
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
     short = ranked[: THRESHOLDS["refit"]] + [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
     now = current.residuals(comparison)
-    reference, square, square_null = evidence(now), mean_square(now)[chosen], mean_square(null.residuals(comparison))[chosen]
+    reference, square, square_null = (
+        evidence(now),
+        mean_square(now)[chosen],
+        mean_square(null.residuals(comparison))[chosen],
+    )
     excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     out = []
@@ -130,7 +148,15 @@ def _round(comparison, current, null, effects, chosen, seed):
         left = mean_square(fit.residuals(comparison))[chosen]
         energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
         one = Candidate(
-            effect, fit, gain, held, float(gain.mean()), sign_flip(gain), float(gain.mean()) / (0.5 * rows * excess), energy, []
+            effect,
+            fit,
+            gain,
+            held,
+            float(gain.mean()),
+            sign_flip(gain),
+            float(gain.mean()) / (0.5 * rows * excess),
+            energy,
+            [],
         )
         one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects])
         out.append(one)
@@ -140,7 +166,8 @@ def _round(comparison, current, null, effects, chosen, seed):
 
 
 def _left_out(comparison, whole, chosen, seed, folds=3):
-    """Evidence of every chosen trajectory with parameters fitted on the other folds, from where the fit to all of them ended."""
+    """Evidence of every chosen trajectory with parameters fitted on the other folds, from where the fit to
+    all of them ended."""
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
@@ -160,13 +187,16 @@ def _refused(comparison, one, chosen, present) -> list:
         out.append("bound")
     if present and one.nats <= THRESHOLDS["further"]:
         out.append("further")
-    # What is left of an effect whose true law is a little different looks like those that it is confused with.
+    # What is left of an effect whose true law is a little different looks like those that it is confused
+    # with.
     alike = any(one.effect.id in e.confusable or e.id in one.effect.confusable for e in present)
     if alike and one.energy <= THRESHOLDS["form"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
-    if one.effect.id in _SETUP and all(abs(v) < comparison.repeatability / np.sqrt(len(chosen)) * 2 for v, _ in params):
+    if one.effect.id in _SETUP and all(
+        abs(v) < comparison.repeatability / np.sqrt(len(chosen)) * 2 for v, _ in params
+    ):
         out.append("repeatability")
     return out
 
@@ -176,7 +206,9 @@ def _needed(comparison, current, found, chosen):
     for item in list(found) if len(found) > 1 else ():
         rest = [(e, th) for e, th in current.effects if e.id != item.effect.id]
         reduced = fit_effects(comparison, rest, chosen, current)
-        loss = evidence(current.residuals(comparison))[chosen] - evidence(reduced.residuals(comparison))[chosen]
+        loss = (
+            evidence(current.residuals(comparison))[chosen] - evidence(reduced.residuals(comparison))[chosen]
+        )
         if sign_flip(loss) > THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
             current, found = reduced, [f for f in found if f is not item]
     return current, found

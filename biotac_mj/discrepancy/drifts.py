@@ -1,4 +1,5 @@
-"""Effects that develop over the record in all electrodes: the shared impedance gain (warm-up), temperature, changes in counts."""
+"""Effects that develop over the record in all electrodes: the shared impedance gain (warm-up), temperature,
+changes in counts."""
 
 import abc
 
@@ -21,7 +22,9 @@ __all__ = [
     "least_squares",
 ]
 
-LENGTH = Parameter("s", 0.1, 1e5, "the record; warm-up of real sensors: minutes (Mongeon 2015, finger_force_control)")
+LENGTH = Parameter(
+    "s", 0.1, 1e5, "the record; warm-up of real sensors: minutes (Mongeon 2015, finger_force_control)"
+)
 ONSET = Parameter("s", 0, 1e6, "the record")
 
 
@@ -32,16 +35,22 @@ class TimeShaped(RecordedEffect):
     kinds = ("exponential", "ramp", "step")
 
     def apply(self, counts, time, channels, theta):
-        return counts_from_log_impedance(log_impedance(counts) + np.outer(self._level(time, theta), theta["pattern"]))
+        return counts_from_log_impedance(
+            log_impedance(counts) + np.outer(self._level(time, theta), theta["pattern"])
+        )
 
     def correct(self, counts, time, channels, theta):
-        return counts_from_log_impedance(log_impedance(counts) - np.outer(self._level(time, theta), theta["pattern"]))
+        return counts_from_log_impedance(
+            log_impedance(counts) - np.outer(self._level(time, theta), theta["pattern"])
+        )
 
     @staticmethod
     def _level(time, theta):
         if theta["kind"] == "ramp":  # keeps its slope beyond the part that was fitted
             return theta["amplitude"] * np.maximum(time - theta["onset"], 0) / theta["length"]
-        return theta["amplitude"] * evaluate_shape(theta["kind"], time, theta["onset"], theta["tau"], theta["end"])
+        return theta["amplitude"] * evaluate_shape(
+            theta["kind"], time, theta["onset"], theta["tau"], theta["end"]
+        )
 
     def _finding(self, session, line, pattern, shape, channels):
         full = np.zeros(19)
@@ -62,20 +71,39 @@ class TimeShaped(RecordedEffect):
         low, high = shape.interval.get("amplitude", (np.nan, np.nan))
         parameters = {"amplitude": (shape.amplitude, low, high)}
         reach = self._level(np.array([line.time[0], line.time[-1]]), theta)
-        parameters["change"] = (reach[1] - reach[0] if shape.kind != "pulse" else shape.amplitude, np.nan, np.nan)
+        parameters["change"] = (
+            reach[1] - reach[0] if shape.kind != "pulse" else shape.amplitude,
+            np.nan,
+            np.nan,
+        )
         if shape.kind == "exponential":
             parameters["tau"] = (shape.tau, *shape.interval.get("tau", (np.nan, np.nan)))
         if shape.onset > line.time[0] + 1e-9:
             parameters["onset"] = (shape.onset, *shape.interval.get("onset", (np.nan, np.nan)))
         slope = np.abs(np.median(counts_per_log(session.counts), axis=0))
-        sizes = np.abs(shape.amplitude * full) * slope * (np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end)))
+        sizes = (
+            np.abs(shape.amplitude * full)
+            * slope
+            * (np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end)))
+        )
         parameters["counts"] = (float(np.median(sizes[list(channels)])), np.nan, np.nan)
-        note = {"exponential": "levels off exponentially", "ramp": "goes on steadily", "step": "jumps", "pulse": "comes and goes"}[
-            shape.kind
-        ]
+        note = {
+            "exponential": "levels off exponentially",
+            "ramp": "goes on steadily",
+            "step": "jumps",
+            "pulse": "comes and goes",
+        }[shape.kind]
         stop = end if np.isfinite(end) else float(session.recording.time[-1])
         found = Finding(
-            self, channels, theta, parameters, shape.nats, theta["onset"], stop, float(np.exp(-min(shape.nats, 700))), note=note
+            self,
+            channels,
+            theta,
+            parameters,
+            shape.nats,
+            theta["onset"],
+            stop,
+            float(np.exp(-min(shape.nats, 700))),
+            note=note,
         )
         found.theta["shape"] = shape
         return found
@@ -92,7 +120,9 @@ class Common(TimeShaped):
 
     def find(self, session):
         line = session.timeline()
-        pattern = self.pattern(np.exp(np.median(np.log(np.clip(session.counts[session.fit], 1, 4094)), axis=0)))[line.used]
+        pattern = self.pattern(
+            np.exp(np.median(np.log(np.clip(session.counts[session.fit], 1, 4094)), axis=0))
+        )[line.used]
         series, sd = line.amplitude(pattern)
         kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
         shape = None if line.loaded else self._jump_of_all(line, pattern, session.known_jumps)
@@ -109,17 +139,29 @@ class Common(TimeShaped):
             # Unloaded every electrode shows its own amplitude of the same shape: do they follow the pattern?
             column = evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end)
             column = column - column.mean()
-            if shape.kind == "step" and shape.neff == len(line.time):  # a jump: its own change, free of slow drift
+            if shape.kind == "step" and shape.neff == len(
+                line.time
+            ):  # a jump: its own change, free of slow drift
                 own = line.jump_at(int(np.argmin(np.abs(line.time - shape.onset))), session.known_jumps)
             else:
                 own = column @ (line.value - line.value.mean(0)) / (column @ column)
             # A few electrodes may have something of their own besides: they are not asked.
             ratio = own / pattern
             middle = np.median(ratio)
-            inside = np.abs(ratio - middle) < 0.2 * abs(middle) + 4 * line.noise / np.sqrt(column @ column) / pattern
+            inside = (
+                np.abs(ratio - middle)
+                < 0.2 * abs(middle) + 4 * line.noise / np.sqrt(column @ column) / pattern
+            )
             if inside.sum() < max(8, 0.7 * len(pattern)):
                 return []
-            agreement = abs(float(own[inside] @ pattern[inside] / np.linalg.norm(own[inside]) / np.linalg.norm(pattern[inside])))
+            agreement = abs(
+                float(
+                    own[inside]
+                    @ pattern[inside]
+                    / np.linalg.norm(own[inside])
+                    / np.linalg.norm(pattern[inside])
+                )
+            )
             if not agreement >= 0.93:  # nan: none of it in the electrodes
                 return []
             fit = pattern * (own[inside] @ pattern[inside]) / (pattern[inside] @ pattern[inside])
@@ -128,12 +170,16 @@ class Common(TimeShaped):
             if "amplitude" in shape.interval:
                 shape.interval["amplitude"] = tuple(sorted(v * factor for v in shape.interval["amplitude"]))
             found = self._finding(session, line, pattern, shape, tuple(int(k) for k in line.used))
-            if agreement > 0.98 and self.id == "warmup":  # the electrodes' own shares, a few per cent about the pattern, belong to it
+            if (
+                agreement > 0.98 and self.id == "warmup"
+            ):  # the electrodes' own shares, a few per cent about the pattern, belong to it
                 share = np.where(inside, own / np.mean(fit / pattern), pattern)
                 found = self._finding(session, line, share, shape, tuple(int(k) for k in line.used))
                 found.parameters["spread"] = (float(np.std(share[inside] / pattern[inside])), np.nan, np.nan)
             noise = np.sqrt((line.noise**2) / (column @ column))
-            found.theta["misfit"] = float(((((own - fit) / np.hypot(noise, 0.02 * np.abs(fit))) ** 2)[inside]).sum())
+            found.theta["misfit"] = float(
+                ((((own - fit) / np.hypot(noise, 0.02 * np.abs(fit))) ** 2)[inside]).sum()
+            )
             found.note += f"; electrodes' own amplitudes agree with the pattern to {agreement:.4f} (cosine)"
         else:
             found.theta["misfit"] = -2 * shape.nats
@@ -146,7 +192,10 @@ class Common(TimeShaped):
         if not len(at):
             return None
         size = np.median(step / pattern, axis=1)
-        alike = (np.abs(step - size[:, None] * pattern) < 0.4 * np.abs(size[:, None] * pattern) + 4 * line.noise * np.sqrt(2 / w)).mean(1)
+        alike = (
+            np.abs(step - size[:, None] * pattern)
+            < 0.4 * np.abs(size[:, None] * pattern) + 4 * line.noise * np.sqrt(2 / w)
+        ).mean(1)
         score = np.where(alike > 0.8, np.abs(size) / (np.median(line.noise) * np.sqrt(2 / w) / 2), 0)
         i = int(np.argmax(score))
         # A slow drift changes within a window too: a jump stands out of its surroundings.
@@ -154,29 +203,51 @@ class Common(TimeShaped):
             return None
         time, half = float(line.time[at[i]]), float(np.median(line.noise)) * np.sqrt(2 / w)
         value = float(np.median(line.jump_at(at[i], known) / pattern))
-        return ShapeFit("step", time, 0.0, np.inf, value, 0.0, float(min(0.5 * score[i] ** 2, 400)), half, len(line.time), 1.0,
-                        {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
+        return ShapeFit(
+            "step",
+            time,
+            0.0,
+            np.inf,
+            value,
+            0.0,
+            float(min(0.5 * score[i] ** 2, 400)),
+            half,
+            len(line.time),
+            1.0,
+            {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)},
+        )
 
 
 class SharedGain(Common):
     id, name, stage = "warmup", "shared impedance gain (warm-up)", "T"
-    physics = "all impedances are multiplied by one factor that changes with time: the liquid's conductivity while the sensor warms up"
+    physics = (
+        "all impedances are multiplied by one factor that changes with time: the liquid's "
+        "conductivity while the sensor warms up"
+    )
     params = {
-        "amplitude": Parameter("ln Z", -1, 1, "-0.23 measured on an unloaded sensor over 190 s; Mongeon 2015: 10-17 % of full scale"),
+        "amplitude": Parameter(
+            "ln Z",
+            -1,
+            1,
+            "-0.23 measured on an unloaded sensor over 190 s; Mongeon 2015: 10-17 % of full scale",
+        ),
         "tau": LENGTH,
         "onset": ONSET,
     }
     confusable = {
-        "thermal": "log TDC", "count_offset": "electrodes with very different rest counts", "drift": "one electrode or all",
+        "thermal": "log TDC",
+        "count_offset": "electrodes with very different rest counts",
+        "drift": "one electrode or all",
         "load": "a free segment at both ends of the record",
-    }  # fmt: skip
+    }
 
     def pattern(self, counts):
         return np.ones(19)
 
 
 class _InCounts(Common):
-    """Patterns that are exact in counts, not in ln Z: theta["counts"] holds the factor from level to counts."""
+    """Patterns that are exact in counts, not in ln Z: theta["counts"] holds the factor from level to
+    counts."""
 
     multiplies = False
 
@@ -215,7 +286,11 @@ class CountGain(_InCounts):
     multiplies = True
     id, name, stage = "count_gain", "common gain in counts (amplifier, excitation)", "A"
     physics = "all counts are multiplied by one factor: amplifier or excitation amplitude"
-    params = {"amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "some per cent"), "tau": LENGTH, "onset": ONSET}
+    params = {
+        "amplitude": Parameter("relative to the mean electrode, ln Z", -1, 1, "some per cent"),
+        "tau": LENGTH,
+        "onset": ONSET,
+    }
     confusable = {"warmup": "electrodes with very different rest counts", "count_offset": "the same"}
 
     def pattern(self, counts):
@@ -227,7 +302,9 @@ class Thermal(TimeShaped):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
     physics = "all impedances follow the core's temperature, with a lag"
     params = {
-        "slope": Parameter("ln Z per C", -0.15, 0.0, "-0.064..-0.078 over five sensors; salt solutions -0.014..-0.028"),
+        "slope": Parameter(
+            "ln Z per C", -0.15, 0.0, "-0.064..-0.078 over five sensors; salt solutions -0.014..-0.028"
+        ),
         "lag": Parameter("s", 0, 300, "liquid and thermistor 0.3-10 s; the core lags the liquid"),
     }
     confusable = {"warmup": "heater on and off: temperature goes back, age does not"}
@@ -255,11 +332,32 @@ class Thermal(TimeShaped):
         if nats < 10:
             return []
         half = 1.96 * np.sqrt(rss / neff / max(design[:, 1].var(), 1e-12) / 1.0)
-        theta = {"slope": float(w[1]), "lag": lag, "temperature": temperature, "rate": recording.rate, "reference": float(temperature[0]),
-                 "pattern": np.ones(19)}  # fmt: skip
-        parameters = {"slope": (float(w[1]), float(w[1] - half), float(w[1] + half)), "lag": (lag, np.nan, np.nan)}
-        return [Finding(self, tuple(int(k) for k in line.used), theta, parameters, nats, 0.0, float(recording.time[-1]), float(np.exp(-min(nats, 700))),  # noqa: E501
-                        ties=("warmup",), note="the common change follows TDC")]  # fmt: skip
+        theta = {
+            "slope": float(w[1]),
+            "lag": lag,
+            "temperature": temperature,
+            "rate": recording.rate,
+            "reference": float(temperature[0]),
+            "pattern": np.ones(19),
+        }
+        parameters = {
+            "slope": (float(w[1]), float(w[1] - half), float(w[1] + half)),
+            "lag": (lag, np.nan, np.nan),
+        }
+        return [
+            Finding(
+                self,
+                tuple(int(k) for k in line.used),
+                theta,
+                parameters,
+                nats,
+                0.0,
+                float(recording.time[-1]),
+                float(np.exp(-min(nats, 700))),  # noqa: E501
+                ties=("warmup",),
+                note="the common change follows TDC",
+            )
+        ]
 
     @staticmethod
     def temperature(recording):

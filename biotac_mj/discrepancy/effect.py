@@ -1,4 +1,5 @@
-"""An effect that a simulator can have or miss: one class, one stage, parameters with units, bounds and source.
+"""An effect that a simulator can have or miss: one class, one stage, parameters with units, bounds and
+source.
 
 Your own in ten lines:
 
@@ -22,14 +23,24 @@ import numpy as np
 __all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
-STAGES = {"S": "set-up", "B": "boundary", "K": "contact", "C": "constitutive", "T": "transduction", "A": "acquisition"}
+STAGES = {
+    "S": "set-up",
+    "B": "boundary",
+    "K": "contact",
+    "C": "constitutive",
+    "T": "transduction",
+    "A": "acquisition",
+}
 
-LAW = 0.08  # reduced laws: what practice data with other forms of the same effects showed (benchmarks/discrepancy_calibrate.py)
+# reduced laws: what practice data with other forms of the same effects showed
+# (benchmarks/discrepancy_calibrate.py)
+LAW = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
 class Param:
-    """unit; bounds; source of the bounds; scale: a realistic size, with which signatures are taken and the prior is made."""
+    """unit; bounds; source of the bounds; scale: a realistic size, with which signatures are taken and the
+    prior is made."""
 
     unit: str
     low: float
@@ -45,11 +56,14 @@ class Run:
     """One trajectory on its way through the stages. n rows; effects change it in place.
 
     Attributes:
-      time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m]; order: number in the session.
-      offset (n, 3): of the object beyond where it was meant to be [m]; log_radius, log_friction: of the tool and the contact.
+      time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m];
+      order: number in the session.
+      offset (n, 3): of the object beyond where it was meant to be [m]; log_radius, log_friction: of the tool
+        and the contact.
       bubble: volume of trapped air [m3].
-      force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is solved those without effects.
-      counts (n, 19), pdc (n,): after the converter, before rounding. temperature: (n,) above the first row of the session [C], or None.
+      force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is
+      solved those without effects. counts (n, 19), pdc (n,): after the converter, before rounding.
+      temperature: (n,) above the first row of the session [C], or None.
       stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
       session: dict that the effects of one simulation share from trajectory to trajectory.
     """
@@ -93,16 +107,18 @@ class Run:
 
 
 class Effect(abc.ABC):
-    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values of shape parameters) and
-    `apply`.
+    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values
+    of shape parameters) and `apply`.
 
-    apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no effect) at `Param.start`.
-    """
+    apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no
+    effect) at `Param.start`."""
 
     id = name = stage = physics = ""
     params: dict = {}
     confusable: dict = {}
-    law = 0.0  # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its interval
+    # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
+    # interval
+    law = 0.0
     grid: tuple = ({},)
 
     @abc.abstractmethod

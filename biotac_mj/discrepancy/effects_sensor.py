@@ -1,4 +1,5 @@
-"""Effects of the transduction and the acquisition: what electrodes, pressure and force channels read of a given skin."""
+"""Effects of the transduction and the acquisition: what electrodes, pressure and force channels read of a
+given skin."""
 
 import numpy as np
 
@@ -24,9 +25,14 @@ __all__ = [
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
     physics = "the film gets thinner with the session's clock: every impedance rises in proportion"
-    params = {"rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)}
+    params = {
+        "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)
+    }
     law = LAW
-    confusable = {"warmup": "log TDC; wait an hour", "gain": "the same probe at the beginning and the end of the session"}
+    confusable = {
+        "warmup": "log TDC; wait an hour",
+        "gain": "the same probe at the beginning and the end of the session",
+    }
 
     def apply(self, run, theta):
         run.log_z = run.log_z - np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))[:, None]
@@ -35,7 +41,11 @@ class FluidLoss(Effect):
 class Thermal(Effect):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
     physics = "ln Z = ... - alpha (T - T0), T from TDC"
-    params = {"alpha": Param("1/K", -0.05, 0.15, "0.014-0.028 of salt solutions; 0.064-0.078 over five sensors", 0.02)}
+    params = {
+        "alpha": Param(
+            "1/K", -0.05, 0.15, "0.014-0.028 of salt solutions; 0.064-0.078 over five sensors", 0.02
+        )
+    }
     confusable = {"warmup": "heater on and off"}
 
     def applicable(self, trajectories):
@@ -56,7 +66,11 @@ class WarmUp(Effect):
     }
     grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
     law = LAW
-    confusable = {"thermal": "log TDC", "fluidloss": "wait an hour", "drift": "free segments: one electrode or all"}
+    confusable = {
+        "thermal": "log TDC",
+        "fluidloss": "wait an hour",
+        "drift": "free segments: one electrode or all",
+    }
 
     def apply(self, run, theta):
         run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
@@ -65,7 +79,9 @@ class WarmUp(Effect):
 class Asperities(Effect):
     id, name, stage = "asper", "sensitivity of impedance to the film", "T"
     physics = "conductance ~ gap^p: the change of ln Z from rest is multiplied by p"
-    params = {"log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)}
+    params = {
+        "log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)
+    }
     confusable = {"gain": "one electrode or all", "saturate": "depth ladder"}
 
     def apply(self, run, theta):
@@ -76,11 +92,17 @@ class Gain(Effect):
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
     params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
-    confusable = {"asper": "one electrode or all", "crosstalk": "drive one electrode alone", "saturate": "depth ladder"}
+    confusable = {
+        "asper": "one electrode or all",
+        "crosstalk": "drive one electrode alone",
+        "saturate": "depth ladder",
+    }
 
     def doubt(self, theta):
         g = np.array(list(theta.values()))
-        return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None  # scatter of manufacturing has no mean
+        return (
+            "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
+        )  # scatter of manufacturing has no mean
 
     def apply(self, run, theta):
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
@@ -90,7 +112,10 @@ class Gain(Effect):
 class CrossTalk(Effect):
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = "V = (I + kappa K) U with K falling off with distance"
-    params = {"kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05), "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True)}
+    params = {
+        "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
+        "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
+    }
     grid = ({"length": 2.0}, {"length": 4.0})
     law = LAW
     confusable = {
@@ -109,7 +134,10 @@ class CrossTalk(Effect):
 class Saturation(Effect):
     id, name, stage = "saturate", "saturation of the change", "A"
     physics = "changes from rest bend beyond a knee: soft clip"
-    params = {"strength": Param("1", 0.0, 1.0, "none to hard", 0.3), "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True)}
+    params = {
+        "strength": Param("1", 0.0, 1.0, "none to hard", 0.3),
+        "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True),
+    }
     grid = ({"knee": 120.0}, {"knee": 400.0}, {"knee": 900.0})
     law = LAW
     confusable = {"gain": "depth ladder at one place"}

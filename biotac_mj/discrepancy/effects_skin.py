@@ -1,9 +1,9 @@
 """Effects of the skin, its contact and the set-up.
 
-Bounds and sources are those of the literature named; "generic" marks silicone in general. C effects act on what the rubber bears: with a
-displacement-controlled object and an elastic field that keeps its form, a separable law leaves the field and changes force and pressure
-(correspondence principle, Lee and Radok 1960; exact for linear materials while the contact grows).
-"""
+Bounds and sources are those of the literature named; "generic" marks silicone in general. C effects act on
+what the rubber bears: with a displacement-controlled object and an elastic field that keeps its form, a
+separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
+exact for linear materials while the contact grows)."""
 
 import numpy as np
 from scipy.special import erf
@@ -38,7 +38,10 @@ class Relaxation(Effect):
     }
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
     law = LAW
-    confusable = {"hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed", "creep": "a hold of 100 s"}
+    confusable = {
+        "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
+        "creep": "a hold of 100 s",
+    }
 
     def apply(self, run, theta):
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
@@ -53,7 +56,8 @@ class PowerCreep(Effect):
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def apply(self, run, theta):
-        # A power law over three decades as the sum of exponentials a factor of three apart (each takes the slope n ln 3).
+        # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
+        # slope n ln 3).
         for tau in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0):
             weight = theta["n"] * np.log(10**0.5)
             run.force = run.force + weight * memory(run, run.force, tau)
@@ -62,14 +66,22 @@ class PowerCreep(Effect):
 
 class Hysteresis(Effect):
     id, name, stage = "hyster", "rate-independent hysteresis", "C"
-    physics = "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, whatever the speed"
+    physics = (
+        "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, whatever "
+        "the speed"
+    )
     params = {
         "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
-        "width": Param("m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True),
+        "width": Param(
+            "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
+        ),
     }
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
     law = LAW
-    confusable = {"relax": "the same depth at ten times the speed", "mullins": "a third cycle to the same depth"}
+    confusable = {
+        "relax": "the same depth at ten times the speed",
+        "mullins": "a third cycle to the same depth",
+    }
 
     def apply(self, run, theta):
         z, width = np.zeros(len(run.depth)), theta["width"]
@@ -80,7 +92,10 @@ class Hysteresis(Effect):
 
 class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
-    physics = "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) below the deepest press before"
+    physics = (
+        "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) "
+        "below the deepest press before"
+    )
     params = {
         "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
         "width": Param("1", 0.1, 3, "m + b Wmax over Wmax", 1.0, 1.0, True),
@@ -92,7 +107,10 @@ class Mullins(Effect):
 
     def apply(self, run, theta):
         seen = run.session.setdefault("mullins", [])
-        before = max((d * np.exp(-((np.linalg.norm(p - run.place) / theta["reach"]) ** 2)) for p, d in seen), default=0.0)
+        before = max(
+            (d * np.exp(-((np.linalg.norm(p - run.place) / theta["reach"]) ** 2)) for p, d in seen),
+            default=0.0,
+        )
         depth = np.maximum(run.depth, 0)
         largest = np.maximum(before, np.maximum.accumulate(depth))
         ratio = np.where(largest > 1e-6, depth / np.maximum(largest, 1e-6), 1.0)
@@ -118,7 +136,10 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
-    confusable = {"misalign": "mount the fingertip again: misalignment changes, the material's map moves with the sensor"}
+    confusable = {
+        "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
+        "sensor"
+    }
 
     def apply(self, run, theta):
         x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
@@ -151,7 +172,10 @@ class Friction(Effect):
 
 class FrictionLoad(Effect):
     id, name, stage = "fric_load", "friction that saturates with load", "K"
-    physics = "tangential force tau0 A rather than mu F: its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
+    physics = (
+        "tangential force tau0 A rather than mu F: its ratio to the normal force falls with load "
+        "(Trejo 2017; Sahli 2018)"
+    )
     params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
@@ -159,7 +183,9 @@ class FrictionLoad(Effect):
     def apply(self, run, theta):
         normal = -np.outer(run.force @ run.heading, run.heading)
         tangential = run.force + normal
-        run.force = run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
+        run.force = (
+            run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
+        )
 
 
 class Adhesion(Effect):
@@ -174,7 +200,9 @@ class Adhesion(Effect):
         a = np.sqrt(radius * np.maximum(run.depth, 0))
         out = np.gradient(run.depth, run.time) < -1e-9
         W = theta["W"] * np.where(out, 3.0, 1.0)
-        run.force = run.force + np.outer(np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading)
+        run.force = run.force + np.outer(
+            np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
+        )
 
 
 class Radius(Effect):

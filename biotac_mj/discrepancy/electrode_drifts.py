@@ -9,11 +9,13 @@ from .shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 
 __all__ = ["Drift", "GainChange"]
 
-# Nats under load. The place of a contact wanders too and bends the electrodes' relations, on recordings without effect up to 82 nats' worth
-# (practice seeds); a fault stands out of what the other electrodes seem to do.
+# Nats under load. The place of a contact wanders too and bends the electrodes' relations, on recordings
+# without effect up to 82 nats' worth (practice seeds); a fault stands out of what the other electrodes seem
+# to do.
 _SLOW, _ALONE = 90.0, 2.0
 _STAYS, _GOES = 50.0, 80.0  # a gain that changes and stays so; one that comes and goes
-_COMES_BACK = 10.0  # [s] a jump of a channel stays; what comes back sooner was a place pressed only then, or a loose contact
+# [s] a jump of a channel stays; what comes back sooner was a place pressed only then, or a loose contact
+_COMES_BACK = 10.0
 _STAYED = 0.4  # of the jump
 
 
@@ -25,7 +27,10 @@ class Drift(TimeShaped):
         "tau": LENGTH,
         "onset": ONSET,
     }
-    confusable = {"gain": "load the electrode before and after: an offset does not scale with the signal", "warmup": "one electrode or all"}
+    confusable = {
+        "gain": "load the electrode before and after: an offset does not scale with the signal",
+        "warmup": "one electrode or all",
+    }
 
     def find(self, session):
         line = session.timeline()
@@ -33,7 +38,12 @@ class Drift(TimeShaped):
         best, evidence = None, {}
         slope = np.abs(np.median(counts_per_log(session.counts), axis=0))[line.used]
         common = max(
-            (f.parameters["counts"][0] for f in session.findings if isinstance(f.effect, Common) and "counts" in f.parameters), default=0.0
+            (
+                f.parameters["counts"][0]
+                for f in session.findings
+                if isinstance(f.effect, Common) and "counts" in f.parameters
+            ),
+            default=0.0,
         )
         for k in whole_electrodes(session, line):
             unit = np.zeros(len(line.used))
@@ -43,19 +53,31 @@ class Drift(TimeShaped):
             if through is not None:
                 series = through(line.value[:, k] - line.value[:, k].mean())
                 sd = max(series.std(), line.noise[k])
-            shape = fit_shapes(line.time, series, kinds, tests=len(line.used), floor=sd * 0.1, through=through)
+            shape = fit_shapes(
+                line.time, series, kinds, tests=len(line.used), floor=sd * 0.1, through=through
+            )
             evidence[k] = 0.0 if shape is None else shape.nats
             if shape is None or shape.nats < (_SLOW if line.loaded else 8):
                 continue
-            size = abs(shape.amplitude) * slope[k] * np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end))
+            size = (
+                abs(shape.amplitude)
+                * slope[k]
+                * np.ptp(evaluate_shape(shape.kind, line.time, shape.onset, shape.tau, shape.end))
+            )
             floor = max(2.0, 0.7 * line.noise[k] * np.sqrt(line.width) * slope[k])
             # Real electrodes share a gain to 3 %: what is left of it is no drift of their own.
-            if size < max(floor, 0.12 * common) or (line.loaded and (shape.explained < 0.3 or size < 3 * floor)):
+            if size < max(floor, 0.12 * common) or (
+                line.loaded and (shape.explained < 0.3 or size < 3 * floor)
+            ):
                 continue
             energy = np.sum((series - series.mean()) ** 2) * shape.explained / sd**2
             if best is None or energy > best[0]:
                 best = energy, k, unit, shape
-        if best and line.loaded and best[3].nats < _ALONE * max((v for k, v in evidence.items() if k != best[1]), default=0.0):
+        if (
+            best
+            and line.loaded
+            and best[3].nats < _ALONE * max((v for k, v in evidence.items() if k != best[1]), default=0.0)
+        ):
             best = None
         if best is None or not line.loaded:
             jump = self._jump(session, line)
@@ -94,7 +116,9 @@ class Drift(TimeShaped):
                 return []
             if not line.loaded or _lasts(line, k, at[i], alone[i, k]):
                 break
-            session.events[int(line.used[k]), round(float(line.time[at[i]]))] = float(abs(alone[i, k]) * slope)
+            session.events[int(line.used[k]), round(float(line.time[at[i]]))] = float(
+                abs(alone[i, k]) * slope
+            )
             score[np.abs(at - at[i]) * line.period < _COMES_BACK] = 0
         else:
             return []
@@ -103,8 +127,19 @@ class Drift(TimeShaped):
         unit[k] = 1
         half = 2 * float(line.noise[k]) / np.sqrt(w) + 0.5 * float(moving[i])
         value = float(alone[i, k]) if line.loaded else float(line.jump_at(at[i], known)[k])
-        shape = ShapeFit("step", time, 0.0, np.inf, value, 0.0, float(min(0.5 * score[i] ** 2 - np.log(n * c), 200)), half, n, 1.0,
-                         {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)})  # fmt: skip
+        shape = ShapeFit(
+            "step",
+            time,
+            0.0,
+            np.inf,
+            value,
+            0.0,
+            float(min(0.5 * score[i] ** 2 - np.log(n * c), 200)),
+            half,
+            n,
+            1.0,
+            {"amplitude": (value - half, value + half), "onset": (time - line.period, time + line.period)},
+        )
         found = self._finding(session, line, unit, shape, (int(line.used[k]),))
         found.ties = ("gain",)
         found.note += f"; the other electrodes stand still meanwhile ({abs(value) * slope:.0f} counts)"
@@ -112,7 +147,8 @@ class Drift(TimeShaped):
 
 
 def _lasts(line, k, row, value):
-    """Whether electrode used[k], departing by `value` [ln Z] at bin `row`, stays where it went, by what the others say."""
+    """Whether electrode used[k], departing by `value` [ln Z] at bin `row`, stays where it went, by what the
+    others say."""
     departure = line.explained_by_others(k)(line.value[:, k] - line.value[:, k].mean())
     reach, gap = int(_COMES_BACK / line.period), int(round(0.6 / line.period))
     before, after = departure[max(row - reach, 0) : max(row - gap, 1)], departure[row + gap : row + reach]
@@ -138,11 +174,16 @@ class GainChange(RecordedEffect):
             signal = line.value[:, k] - np.median(line.value[:, k]) - residual
             if signal.std() < 4 * line.noise[k]:
                 continue
-            for start, stop in [(c, n) for c in cuts] + [(a, b) for i, a in enumerate(cuts[::4]) for b in cuts[::4][i + 1 :]]:
+            for start, stop in [(c, n) for c in cuts] + [
+                (a, b) for i, a in enumerate(cuts[::4]) for b in cuts[::4][i + 1 :]
+            ]:
                 on = np.zeros(n)
                 on[start:stop] = 1
                 share = (stop - start) / n
-                if not 0.1 < share < 0.9 or min(signal[on > 0].std(), signal[on == 0].std()) < 0.4 * signal.std():
+                if (
+                    not 0.1 < share < 0.9
+                    or min(signal[on > 0].std(), signal[on == 0].std()) < 0.4 * signal.std()
+                ):
                     continue  # a gain shows where the load changes, on both sides
                 base = np.ones((n, 1))
                 more = np.concatenate([base, through(np.stack([on, on * signal], axis=1))], axis=1)
@@ -157,7 +198,8 @@ class GainChange(RecordedEffect):
         neff = max(4.0, n / correlation_length(residual - more @ w))
         nats = 0.5 * neff * np.log(ratio) - 2 * np.log(neff) - np.log(19) - 3
         gain = float(w[2])
-        # Where the place of a contact bends the relations, several electrodes seem to change: a gain is one electrode's.
+        # Where the place of a contact bends the relations, several electrodes seem to change: a gain is one
+        # electrode's.
         shared = max((v for i, v in alone.items() if i != k), default=0.0) > 0.6 * alone[k]
         if nats < (_STAYS if stop >= n else _GOES) or ratio < 1.6 or shared or not 0.08 < abs(gain) < 1.2:
             return []
@@ -169,26 +211,53 @@ class GainChange(RecordedEffect):
         channel = int(line.used[k])
         rest = float(np.median(line.value[:, k]))
         shift = float(w[1])
-        theta = {"ratio": ratio, "gain": gain, "rest": rest, "start": first, "end": np.inf if whole else last, "shift": shift}
-        parameters = {"gain": (gain, gain - half, gain + half), "onset": (first, first - 2 * line.period, first + 2 * line.period)}
+        theta = {
+            "ratio": ratio,
+            "gain": gain,
+            "rest": rest,
+            "start": first,
+            "end": np.inf if whole else last,
+            "shift": shift,
+        }
+        parameters = {
+            "gain": (gain, gain - half, gain + half),
+            "onset": (first, first - 2 * line.period, first + 2 * line.period),
+        }
         note = f"its response to load changes by {gain:+.0%} against what the other electrodes say"
-        return [Finding(self, (channel,), theta, parameters, nats, first, last, float(np.exp(-min(nats, 700))), note=note)]
+        return [
+            Finding(
+                self,
+                (channel,),
+                theta,
+                parameters,
+                nats,
+                first,
+                last,
+                float(np.exp(-min(nats, 700))),
+                note=note,
+            )
+        ]
 
     def apply(self, counts, time, channels, theta):
         return self._scale(counts, time, channels, theta, 1 + theta["gain"], theta["shift"], False)
 
     def correct(self, counts, time, channels, theta):
-        return self._scale(counts, time, channels, theta, 1 / max(1 + theta["gain"], 0.05), theta["shift"], True)
+        return self._scale(
+            counts, time, channels, theta, 1 / max(1 + theta["gain"], 0.05), theta["shift"], True
+        )
 
     @staticmethod
     def _scale(counts, time, channels, theta, factor, shift, inverse):
         out = counts.copy()
         rows = (time >= theta["start"]) & (time < theta["end"])
         z = log_impedance(counts[rows, channels[0]]) - theta["rest"]
-        out[rows, channels[0]] = counts_from_log_impedance(theta["rest"] + ((z - shift) * factor if inverse else z * factor + shift))
+        out[rows, channels[0]] = counts_from_log_impedance(
+            theta["rest"] + ((z - shift) * factor if inverse else z * factor + shift)
+        )
         return out
 
 
 def whole_electrodes(session, line):
-    """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken for a drift."""
+    """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken
+    for a drift."""
     return [i for i, k in enumerate(line.used) if session.masked[session.fit, k].mean() < 0.03]

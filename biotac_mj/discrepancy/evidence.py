@@ -6,7 +6,8 @@ __all__ = ["benjamini_hochberg", "max_t", "sign_flip", "wilson"]
 
 
 def sign_flip(gain, draws=4000, seed=0) -> float:
-    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of them."""
+    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of
+    them."""
     gain = np.asarray(gain, float)
     n = len(gain)
     if n <= 12:
@@ -18,11 +19,12 @@ def sign_flip(gain, draws=4000, seed=0) -> float:
 
 
 def max_t(statistic, draws=2000, seed=0):
-    """Family-wise p of many cells by sign flips of whole units (Andreella and Finos 2026; max-T of Westfall and Young).
+    """Family-wise p of many cells by sign flips of whole units (Andreella and Finos 2026; max-T of Westfall
+    and Young).
 
     Args:
-      statistic: (units, cells), one number for each trajectory or block and cell, symmetric about zero under the null; nan where a unit
-        has nothing to say about a cell.
+      statistic: (units, cells), one number for each trajectory or block and cell, symmetric about zero under
+        the null; nan where a unit has nothing to say about a cell.
 
     Returns:
       t (cells,), p (cells,) adjusted.

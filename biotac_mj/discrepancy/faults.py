@@ -27,7 +27,8 @@ class Stuck(RecordedEffect):
         x = session.recording.electrodes[first:last]
         whole = _frozen_rows(x, rate)
         repeat = np.array([_repeat_share(c) for c in x.T])
-        # What the other electrodes do too (a filtered or coarse recording stands still at times) is no fault of one.
+        # What the other electrodes do too (a filtered or coarse recording stands still at times) is no fault
+        # of one.
         longest = np.array([runs(c)[1].max() for c in x.T])
         usual = float(np.median(longest[longest < 0.5 * len(x)])) if (longest < 0.5 * len(x)).any() else 1.0
         coarse = {k for f in session.findings if f.id == "quantise" for k in f.channels}
@@ -50,11 +51,17 @@ class Stuck(RecordedEffect):
             value = float(x[s, k])
             found.append(
                 Finding(
-                    self, (k,), {"mask": mask, "value": value}, {"value": (value, value, value)},
-                    -total * np.log(max(p, 0.02)), (first + long[0][0]) / rate, (first + long[-1][0] + long[-1][1]) / rate,
-                    p=float(max(p, 0.02) ** min(n, 200)), note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",  # noqa: E501
+                    self,
+                    (k,),
+                    {"mask": mask, "value": value},
+                    {"value": (value, value, value)},
+                    -total * np.log(max(p, 0.02)),
+                    (first + long[0][0]) / rate,
+                    (first + long[-1][0] + long[-1][1]) / rate,
+                    p=float(max(p, 0.02) ** min(n, 200)),
+                    note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",  # noqa: E501
                 )
-            )  # fmt: skip
+            )
         return found
 
     @staticmethod
@@ -96,20 +103,35 @@ class Freeze(RecordedEffect):
         seconds = whole.sum() / rate
         return [
             Finding(
-                self, tuple(range(19)), {"mask": mask}, {"seconds": (seconds, seconds, seconds)}, 20.0 + seconds,
-                where[0] / rate, where[-1] / rate, p=0.0, note=f"{seconds:.1f} s of rows repeat the one before in all electrodes",
+                self,
+                tuple(range(19)),
+                {"mask": mask},
+                {"seconds": (seconds, seconds, seconds)},
+                20.0 + seconds,
+                where[0] / rate,
+                where[-1] / rate,
+                p=0.0,
+                note=f"{seconds:.1f} s of rows repeat the one before in all electrodes",
             )
-        ]  # fmt: skip
+        ]
 
     def mask(self, counts, time, finding):
         return np.repeat(finding.theta["mask"][:, None], 19, axis=1)
 
 
 class Saturate(RecordedEffect):
-    id, name, stage, unit = "saturate", "clipping (saturation of channels)", "A", "share of samples on the limit"
+    id, name, stage, unit = (
+        "saturate",
+        "clipping (saturation of channels)",
+        "A",
+        "share of samples on the limit",
+    )
     physics = "samples pile up on the largest or smallest value: converter or amplifier at its limit"
     params = {"level": Parameter("counts", 0, 4095, "12-bit range")}
-    confusable = {"stuck": "a clipped channel leaves the limit when the load goes back", "gain": "depth ladder at one place"}
+    confusable = {
+        "stuck": "a clipped channel leaves the limit when the load goes back",
+        "gain": "depth ladder at one place",
+    }
 
     def find(self, session):
         hits = {}
@@ -122,7 +144,9 @@ class Saturate(RecordedEffect):
             for side in (1, -1):
                 level, mass, expected = _edge_mass(side * column)
                 if mass >= max(15, 0.002 * len(column)) and mass > 6 * expected + 10:
-                    hits.setdefault((side, round(level * side)), []).append((k, mass / len(column), mass, expected))
+                    hits.setdefault((side, round(level * side)), []).append(
+                        (k, mass / len(column), mass, expected)
+                    )
         found = []
         for (side, level), group in hits.items():
             channels = tuple(g[0] for g in group)
@@ -130,11 +154,18 @@ class Saturate(RecordedEffect):
             mass, expected = sum(g[2] for g in group), sum(max(g[3], 0.5) for g in group)
             found.append(
                 Finding(
-                    self, channels, {"level": float(level), "side": side}, {"level": (float(level), level - 0.5, level + 0.5)},
-                    min(mass * np.log(mass / expected), 1e4), at[0] / session.recording.rate, at[-1] / session.recording.rate, p=0.0,
-                    note=f"{np.mean([g[1] for g in group]):.1%} of the samples lie on {level}, the {'largest' if side > 0 else 'smallest'} value",  # noqa: E501
+                    self,
+                    channels,
+                    {"level": float(level), "side": side},
+                    {"level": (float(level), level - 0.5, level + 0.5)},
+                    min(mass * np.log(mass / expected), 1e4),
+                    at[0] / session.recording.rate,
+                    at[-1] / session.recording.rate,
+                    p=0.0,
+                    note=f"{np.mean([g[1] for g in group]):.1%} of the samples lie on {level}, the "
+                    f"{'largest' if side > 0 else 'smallest'} value",  # noqa: E501
                 )
-            )  # fmt: skip
+            )
         return found
 
     def mask(self, counts, time, finding):
@@ -166,7 +197,15 @@ class Quantise(RecordedEffect):
         whole = np.array([_lattice(x[rows, k]) for k in range(19)])
         rate = session.recording.rate
         if np.mean(whole >= 2) > 0.8:
-            return [self._finding(tuple(range(19)), float(np.median(whole)), 0.0, float(session.recording.time[-1]) + 1, 50.0)]
+            return [
+                self._finding(
+                    tuple(range(19)),
+                    float(np.median(whole)),
+                    0.0,
+                    float(session.recording.time[-1]) + 1,
+                    50.0,
+                )
+            ]
         step = np.array([[_lattice(x[a:b, k]) for k in range(19)] for a, b in zip(edges[:-1], edges[1:])])
         coarse = step >= 2
         found = []
@@ -185,7 +224,15 @@ class Quantise(RecordedEffect):
     def _finding(self, channels, value, start, end, nats):
         note = f"every value is a multiple of {value:g} counts (up to an offset)"
         return Finding(
-            self, channels, {"step": value, "start": start, "end": end}, {"step": (value, value, value)}, nats, start, end, 0.0, note=note
+            self,
+            channels,
+            {"step": value, "start": start, "end": end},
+            {"step": (value, value, value)},
+            nats,
+            start,
+            end,
+            0.0,
+            note=note,
         )
 
     def apply(self, counts, time, channels, theta):
@@ -215,17 +262,30 @@ class Spikes(RecordedEffect):
         at = np.flatnonzero(bad[:, channels].any(1)) / session.recording.rate
         value = float(count[list(channels)].sum() / minutes)
         return [
-            Finding(self, channels, {}, {"rate": (value, _NAN, _NAN)}, 10.0 * count.sum(), at[0], at[-1], 0.0,
-                    note=f"{int(count.sum())} samples leave their neighbours by more than ten times the noise")
-        ]  # fmt: skip
+            Finding(
+                self,
+                channels,
+                {},
+                {"rate": (value, _NAN, _NAN)},
+                10.0 * count.sum(),
+                at[0],
+                at[-1],
+                0.0,
+                note=f"{int(count.sum())} samples leave their neighbours by more than ten times the noise",
+            )
+        ]
 
     @staticmethod
     def flag(x):
         middle = median_filter(x, size=(7, 1), mode="nearest")
         off = np.abs(x - middle)
         before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
-        around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")  # lively stretches leave the median by more
-        return (off > np.maximum(np.maximum(10 * noise_level(x), 25), 10 * around)) & (np.abs(before - after) < 0.3 * off)
+        around = uniform_filter1d(
+            np.minimum(off, 200), 101, axis=0, mode="nearest"
+        )  # lively stretches leave the median by more
+        return (off > np.maximum(np.maximum(10 * noise_level(x), 25), 10 * around)) & (
+            np.abs(before - after) < 0.3 * off
+        )
 
     def mask(self, counts, time, finding):
         mask = np.zeros(counts.shape, bool)
@@ -250,7 +310,10 @@ class Swap(RecordedEffect):
         at, step, w = line.jumps()
         best = None
         for i in np.argsort(-np.abs(step).max(1) if len(at) else np.zeros(0))[:40]:
-            before, after = line.value[at[i] - w : at[i]].mean(0), line.value[at[i] + 1 : at[i] + w + 1].mean(0)
+            before, after = (
+                line.value[at[i] - w : at[i]].mean(0),
+                line.value[at[i] + 1 : at[i] + w + 1].mean(0),
+            )
             a, b = np.argsort(-np.abs(step[i]))[:2]
             moved = abs(step[i, a]) + abs(step[i, b])
             left = abs(after[a] - before[b]) + abs(after[b] - before[a])
@@ -305,8 +368,17 @@ class Swap(RecordedEffect):
         onset = self._onset(z, t, a, b, cut, late, line)
         start, end = (onset, float(session.recording.time[-1])) if late else (0.0, onset)
         channels = tuple(int(line.used[i]) for i in (a, b))
-        return Finding(self, channels, {"start": start, "end": end + (1 if late else 0)}, {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},  # noqa: E501
-                       gain, start, end, 0.0, note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}")  # fmt: skip  # noqa: E501
+        return Finding(
+            self,
+            channels,
+            {"start": start, "end": end + (1 if late else 0)},
+            {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},  # noqa: E501
+            gain,
+            start,
+            end,
+            0.0,
+            note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}",
+        )  # noqa: E501
 
     @staticmethod
     def _onset(z, t, a, b, cut, late, line):
@@ -371,7 +443,8 @@ def _lattice(x):
 
 
 def interpolated(counts, masked, line):
-    """Counts with masked samples replaced by linear interpolation in ln Z over time, for effects that need a complete series."""
+    """Counts with masked samples replaced by linear interpolation in ln Z over time, for effects that need a
+    complete series."""
     z = log_impedance(counts)
     rows = np.arange(len(z))
     for k in np.flatnonzero(masked.any(0)):

@@ -1,4 +1,5 @@
-"""Fits of effects: nuisance parameters always with them, trajectories weighted so that none decides alone, evidence by trajectory."""
+"""Fits of effects: nuisance parameters always with them, trajectories weighted so that none decides alone,
+evidence by trajectory."""
 
 import dataclasses
 
@@ -17,7 +18,8 @@ class Fit:
     """Effects with their parameters and the nuisance fitted with them.
 
     Attributes:
-      effects: list of (Effect, theta). nuisance: fitted with them. covariance: of the free parameters, by trajectory (sandwich).
+      effects: list of (Effect, theta). nuisance: fitted with them. covariance: of the free parameters, by
+        trajectory (sandwich).
       names: of the free parameters: (effect id, name); cost.
     """
 
@@ -34,7 +36,8 @@ class Fit:
         return comparison.raw(self.effects, self.nuisance, exact)
 
     def interval(self, k):
-        """95 % interval of free parameter k, from the covariance by trajectory and what the effect says of its law."""
+        """95 % interval of free parameter k, from the covariance by trajectory and what the effect says of
+        its law."""
         effect, name = self.names[k]
         value = next(th for e, th in self.effects if e.id == effect)[name]
         law = next(e.law for e, _ in self.effects if e.id == effect) * value
@@ -48,7 +51,8 @@ def mean_square(residuals) -> np.ndarray:
 
 
 def evidence(residuals) -> np.ndarray:
-    """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share their causes [nats]."""
+    """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share their
+    causes [nats]."""
     return np.array([-0.5 * len(r) * np.log(max(float((r**2).mean()), 0.05)) for r in residuals])
 
 
@@ -68,7 +72,11 @@ def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
             scale.append(p.scale if not p.shape else 1.0)
             value = theta[name]
             if p.shape:  # in the logarithm
-                low.append(np.log(p.low)), high.append(np.log(p.high)), x0.append(np.log(np.clip(value, p.low * 1.001, p.high * 0.999)))
+                (
+                    low.append(np.log(p.low)),
+                    high.append(np.log(p.high)),
+                    x0.append(np.log(np.clip(value, p.low * 1.001, p.high * 0.999))),
+                )
             else:
                 (
                     low.append(p.low / p.scale),
@@ -80,14 +88,28 @@ def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
     sliding = any(e.id == "friction" for e, _ in effects)
     x = np.concatenate([nuisance, x0])
     bounds = (np.concatenate([LOW, low]), np.concatenate([HIGH, high]))
-    prior = np.array([2.5 if not e.params[n].shape else 1.0 for i, (eid, n) in enumerate(names) for e, _ in effects if e.id == eid])
-    centre = np.array([0.0 if not _param(effects, nm).shape else np.log({e.id: th for e, th in effects}[nm[0]][nm[1]]) for nm in names])
+    prior = np.array(
+        [
+            2.5 if not e.params[n].shape else 1.0
+            for i, (eid, n) in enumerate(names)
+            for e, _ in effects
+            if e.id == eid
+        ]
+    )
+    centre = np.array(
+        [
+            0.0 if not _param(effects, nm).shape else np.log({e.id: th for e, th in effects}[nm[0]][nm[1]])
+            for nm in names
+        ]
+    )
 
     def unpack(v):
         filled = [(e, dict(th)) for e, th in effects]
         table = {e.id: th for e, th in filled}
         for (eid, name), value, s in zip(names, v[_N:], scale):
-            table[eid][name] = float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
+            table[eid][name] = (
+                float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
+            )
         return filled, Nuisance(float(v[0]), 0.0 if sliding else float(v[1]), float(v[2]), float(v[3]))
 
     weight = None
@@ -95,7 +117,9 @@ def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
     def function(v):
         r = comparison.residuals(*unpack(v))
         parts = [r[i].ravel() * np.sqrt(weight[i] / r[i].shape[1]) for i in keep]
-        penalty = np.concatenate([v[:_N] / PRIOR, (v[_N:] - centre) / prior]) if len(names) else v[:_N] / PRIOR
+        penalty = (
+            np.concatenate([v[:_N] / PRIOR, (v[_N:] - centre) / prior]) if len(names) else v[:_N] / PRIOR
+        )
         return np.concatenate([*parts, penalty])
 
     weight = np.ones(len(comparison.trajectories))
@@ -103,7 +127,15 @@ def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
         c = mean_square(comparison.residuals(*unpack(x)))
         weight = 1 / np.maximum(c, 0.5)
         out = least_squares(
-            function, x, bounds=bounds, method="trf", diff_step=1e-3, max_nfev=8 if round_ == 0 else 6, x_scale="jac", ftol=1e-5, xtol=1e-5
+            function,
+            x,
+            bounds=bounds,
+            method="trf",
+            diff_step=1e-3,
+            max_nfev=8 if round_ == 0 else 6,
+            x_scale="jac",
+            ftol=1e-5,
+            xtol=1e-5,
         )
         x = out.x
     filled, nuisance = unpack(x)
@@ -115,8 +147,16 @@ def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
     score = np.array([J[a:b].T @ r[a:b] for a, b in zip(edges[:-1], edges[1:])])
     n = len(keep)
     sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
-    covariance = np.maximum(np.diag(sandwich)[_N:], np.diag(bread)[_N:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)))
-    jacobian = np.array([1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]] for nm in names])
+    covariance = np.maximum(
+        np.diag(sandwich)[_N:],
+        np.diag(bread)[_N:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)),
+    )
+    jacobian = np.array(
+        [
+            1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]]
+            for nm in names
+        ]
+    )
     covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
     return Fit(filled, nuisance, names, covariance, float(out.cost))
 

@@ -13,7 +13,10 @@ _LEAST = 25.0  # nats: a weak line of a single electrode comes and goes in real 
 class Hum(RecordedEffect):
     id, name, stage, unit = "hum", "mains hum or another periodic disturbance", "A", "counts"
     physics = "A sin(2 pi f t): mains, its alias, or a machine"
-    params = {"amplitude": Parameter("counts", 0.3, 500, "1-10 counts"), "frequency": Parameter("Hz", 0.2, 2000, "up to half the rate")}
+    params = {
+        "amplitude": Parameter("counts", 0.3, 500, "1-10 counts"),
+        "frequency": Parameter("Hz", 0.2, 2000, "up to half the rate"),
+    }
     confusable = {"noise": "noise has no line in its spectrum"}
 
     def find(self, session):
@@ -38,8 +41,13 @@ class Hum(RecordedEffect):
         full[:, list(channels)] = w
         offset = np.flatnonzero(session.fit)[0]
         whole = (start, stop) == (0, len(x))
-        theta = {"frequency": f, "weights": full, "start": 0.0 if whole else (offset + start) / rate,
-                 "end": np.inf if stop == len(x) else (offset + stop) / rate, "origin": (offset + start) / rate}  # fmt: skip
+        theta = {
+            "frequency": f,
+            "weights": full,
+            "start": 0.0 if whole else (offset + start) / rate,
+            "end": np.inf if stop == len(x) else (offset + stop) / rate,
+            "origin": (offset + start) / rate,
+        }
         width = 0.5 / ((stop - start) / rate)
         parameters = {
             "frequency": (f, f - width / 2, f + width / 2),
@@ -50,8 +58,19 @@ class Hum(RecordedEffect):
             return []
         end = float(session.recording.time[-1]) if stop == len(x) else theta["end"]
         alias = "" if abs(f - 50) < 0.6 or abs(f - 60) < 0.6 else _alias(f, rate)
-        return [Finding(self, tuple(channels), theta, parameters, nats, theta["start"], end, float(np.exp(-min(nats, 700))),
-                        note=f"a line {strength:.0f} times above the spectrum around it{alias}")]  # fmt: skip
+        return [
+            Finding(
+                self,
+                tuple(channels),
+                theta,
+                parameters,
+                nats,
+                theta["start"],
+                end,
+                float(np.exp(-min(nats, 700))),
+                note=f"a line {strength:.0f} times above the spectrum around it{alias}",
+            )
+        ]
 
     @staticmethod
     def _line(x, rate):
@@ -80,7 +99,14 @@ class Hum(RecordedEffect):
         if not hits:
             return None
         top = max(hits)
-        channels = sorted({k for r, g, ch, _ in hits if abs(g - top[1]) < 1.5 * rate / size for k in (ch if len(ch) == 1 else ())})
+        channels = sorted(
+            {
+                k
+                for r, g, ch, _ in hits
+                if abs(g - top[1]) < 1.5 * rate / size
+                for k in (ch if len(ch) == 1 else ())
+            }
+        )
         common = [h for h in hits if len(h[2]) == 19 and abs(h[1] - top[1]) < 1.5 * rate / size]
         chosen = tuple(range(19)) if common or len(channels) > 12 else tuple(channels) or top[2]
         return top[0], top[1], chosen, segments
@@ -88,7 +114,9 @@ class Hum(RecordedEffect):
     def _wave(self, time, theta):
         on = (time >= theta["start"]) & (time < theta["end"])
         phase = 2 * np.pi * theta["frequency"] * (time - theta["origin"])
-        return on[:, None] * (np.sin(phase)[:, None] * theta["weights"][0] + np.cos(phase)[:, None] * theta["weights"][1])
+        return on[:, None] * (
+            np.sin(phase)[:, None] * theta["weights"][0] + np.cos(phase)[:, None] * theta["weights"][1]
+        )
 
     def apply(self, counts, time, channels, theta):
         return counts + self._wave(time, theta)
@@ -103,12 +131,18 @@ def _stretches(n, rate):
     out = [(0, n)]
     for parts in (2, 3, 4):
         edges = np.linspace(0, n, parts + 1).astype(int)
-        out += [(edges[i], edges[j]) for i in range(parts) for j in range(i + 1, parts + 1) if (i, j) != (0, parts)]
+        out += [
+            (edges[i], edges[j])
+            for i in range(parts)
+            for j in range(i + 1, parts + 1)
+            if (i, j) != (0, parts)
+        ]
     return [(a, b) for a, b in out if b - a >= least]
 
 
 def _when(x, rate, f, channels, start, stop):
-    """First and last row of the stretch about start..stop in which the line is there, from its amplitude in short windows."""
+    """First and last row of the stretch about start..stop in which the line is there, from its amplitude in
+    short windows."""
     size = int(max(64, min(2 * rate, (stop - start) // 6)))
     k = len(x) // size
     t = np.arange(size) / rate

@@ -1,4 +1,5 @@
-"""Loss of liquid and rough walls where they act: less liquid under the skin, another law of the film's conductance."""
+"""Loss of liquid and rough walls where they act: less liquid under the skin, another law of the film's
+conductance."""
 
 import numpy as np
 
@@ -12,7 +13,8 @@ _LONG = 1e6  # [s] rubber relaxes while the liquid goes
 
 
 class RoughFilm(FilmConduction):
-    """A film whose conductance goes as a power of its thickness: sigma h0 (h / h0)^power, h0 at rest, so that impedances at rest stay.
+    """A film whose conductance goes as a power of its thickness: sigma h0 (h / h0)^power, h0 at rest, so that
+    impedances at rest stay.
 
     Args:
       film: FilmConduction; power: 1 is a smooth film.

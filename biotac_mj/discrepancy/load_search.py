@@ -1,11 +1,12 @@
-"""Which effects act between force and electrodes: all are compared on the same measured force, and the best evidence wins.
+"""Which effects act between force and electrodes: all are compared on the same measured force, and the best
+evidence wins.
 
-The force sensor's reading is regressed on what the electrodes say (ln Z and squares and products of its six principal components; they know
-the place of the contact, force alone does not), ridge, cross-validated by contiguous blocks of time. An effect acts on the electrodes' side
-of the regression, so that it never changes what has to be explained, and adds at most one number per component. Both sides are smoothed
-alike, by 20 ms, which takes the electrodes' noise out of the comparison. Memory has a direction in time: an effect must beat itself run
-backwards.
-"""
+The force sensor's reading is regressed on what the electrodes say (ln Z and squares and products of its six
+principal components; they know the place of the contact, force alone does not), ridge, cross-validated by
+contiguous blocks of time. An effect acts on the electrodes' side of the regression, so that it never changes
+what has to be explained, and adds at most one number per component. Both sides are smoothed alike, by 20 ms,
+which takes the electrodes' noise out of the comparison. Memory has a direction in time: an effect must beat
+itself run backwards."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -17,16 +18,26 @@ from .recorded_effect import Finding
 
 __all__ = ["BETWEEN", "ForceView", "find_between"]
 
-_KINS = [Latency(), LoadLowPass()], [Relaxation(), Hysteresis()]  # one of each at most: what a law a little different leaves is no effect
+_KINS = (
+    [Latency(), LoadLowPass()],
+    [Relaxation(), Hysteresis()],
+)  # one of each at most: what a law a little different leaves is no effect
 BETWEEN = [effect for kin in _KINS for effect in kin]
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
 _RIDGE = 1e-4
 _ROWS = 4000
-_GAIN = {"latency": 0.03, "lowpass": 0.03, "relax": 0.06, "hyster": 0.06}  # least mean fall of a block's log mean square error
+_GAIN = {
+    "latency": 0.03,
+    "lowpass": 0.03,
+    "relax": 0.06,
+    "hyster": 0.06,
+}  # least mean fall of a block's log mean square error
 _FURTHER = 1.5  # times that beside another effect
 _P = 0.02
-_REMAINDER = 0.1  # of the other's gain that a second effect needs: what a law a little different leaves is no effect
+_REMAINDER = (
+    0.1  # of the other's gain that a second effect needs: what a law a little different leaves is no effect
+)
 _LEAST = 0.06  # fraction of a relaxation or a loop
 _TIE = 1.64  # standard errors, paired over blocks
 
@@ -35,7 +46,8 @@ class ForceView:
     """Cross-validated prediction of force from electrodes on some contiguous rows.
 
     Args:
-      counts: (n, 19); force: (n, 3) as the sensor said [N]; rows: (n,) bool, contiguous; usable: electrodes to use; rate: [Hz];
+      counts: (n, 19); force: (n, 3) as the sensor said [N]; rows: (n,) bool, contiguous; usable: electrodes
+        to use; rate: [Hz];
       chain: effects between force and electrodes that are known, list of (effect, theta).
     """
 
@@ -56,7 +68,8 @@ class ForceView:
         return gaussian_filter1d(x, _SMOOTH * self.rate, axis=0, mode="nearest")
 
     def errors(self, chain=()):
-        """(blocks, 3) logarithm of the mean square error of each block left out, with effects besides those known."""
+        """(blocks, 3) logarithm of the mean square error of each block left out, with effects besides those
+        known."""
         return self._score(*self._features([*self.chain, *chain]))[0]
 
     def explained(self):
@@ -90,7 +103,11 @@ class ForceView:
     def _here(self, theta):
         """Times of a theta counted from the view's first row."""
         begin = self.rows[0] / self.rate
-        return theta | {"start": max(theta["start"] - begin, 0.0), "end": theta["end"] - begin} if "start" in theta else theta
+        return (
+            theta | {"start": max(theta["start"] - begin, 0.0), "end": theta["end"] - begin}
+            if "start" in theta
+            else theta
+        )
 
     def loop(self, x, theta):
         """(rows, 3) elastic part of a play operator on what the electrodes say of the force."""
@@ -99,7 +116,8 @@ class ForceView:
         return _sided(lambda s, rate, t: play(s, width), said, self.rate, theta)
 
     def predict(self, x, loop=None):
-        """(rows, 3) force by columns (rows, q), each block from the others [N], a loop's part left out, and the loop's factor (3,)."""
+        """(rows, 3) force by columns (rows, q), each block from the others [N], a loop's part left out, and
+        the loop's factor (3,)."""
         A = np.concatenate([np.ones((len(x), 1)), x, *([] if loop is None else [loop])], axis=1)
         G, H, _ = self._products(A)
         q, out, factor = 1 + x.shape[1], np.empty(self.target.shape), np.zeros(3)
@@ -114,11 +132,15 @@ class ForceView:
     def _products(self, A):
         spans = list(zip(self.edges[:-1], self.edges[1:]))
         t = self.target
-        return (np.stack([A[a:b].T @ A[a:b] for a, b in spans]), np.stack([A[a:b].T @ t[a:b] for a, b in spans]),
-                np.stack([(t[a:b] ** 2).sum(0) for a, b in spans]))  # fmt: skip
+        return (
+            np.stack([A[a:b].T @ A[a:b] for a, b in spans]),
+            np.stack([A[a:b].T @ t[a:b] for a, b in spans]),
+            np.stack([(t[a:b] ** 2).sum(0) for a, b in spans]),
+        )
 
     def _score(self, x, loops, change=None, shares=(0.0,)):
-        """(shares, blocks, 3) log mean square error by columns x + share change and each component's loops, from one set of products."""
+        """(shares, blocks, 3) log mean square error by columns x + share change and each component's loops,
+        from one set of products."""
         q, more = x.shape[1], loops.shape[2]
         change = x[:, :0] if change is None else change
         G, H, T = self._products(np.concatenate([np.ones((len(x), 1)), x, *loops, change], axis=1))
@@ -142,7 +164,8 @@ class ForceView:
 
 
 def find_between(session) -> list:
-    """Findings between force and electrodes: the set of effects that predicts the force best on blocks left out, each one needed in it."""
+    """Findings between force and electrodes: the set of effects that predicts the force best on blocks left
+    out, each one needed in it."""
     view = session.force_view()
     if view is None:
         return []
@@ -169,7 +192,8 @@ def find_between(session) -> list:
     null = view.errors().mean()
 
     def choose(effects, chain):
-        """The effect of some that predicts best beside a chain, if its evidence is enough: list of none or one."""
+        """The effect of some that predicts best beside a chain, if its evidence is enough: list of none or
+        one."""
         without, options = view.errors(chain).mean(1), []
         least = _REMAINDER * (null - without.mean())
         for effect in effects:
@@ -210,7 +234,9 @@ def _finding(session, view, one, rest, best, gain):
     parameters, theta = _parameters(effect, theta, thetas, table)
     shortest = thetas[0].get("tau")
     if isinstance(effect, Relaxation) and parameters["tau"][1] < 1.2 * shortest and "hyster" not in ties:
-        ties.append("hyster")  # a memory as short as the movements: whether it fades or is worn off they do not show
+        ties.append(
+            "hyster"
+        )  # a memory as short as the movements: whether it fades or is worn off they do not show
     if isinstance(effect, Hysteresis):
         x = view._features([*view.chain, *rest])[0]
         theta["width"] = theta.pop("share") * view.predict(x)[0].std(0)
@@ -221,16 +247,29 @@ def _finding(session, view, one, rest, best, gain):
     seconds = session.fit.sum() / session.recording.rate
     # half the summed log-error ratio, per independent second of a block
     nats = float(0.5 * 3 * g.sum() * min(max(1.0, seconds / _BLOCKS), 20))
-    note = "; ".join(filter(None, [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"]))
+    note = "; ".join(
+        filter(
+            None,
+            [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"],
+        )
+    )
     last = float(session.recording.time[-1])
-    found = Finding(effect, tuple(range(19)), theta, parameters, nats, 0.0, last, sign_flip(g), tuple(ties), note)
+    found = Finding(
+        effect, tuple(range(19)), theta, parameters, nats, 0.0, last, sign_flip(g), tuple(ties), note
+    )
     if isinstance(effect, Latency):
-        _in_a_stretch(found, np.array([t["delay"] * view.rate for t in thetas]), table, session.recording.time[view.rows])
+        _in_a_stretch(
+            found,
+            np.array([t["delay"] * view.rate for t in thetas]),
+            table,
+            session.recording.time[view.rows],
+        )
     return found
 
 
 def _parameters(effect, theta, thetas, table):
-    """name -> (value, low, high) and theta with the refined value: bootstrap over blocks, at least the grid's spacing."""
+    """name -> (value, low, high) and theta with the refined value: bootstrap over blocks, at least the grid's
+    spacing."""
     rng = np.random.default_rng(0)
     draws = [table[:, rng.integers(0, _BLOCKS, _BLOCKS)].mean(1) for _ in range(200)]
     out = {}
@@ -243,7 +282,8 @@ def _parameters(effect, theta, thetas, table):
 
 
 def _profiled(values, score):
-    """Value with the least score, the least over the other parameters, between the tried ones; values (n,), score (n,)."""
+    """Value with the least score, the least over the other parameters, between the tried ones; values (n,),
+    score (n,)."""
     distinct = np.unique(values)
     axis = np.log(distinct) if distinct[0] > 0 else distinct
     profile = np.array([score[values == v].min() for v in distinct])
@@ -257,7 +297,8 @@ def _sided(act, x, rate, theta):
 
 
 def _left_out(G, H):
-    """Weights (blocks, q, components) fitted without each block, from products by blocks; ridge in units of each column's variance."""
+    """Weights (blocks, q, components) fitted without each block, from products by blocks; ridge in units of
+    each column's variance."""
     total = G.sum(0)
     ridge = _RIDGE * np.diag(total).copy()
     ridge[0] = 0
@@ -280,15 +321,23 @@ def _in_a_stretch(found, delays, table, time):
     a, b, inside, outside = part
     edges = time[np.minimum(np.arange(_BLOCKS + 1) * len(time) // _BLOCKS, len(time) - 1)]
     rate = (len(time) - 1) / (time[-1] - time[0])
-    found.theta.update(delay=inside / rate, start=edges[a], end=edges[b] if b < _BLOCKS else np.inf, otherwise=outside / rate)
+    found.theta.update(
+        delay=inside / rate, start=edges[a], end=edges[b] if b < _BLOCKS else np.inf, otherwise=outside / rate
+    )
     found.start, found.end = float(edges[a]), float(edges[b])
-    found.parameters = {"delay": (inside / rate, (inside - 1.5) / rate, (inside + 1.5) / rate),
-                        "delay_otherwise": (outside / rate, (outside - 1.5) / rate, (outside + 1.5) / rate)}  # fmt: skip
-    found.note += f"; {inside / rate * 1e3:.0f} ms from {edges[a]:.0f} s to {edges[b]:.0f} s, {outside / rate * 1e3:.0f} ms otherwise"
+    found.parameters = {
+        "delay": (inside / rate, (inside - 1.5) / rate, (inside + 1.5) / rate),
+        "delay_otherwise": (outside / rate, (outside - 1.5) / rate, (outside + 1.5) / rate),
+    }
+    found.note += (
+        f"; {inside / rate * 1e3:.0f} ms from {edges[a]:.0f} s to {edges[b]:.0f} s, "
+        f"{outside / rate * 1e3:.0f} ms otherwise"
+    )
 
 
 def _segment(delays, score):
-    """A stretch of blocks whose delay differs from the others': first, last + 1, delay inside, delay outside; or None."""
+    """A stretch of blocks whose delay differs from the others': first, last + 1, delay inside, delay outside;
+    or None."""
     nb = score.shape[1]
     one = score.sum(1).min()
     best = None
@@ -310,7 +359,12 @@ def _segment(delays, score):
     together = int(score.sum(1).argmin())
     better = np.where(rows, score[together] - score[i], score[together] - score[o])
     affected = better[np.abs(better) > 1e-12]
-    if abs(delays[i] - delays[o]) < 2 or len(affected) < 3 or (one - value) / nb < 0.02 or np.mean(affected > 0) < 0.8:
+    if (
+        abs(delays[i] - delays[o]) < 2
+        or len(affected) < 3
+        or (one - value) / nb < 0.02
+        or np.mean(affected > 0) < 0.8
+    ):
         return None
     if abs(delays[i]) < abs(delays[o]):  # what departs most from none is the effect
         if a == 0:

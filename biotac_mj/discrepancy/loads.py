@@ -1,8 +1,7 @@
 """Effects between force and electrodes: latency, low-pass, relaxation after a load change, hysteresis.
 
-Each says what a force sensor shows of the force that the electrodes follow (`unsee`) and the other way round (`see`). Which of them acts is
-decided for all together in `load_search.py`.
-"""
+Each says what a force sensor shows of the force that the electrodes follow (`unsee`) and the other way round
+(`see`). Which of them acts is decided for all together in `load_search.py`."""
 
 import abc
 
@@ -11,14 +10,26 @@ from scipy.signal import lfilter
 
 from .recorded_effect import Parameter, RecordedEffect
 
-__all__ = ["ForceEffect", "Hysteresis", "Latency", "LoadLowPass", "Relaxation", "force_features", "lagged", "play", "shift"]
+__all__ = [
+    "ForceEffect",
+    "Hysteresis",
+    "Latency",
+    "LoadLowPass",
+    "Relaxation",
+    "force_features",
+    "lagged",
+    "play",
+    "shift",
+]
 
 
 class ForceEffect(RecordedEffect):
-    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, its inverse `unsee`, and what is tried.
+    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, its inverse `unsee`,
+    and what is tried.
 
     Attributes:
-      arrow: whether the effect has to beat itself run backwards in time: what has no memory looks alike from both ends.
+      arrow: whether the effect has to beat itself run backwards in time: what has no memory looks alike from
+        both ends.
       linear: parameter that `unsee` is linear in, or None.
     """
 
@@ -27,7 +38,8 @@ class ForceEffect(RecordedEffect):
     linear = None
 
     def find(self, session):
-        """Nothing alone: effects between force and electrodes are compared with each other (`load_search.find_between`)."""
+        """Nothing alone: effects between force and electrodes are compared with each other
+        (`load_search.find_between`)."""
         return []
 
     @abc.abstractmethod
@@ -40,7 +52,8 @@ class ForceEffect(RecordedEffect):
 
     @abc.abstractmethod
     def unsee(self, force, rate, theta):
-        """(n, m) force that a sensor would have said from what the electrodes followed [N]: the inverse of `see`."""
+        """(n, m) force that a sensor would have said from what the electrodes followed [N]: the inverse of
+        `see`."""
 
     def note(self, theta):
         """What was seen, in words."""
@@ -93,7 +106,8 @@ class LoadLowPass(ForceEffect):
         return lagged(force, theta["tau"], rate)
 
     def unsee(self, force, rate, theta):
-        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify the electrodes' noise
+        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify the
+        # electrodes' noise
         return force + shift(force, -0.5 * theta["tau"] * rate) - shift(force, 0.5 * theta["tau"] * rate)
 
     def apply(self, counts, time, channels, theta):
@@ -102,17 +116,29 @@ class LoadLowPass(ForceEffect):
 
 class Relaxation(ForceEffect):
     id, name, stage = "relax", "relaxation after load changes", "C"
-    physics = "force answers a change of deformation at once and relaxes towards a part of it: G(t) = Ginf + G1 exp(-t / tau)"
+    physics = (
+        "force answers a change of deformation at once and relaxes towards a part of it: G(t) = Ginf "
+        "+ G1 exp(-t / tau)"
+    )
     params = {
         "fraction": Parameter("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),
         "tau": Parameter("s", 0.1, 60, "0.5 s and 4-7 s (PDC)"),
     }
-    confusable = {"hyster": "hold 0, 1 and 30 s at the same depth", "lowpass": "longer holds", "latency": "a tap"}
+    confusable = {
+        "hyster": "hold 0, 1 and 30 s at the same depth",
+        "lowpass": "longer holds",
+        "latency": "a tap",
+    }
     linear = "fraction"
 
     def tried(self, rate, seconds):
         fractions = (-0.25, -0.1, 0.08, 0.16, 0.3, 0.5)
-        return [{"fraction": g, "tau": t} for t in (0.3, 0.5, 0.9, 1.6, 2.8, 5, 9, 16) if t < seconds / 8 for g in fractions]
+        return [
+            {"fraction": g, "tau": t}
+            for t in (0.3, 0.5, 0.9, 1.6, 2.8, 5, 9, 16)
+            if t < seconds / 8
+            for g in fractions
+        ]
 
     def see(self, force, rate, theta):
         g, tau = theta["fraction"], theta["tau"]
@@ -122,12 +148,17 @@ class Relaxation(ForceEffect):
         return force + theta["fraction"] * (force - lagged(force, theta["tau"], rate))
 
     def note(self, theta):
-        return f"force {'overshoots' if theta['fraction'] > 0 else 'lags'} what the electrodes say and comes back"
+        return (
+            f"force {'overshoots' if theta['fraction'] > 0 else 'lags'} what the electrodes say and "
+            "comes back"
+        )
 
 
 class Hysteresis(ForceEffect):
     id, name, stage = "hyster", "rate-independent hysteresis", "C"
-    physics = "loading and unloading differ at equal electrodes, whatever the speed (Dahl, Prandtl-Ishlinskii)"
+    physics = (
+        "loading and unloading differ at equal electrodes, whatever the speed (Dahl, Prandtl-Ishlinskii)"
+    )
     params = {
         "fraction": Parameter("1", -1, 1, "loops of soft tactile sensors: 13-24 % of full scale"),
         "width": Parameter("N", 0.01, 5, "the record"),
@@ -135,7 +166,9 @@ class Hysteresis(ForceEffect):
     confusable = {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"}
 
     def tried(self, rate, seconds):
-        return [{"share": share} for share in (0.15, 0.3, 0.6, 1.2)]  # widths in standard deviations; the fraction is fitted
+        return [
+            {"share": share} for share in (0.15, 0.3, 0.6, 1.2)
+        ]  # widths in standard deviations; the fraction is fitted
 
     def see(self, force, rate, theta):
         return force - theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
@@ -178,4 +211,6 @@ def force_features(force):
     normal = np.where(np.abs(force[:, 2]) < 0.2, 0.2 * np.where(force[:, 2] < 0, -1, 1), force[:, 2])
     x = np.concatenate([force, np.clip(force[:, :2] / normal[:, None], -3, 3)], axis=1)
     i, j = np.triu_indices(3)
-    return np.concatenate([np.ones((len(x), 1)), x, x[:, i] * x[:, j], x[:, 3:] * x[:, 2:3], x[:, 3:] ** 2], axis=1)
+    return np.concatenate(
+        [np.ones((len(x), 1)), x, x[:, i] * x[:, j], x[:, 3:] * x[:, 2:3], x[:, 3:] ** 2], axis=1
+    )

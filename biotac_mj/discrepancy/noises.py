@@ -1,8 +1,8 @@
 """Effects that the noise shows: low-pass filtering, cross-talk, an electrode noisier than it should be.
 
-Noise of a real unloaded sensor is white and independent between electrodes (docs/sensor.md), so its colour and its correlations are the
-electronics'. Third differences take the load out; windows in which the load moves least are used.
-"""
+Noise of a real unloaded sensor is white and independent between electrodes (docs/sensor.md), so its colour
+and its correlations are the electronics'. Third differences take the load out; windows in which the load
+moves least are used."""
 
 import numpy as np
 from scipy.optimize import brentq
@@ -11,14 +11,26 @@ from .recorded_effect import Finding, Parameter, RecordedEffect, spans
 
 __all__ = ["CommonNoise", "CrossTalk", "LowPass", "Noise"]
 
-_LOADED = 90.0  # nats of cross-talk under load: skin that moves correlates electrodes too, up to 84 nats of pairs (practice seeds)
+# nats of cross-talk under load: skin that moves correlates electrodes too, up to 84 nats of pairs (practice
+# seeds)
+_LOADED = 90.0
 _THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _WINDOWS = 24
 _ELECTRODES_MM = {  # Lin et al. 2013, in the sensor's frame [mm]; E11..E16 mirror E1..E6
-    1: (0.993, -4.855, -1.116), 2: (-2.7, -3.513, -3.67), 3: (-6.2, -3.513, -3.67), 4: (-8, -4.956, -1.116), 5: (-10.5, -3.513, -3.67),
-    6: (-13.4, -4.956, -1.116), 7: (4.763, 0, -2.33), 8: (3.031, -1.95, -3.33), 9: (3.031, 1.95, -3.33), 10: (1.299, 0, -4.33),
-    17: (-2.8, 0, -5.08), 18: (-9.8, 0, -5.08), 19: (-13.6, 0, -5.08),
-}  # fmt: skip
+    1: (0.993, -4.855, -1.116),
+    2: (-2.7, -3.513, -3.67),
+    3: (-6.2, -3.513, -3.67),
+    4: (-8, -4.956, -1.116),
+    5: (-10.5, -3.513, -3.67),
+    6: (-13.4, -4.956, -1.116),
+    7: (4.763, 0, -2.33),
+    8: (3.031, -1.95, -3.33),
+    9: (3.031, 1.95, -3.33),
+    10: (1.299, 0, -4.33),
+    17: (-2.8, 0, -5.08),
+    18: (-9.8, 0, -5.08),
+    19: (-13.6, 0, -5.08),
+}
 
 
 def electrode_positions():
@@ -28,7 +40,8 @@ def electrode_positions():
 
 
 def windows(session, rows=None):
-    """Third differences (without repeated rows) cut into windows: list of (first time, last time, (n, 19))."""
+    """Third differences (without repeated rows) cut into windows: list of (first time, last time, (n,
+    19))."""
     recording = session.recording
     where = np.flatnonzero((session.fit if rows is None else rows) & ~recording.repeated)
     x = session.counts[where]
@@ -42,7 +55,8 @@ def windows(session, rows=None):
 
 
 def differenced_correlation(pole):
-    """Lag-1 autocorrelation of the third differences of noise with an exponential autocorrelation pole^|h|."""
+    """Lag-1 autocorrelation of the third differences of noise with an exponential autocorrelation
+    pole^|h|."""
     c = np.convolve(_THIRD, _THIRD[::-1])
     lags = np.arange(-3, 4)
     zero = (c * pole ** np.abs(lags)).sum()
@@ -55,7 +69,11 @@ def pole_of(correlation):
     white, stiff = differenced_correlation(0.0), differenced_correlation(0.995)
     if not white < correlation:
         return 0.0
-    return 0.995 if correlation >= stiff else brentq(lambda a: differenced_correlation(a) - correlation, 0.0, 0.995)
+    return (
+        0.995
+        if correlation >= stiff
+        else brentq(lambda a: differenced_correlation(a) - correlation, 0.0, 0.995)
+    )
 
 
 def _lag_one(d):
@@ -118,7 +136,16 @@ class LowPass(RecordedEffect):
         middle = np.nanmedian(single)
         for k in range(19):
             if np.isfinite(single[k]) and single[k] > max(limit, middle + 0.12):
-                found.append(self._finding(session, value[calm][:, [k]], (k,), float(edges[0]), float(session.recording.time[-1]), edges))
+                found.append(
+                    self._finding(
+                        session,
+                        value[calm][:, [k]],
+                        (k,),
+                        float(edges[0]),
+                        float(session.recording.time[-1]),
+                        edges,
+                    )
+                )
         return found[:1]
 
     def _finding(self, session, value, channels, start, end, edges):
@@ -137,8 +164,17 @@ class LowPass(RecordedEffect):
             "end": end + 1e9 * (end >= r.time[-1] - 1e-9),
             "rate": r.rate,
         }
-        return Finding(self, channels, theta, {"tau": (tau[0], tau[1], tau[2])}, nats, theta["start"], end, float(np.exp(-min(nats, 700))),
-                       note=f"correlation of neighbouring noise samples {pole:.2f}, white is 0")  # fmt: skip
+        return Finding(
+            self,
+            channels,
+            theta,
+            {"tau": (tau[0], tau[1], tau[2])},
+            nats,
+            theta["start"],
+            end,
+            float(np.exp(-min(nats, 700))),
+            note=f"correlation of neighbouring noise samples {pole:.2f}, white is 0",
+        )
 
     def apply(self, counts, time, channels, theta):
         from scipy.signal import lfilter
@@ -154,8 +190,14 @@ class LowPass(RecordedEffect):
 
 class CrossTalk(RecordedEffect):
     id, name, stage, unit = "crosstalk", "cross-talk between electrodes", "A", "mean correlation of noise"
-    physics = "V = (I + kappa K) U: part of the neighbours' signal and noise is added, neighbours in space or in the multiplexer's order"
-    params = {"kappa": Parameter("1", 0.005, 0.5, "0-0.2"), "length": Parameter("mm", 1, 12, "2-6 mm, spacing of the electrodes")}
+    physics = (
+        "V = (I + kappa K) U: part of the neighbours' signal and noise is added, neighbours in space "
+        "or in the multiplexer's order"
+    )
+    params = {
+        "kappa": Parameter("1", 0.005, 0.5, "0-0.2"),
+        "length": Parameter("mm", 1, 12, "2-6 mm, spacing of the electrodes"),
+    }
     confusable = {"gain": "drive one electrode alone", "common_noise": "cross-talk falls off with distance"}
 
     def find(self, session):
@@ -164,7 +206,8 @@ class CrossTalk(RecordedEffect):
             return []
         corr, n = result
         off = corr[np.triu_indices(19, 1)]
-        # Movement correlates too, but more where it is livelier; cross-talk of the noise is there all the same.
+        # Movement correlates too, but more where it is livelier; cross-talk of the noise is there all the
+        # same.
         lively = self._correlation(session, share=1.0)[0][np.triu_indices(19, 1)]
         if np.sqrt((off**2).mean()) < 0.75 * np.sqrt((lively**2).mean()):
             return []
@@ -200,24 +243,39 @@ class CrossTalk(RecordedEffect):
                     if i != j and abs(corr[i, j]) > 0.1:
                         K[i, j] = corr[i, j] / corr[a, b]
         half = 2 / np.sqrt(n)
-        theta = {"kappa": value, "matrix": np.eye(19) + value * K, "centre": np.median(session.counts[session.fit], axis=0)}
+        theta = {
+            "kappa": value,
+            "matrix": np.eye(19) + value * K,
+            "centre": np.median(session.counts[session.fit], axis=0),
+        }
         nats = min(0.5 * n * float(np.nansum((2 * value * K[np.triu_indices(19, 1)]) ** 2)), 1e4)
         if session.timeline().loaded and nats < _LOADED:
             return []
         parameters = {"kappa": (value, value - half, value + half)}
         if pattern.startswith("distance"):
             parameters["length"] = (float(pattern.split()[1]), np.nan, np.nan)
-        note = f"noise of neighbours ({pattern}) is correlated by {2 * value:.2f}; a sensor's is independent (0.00)"
+        note = (
+            f"noise of neighbours ({pattern}) is correlated by {2 * value:.2f}; a sensor's is "
+            "independent (0.00)"
+        )
         return [
             Finding(
-                self, channels, theta, parameters, nats, 0.0, float(session.recording.time[-1]), float(np.exp(-min(nats, 700))), note=note
+                self,
+                channels,
+                theta,
+                parameters,
+                nats,
+                0.0,
+                float(session.recording.time[-1]),
+                float(np.exp(-min(nats, 700))),
+                note=note,
             )
         ]
 
     @staticmethod
     def _correlation(session, rows=None, share=None):
-        """Correlation (19, 19) of fifth differences in the quietest share of windows of 40 rows, and how many independent samples made
-        it."""
+        """Correlation (19, 19) of fifth differences in the quietest share of windows of 40 rows, and how many
+        independent samples made it."""
         recording = session.recording
         share = (0.3 if session.timeline().loaded else 1.0) if share is None else share
         where = np.flatnonzero((session.fit if rows is None else rows) & ~recording.repeated)
@@ -253,7 +311,12 @@ class CrossTalk(RecordedEffect):
 
 
 class CommonNoise(RecordedEffect):
-    id, name, stage, unit = "common_noise", "noise common to all channels (reference, supply)", "A", "mean correlation of noise"
+    id, name, stage, unit = (
+        "common_noise",
+        "noise common to all channels (reference, supply)",
+        "A",
+        "mean correlation of noise",
+    )
     physics = "one noise is added to every channel"
     params = {"correlation": Parameter("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}
@@ -268,13 +331,27 @@ class CommonNoise(RecordedEffect):
         if middle < 0.15 or middle < 1.0 * spread:
             return []
         nats = min(0.5 * n * middle**2 * 19, 1e4)
-        return [Finding(self, tuple(range(19)), {}, {"correlation": (middle, middle - 2 / np.sqrt(n), middle + 2 / np.sqrt(n))}, nats, 0.0,
-                        float(session.recording.time[-1]), float(np.exp(-min(nats, 700))), note="all pairs alike")]  # fmt: skip
+        return [
+            Finding(
+                self,
+                tuple(range(19)),
+                {},
+                {"correlation": (middle, middle - 2 / np.sqrt(n), middle + 2 / np.sqrt(n))},
+                nats,
+                0.0,
+                float(session.recording.time[-1]),
+                float(np.exp(-min(nats, 700))),
+                note="all pairs alike",
+            )
+        ]
 
 
 class Noise(RecordedEffect):
     id, name, stage, unit = "noise", "excess noise of single electrodes", "A", "times the law"
-    physics = "an electrode's white noise is larger than the law min(15.8 (1 - E/4095), 6.6) counts scaled to the other electrodes"
+    physics = (
+        "an electrode's white noise is larger than the law min(15.8 (1 - E/4095), 6.6) counts scaled "
+        "to the other electrodes"
+    )
     params = {"factor": Parameter("1", 1.8, 100, "a real sensor follows the law within 20 %")}
     confusable = {"hum": "a line in the spectrum", "spikes": "single samples"}
 
@@ -297,15 +374,30 @@ class Noise(RecordedEffect):
             if own > 2.5:
                 start, end = float(edges[0]), float(session.recording.time[-1])
             else:
-                long = spans(excess > 2.5 * max(np.quantile(excess, 0.25), 0.3), edges, least=3) if not session.timeline().loaded else []
+                long = (
+                    spans(excess > 2.5 * max(np.quantile(excess, 0.25), 0.3), edges, least=3)
+                    if not session.timeline().loaded
+                    else []
+                )
                 if not long:
                     continue
                 start, end = long[0]
                 own = float(np.median(excess[(edges[:-1] >= start - 1e-9) & (edges[1:] <= end + 1e-9)]))
             n = len(cuts) * 60
             nats = min(0.1 * n * np.log(own) ** 2, 1e4)
-            found.append(Finding(self, (int(k),), {}, {"factor": (float(own), np.nan, np.nan)}, nats, start, end, float(np.exp(-min(nats, 700))),  # noqa: E501
-                                 note=f"{own:.1f} times as noisy as the other electrodes' law"))  # fmt: skip
+            found.append(
+                Finding(
+                    self,
+                    (int(k),),
+                    {},
+                    {"factor": (float(own), np.nan, np.nan)},
+                    nats,
+                    start,
+                    end,
+                    float(np.exp(-min(nats, 700))),  # noqa: E501
+                    note=f"{own:.1f} times as noisy as the other electrodes' law",
+                )
+            )
         return found
 
 

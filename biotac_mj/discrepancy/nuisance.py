@@ -1,7 +1,8 @@
-"""What is never quite known about the base model and is fitted with every effect, so that none of it takes an effect's name.
+"""What is never quite known about the base model and is fitted with every effect, so that none of it takes an
+effect's name.
 
-Modulus and friction; the width of the contact's footprint on the electrodes; how far the answer lies between this mesh and another one.
-"""
+Modulus and friction; the width of the contact's footprint on the electrodes; how far the answer lies between
+this mesh and another one."""
 
 import dataclasses
 import functools
@@ -13,13 +14,17 @@ __all__ = ["HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 # In the order of Nuisance's fields: standard deviations of the prior, bounds.
 PRIOR = np.array([0.4, 0.4, 0.05, 0.7])
 LOW, HIGH = np.array([-1.5, -1.5, -0.2, -1.0]), np.array([1.5, 1.5, 0.2, 2.0])
-OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}  # measured on the condensed tier, whose price is seconds
+OTHER_MESH = {
+    "coarse": "default",
+    "default": "coarse",
+    "fine": "default",
+}  # measured on the condensed tier, whose price is seconds
 
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its neighbourhood shows; mesh: 0 this mesh,
-    1 the other."""
+    """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its
+    neighbourhood shows; mesh: 0 this mesh, 1 the other."""
 
     log_modulus: float = 0.0
     log_friction: float = 0.0

@@ -1,6 +1,8 @@
-"""Diagnosis of plain recordings: what the sensor's model misses, found on the first part, checked on the part kept aside.
+"""Diagnosis of plain recordings: what the sensor's model misses, found on the first part, checked on the part
+kept aside.
 
-The model is amended step by step: faults of samples, then noise, then what develops over time, then what lies between force and electrodes;
+The model is amended step by step: faults of samples, then noise, then what develops over time, then what lies
+  between force and electrodes;
 each round takes the effect with the most evidence, takes it out of the recording and looks again.
 """
 
@@ -22,13 +24,35 @@ from .recording import Recording
 
 __all__ = ["EFFECTS", "RecordingDiagnosis", "diagnose_recording"]
 
-EFFECTS = [Quantise(), Freeze(), Stuck(), Saturate(), Spikes(), Swap(), Hum(), LowPass(), CrossTalk(), CommonNoise(), Noise(), SharedGain(),
-           CountOffset(), CountGain(), Thermal(), Drift(), GainChange(), *BETWEEN]  # fmt: skip
+EFFECTS = [
+    Quantise(),
+    Freeze(),
+    Stuck(),
+    Saturate(),
+    Spikes(),
+    Swap(),
+    Hum(),
+    LowPass(),
+    CrossTalk(),
+    CommonNoise(),
+    Noise(),
+    SharedGain(),
+    CountOffset(),
+    CountGain(),
+    Thermal(),
+    Drift(),
+    GainChange(),
+    *BETWEEN,
+]
 _COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
 _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
 _MOVING = [EFFECTS[5], *EFFECTS[11:17]]
 _MOST = 8
-_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = 43 / 44, 17 / 19, 2 / 5  # confidence: of 42, 17 and 3 names 42, 16 and 1 right
+_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = (
+    43 / 44,
+    17 / 19,
+    2 / 5,
+)  # confidence: of 42, 17 and 3 names 42, 16 and 1 right
 
 
 @dataclasses.dataclass
@@ -36,9 +60,11 @@ class RecordingDiagnosis:
     """What was found.
 
     Attributes:
-      recording; locked: share kept aside at the end; verdict: one line; findings: accepted, the strongest first; rejected: those that the
-      part kept aside does not confirm; where: list of cells (channel, from, to, z, p); gap: dict of views with before and after;
-      remainder: dict that describes what is left; notes: what the data cannot tell; session: counts without the effects;
+      recording; locked: share kept aside at the end; verdict: one line; findings: accepted, the strongest
+      first; rejected: those that the part kept aside does not confirm; where: list of cells (channel, from,
+      to, z, p); gap: dict of views with before and after;
+      remainder: dict that describes what is left; notes: what the data cannot tell; session: counts without
+        the effects;
       events: (electrode, second) -> counts by which it left the others for a few seconds.
     """
 
@@ -55,7 +81,9 @@ class RecordingDiagnosis:
     events: dict = dataclasses.field(default_factory=dict)
 
 
-def diagnose_recording(recording: Recording, locked: float | None = None, effects=(), progress: bool = False) -> RecordingDiagnosis:
+def diagnose_recording(
+    recording: Recording, locked: float | None = None, effects=(), progress: bool = False
+) -> RecordingDiagnosis:
     """Finds what the model misses in one recording.
 
     Args:
@@ -78,7 +106,9 @@ def diagnose_recording(recording: Recording, locked: float | None = None, effect
         late = _late(session, effects)
         bar.update()
         rejected = statistics(session)
-        result = RecordingDiagnosis(recording, locked, "", session.findings, rejected, [], {}, {}, [], session, session.events)
+        result = RecordingDiagnosis(
+            recording, locked, "", session.findings, rejected, [], {}, {}, [], session, session.events
+        )
         _settle(result, late)
         result.where = cells(session)
         result.gap = gap(result.session, [f for f in result.session.findings if f not in late], late)
@@ -110,12 +140,17 @@ def _search(session, effects, bar):
         chosen = _choose(session, candidates)
         if chosen is None:
             break
-        alike = [f for f in session.findings if f.theta.get("kind") in ("step", "pulse") and f.channels == chosen.channels]
+        alike = [
+            f
+            for f in session.findings
+            if f.theta.get("kind") in ("step", "pulse") and f.channels == chosen.channels
+        ]
         if len(alike) >= 2 and chosen.theta.get("kind") in ("step", "pulse"):
             # One jump is an event, jumps again and again are a behaviour that no effect here describes.
             session.give_up(
                 alike,
-                f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} goes up and down again and again",
+                f"the level {'of all electrodes' if len(chosen.channels) > 12 else 'of one electrode'} goes "
+                "up and down again and again",
             )
             break
         session.accept(chosen)
@@ -123,7 +158,9 @@ def _search(session, effects, bar):
     filters = [f.theta["tau"] for f in session.findings if f.id == "lowpass" and len(f.channels) > 12]
     for finding in find_between(session):
         # A low-pass that coloured the noise was named already, and it delays by its own time constant.
-        known = filters and (finding.id == "lowpass" or finding.id == "latency" and 0 < finding.theta["delay"] < 2 * filters[0])
+        known = filters and (
+            finding.id == "lowpass" or finding.id == "latency" and 0 < finding.theta["delay"] < 2 * filters[0]
+        )
         if not known:
             session.accept(finding)
     bar.update()
@@ -132,14 +169,17 @@ def _search(session, effects, bar):
 def _choose(session, candidates):
     """The strongest; common patterns are told apart by how well they fit, and tied where they fit alike."""
     if session.timeline().loaded and not any(f.id == "warmup" for f in candidates):
-        candidates = [f for f in candidates if not f.id.startswith("count_")]  # under load they are no more than ties of a shared gain
+        candidates = [
+            f for f in candidates if not f.id.startswith("count_")
+        ]  # under load they are no more than ties of a shared gain
     if not candidates:
         return None
     best = max(candidates, key=lambda f: f.nats)
     common = [f for f in candidates if f.id in _COMMON]
     if common and not session.timeline().loaded:
         best = max(common, key=lambda f: f.nats)  # its pattern was checked electrode by electrode
-    # A change of one electrode leaks into the common pattern and the other way round; the matched one has more energy.
+    # A change of one electrode leaks into the common pattern and the other way round; the matched one has
+    # more energy.
     if session.timeline().loaded and common and best.id in ("drift", "gain"):
         rival = max(common, key=lambda f: f.nats)
         if best.id == "gain" or _energy(session, rival) > _energy(session, best):
@@ -153,7 +193,9 @@ def _choose(session, candidates):
         if patterns:
             order = sorted(patterns, key=lambda f: f.theta["misfit"])
             loaded = session.timeline().loaded
-            slack = 12.0 if not loaded else 40.0  # loaded, nearly parallel patterns are told apart by nothing but the load's remains
+            slack = (
+                12.0 if not loaded else 40.0
+            )  # loaded, nearly parallel patterns are told apart by nothing but the load's remains
             best = order[0]
             near = [f for f in order if f.theta["misfit"] - order[0].theta["misfit"] < slack]
             preferred = [f for f in (patterns if loaded else near) if f.id == "warmup"]
@@ -185,7 +227,9 @@ def _late(session, effects):
     whole.findings = list(session.findings)
     for effect in _FAULTS:
         for finding in effect.find(whole):
-            known = [f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)]
+            known = [
+                f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)
+            ]
             if known:  # the same fault goes on: its samples are masked, it is no second finding
                 whole.accept(finding)
                 session.masked |= whole.masked
@@ -199,7 +243,9 @@ def _late(session, effects):
     for _ in range(4):
         candidates = [f for effect in (*_MOVING, *_NOISE[:1], *effects) for f in effect.find(whole)]
         known = {(f.id, f.channels) for f in session.findings}
-        candidates = [f for f in candidates if (f.id, f.channels) not in known]  # an extrapolation that is a little off is no new effect
+        candidates = [
+            f for f in candidates if (f.id, f.channels) not in known
+        ]  # an extrapolation that is a little off is no new effect
         if session.unnamed:
             candidates = [f for f in candidates if f.theta.get("kind") not in ("step", "pulse")]
         if any(f.id in _COMMON for f in session.findings):
@@ -207,7 +253,9 @@ def _late(session, effects):
         if whole.timeline().loaded:  # nothing is left to confirm them, so they must be plain
             candidates = [f for f in candidates if f.id not in ("gain", "drift", *_COMMON) or f.nats > 80]
         candidates = [f for f in candidates if f.start >= begin - 0.02 * session.recording.time[-1]]
-        chosen = _choose(whole, [f for f in candidates if f.id != "hum"]) or next((f for f in candidates if f.id == "hum"), None)
+        chosen = _choose(whole, [f for f in candidates if f.id != "hum"]) or next(
+            (f for f in candidates if f.id == "hum"), None
+        )
         if chosen is None:
             break
         whole.accept(chosen)
@@ -237,10 +285,11 @@ def _settle(result, late):
 
 
 def _confidence(finding, loaded):
-    """How often such a name, or one of its ties, was right on the benchmark's practice recordings (Laplace's rule).
+    """How often such a name, or one of its ties, was right on the benchmark's practice recordings (Laplace's
+    rule).
 
-    Under load what one electrode does against the others is told less surely; what no row kept aside could confirm least.
-    """
+    Under load what one electrode does against the others is told less surely; what no row kept aside could
+    confirm least."""
     moving = isinstance(finding.effect, (TimeShaped, GainChange))
     if finding.verified is None and moving:
         return _UNCHECKED
@@ -254,25 +303,41 @@ def _notes(result):
     notes = [f"rate {r.rate:.1f} Hz ({r.rate_source})"]
     for (k, second), counts in sorted(result.events.items(), key=lambda item: -item[1])[:3]:
         notes.append(
-            f"e{k + 1} leaves the others at {second} s by {counts:.0f} counts and comes back: a place pressed only then or a loose contact; press it again there"  # noqa: E501
+            f"e{k + 1} leaves the others at {second} s by {counts:.0f} counts and comes back: a place "
+            "pressed only then or a loose contact; press it again there"  # noqa: E501
         )
     if r.force is None:
-        notes.append("no force: latency, relaxation and hysteresis against the load cannot be known; give --force to see them")
+        notes.append(
+            "no force: latency, relaxation and hysteresis against the load cannot be known; give --force to "
+            "see them"
+        )
     elif result.session.force_view() is None:
-        notes.append("the electrodes do not predict the force (or it does not change): nothing between force and electrodes can be known")
+        notes.append(
+            "the electrodes do not predict the force (or it does not change): nothing between force and "
+            "electrodes can be known"
+        )
     if r.tdc is None:
-        notes.append("no TDC: a change with temperature cannot be told from one with time; give --tdc, or switch the heater off and on")
+        notes.append(
+            "no TDC: a change with temperature cannot be told from one with time; give --tdc, or switch the "
+            "heater off and on"
+        )
     if line.loaded:
         notes.append(
-            "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole record cannot be told from its calibration"  # noqa: E501
+            "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole "
+            "record cannot be told from its calibration"  # noqa: E501
         )
         if r.force is not None and not (np.linalg.norm(r.force, axis=1) < 0.1).any():
-            notes.append("no free segment: the rest values cannot be checked; leave the sensor untouched at both ends")
+            notes.append(
+                "no free segment: the rest values cannot be checked; leave the sensor untouched at both ends"
+            )
     else:
-        notes.append("the sensor is not loaded: gains, saturation and cross-talk of signals cannot be known; press it")
+        notes.append(
+            "the sensor is not loaded: gains, saturation and cross-talk of signals cannot be known; press it"
+        )
     if r.rest_correlation < 0.5:
         notes.append(
-            f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published sensors (0.9 among them): check the channels' order"  # noqa: E501
+            f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published "
+            "sensors (0.9 among them): check the channels' order"  # noqa: E501
         )
     return notes
 

@@ -1,4 +1,5 @@
-"""What an effect on plain recordings is: found in a `Session`, applied to clean counts, taken out of measured ones."""
+"""What an effect on plain recordings is: found in a `Session`, applied to clean counts, taken out of measured
+ones."""
 
 import abc
 import dataclasses
@@ -10,7 +11,14 @@ from .timeline import Timeline
 
 __all__ = ["Finding", "Parameter", "RecordedEffect", "Session", "runs", "spans"]
 
-STAGES = {"C": "constitutive", "B": "boundary", "K": "contact", "T": "transduction", "A": "acquisition", "S": "set-up"}
+STAGES = {
+    "C": "constitutive",
+    "B": "boundary",
+    "K": "contact",
+    "T": "transduction",
+    "A": "acquisition",
+    "S": "set-up",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,9 +38,11 @@ class Finding:
     Attributes:
       effect: RecordedEffect. channels: electrode numbers from 0. theta: what `apply` and `correct` need.
       parameters: name -> (value, low, high) to report; low and high are nan where no interval is known.
-      nats: evidence, log-likelihood of effectively independent samples less the price of the parameters. p: of the test, blocks in time.
+      nats: evidence, log-likelihood of effectively independent samples less the price of the parameters. p:
+        of the test, blocks in time.
       start, end: [s] when it acts. ties: ids that fit as well. note: in words.
-      statistic: name, unit and value of the number that diagnoses the effect, before and after, on the part kept aside.
+      statistic: name, unit and value of the number that diagnoses the effect, before and after, on the part
+        kept aside.
       verified: whether the part kept aside confirms it; None if it could not be checked. confidence: 0..1.
     """
 
@@ -64,8 +74,8 @@ class Finding:
 class RecordedEffect(abc.ABC):
     """One effect that recordings alone can show.
 
-    Subclasses set id, name, stage (of STAGES), physics, params (name -> Parameter) and confusable (id -> what would tell them apart) and
-    write
+    Subclasses set id, name, stage (of STAGES), physics, params (name -> Parameter) and confusable (id -> what
+    would tell them apart) and write
 
       find(session) -> list of Finding: on the rows `session.fit` only;
       apply(counts, time, channels, theta): counts (n, 19) as the effect changes them;
@@ -129,12 +139,17 @@ class Session:
         return self._view or None
 
     def force_view_of(self, rows):
-        """ForceView of contiguous rows (n,) bool with what was found between force and electrodes, or None with too few electrodes."""
+        """ForceView of contiguous rows (n,) bool with what was found between force and electrodes, or None
+        with too few electrodes."""
         from .load_search import ForceView
 
         usable = np.flatnonzero(~(self.masked[rows].mean(0) > 0.02))
         chain = [(f.effect, f.theta) for f in self.findings if hasattr(f.effect, "see")]
-        return ForceView(self.counts, self.recording.force, rows, usable, self.recording.rate, chain) if len(usable) >= 6 else None
+        return (
+            ForceView(self.counts, self.recording.force, rows, usable, self.recording.rate, chain)
+            if len(usable) >= 6
+            else None
+        )
 
     def timeline(self, rows=None, counts=None) -> Timeline:
         """Bins of the rows to fit, or of others (a slice, contiguous)."""
@@ -149,7 +164,11 @@ class Session:
     @property
     def known_jumps(self):
         """Times [s] of the jumps found so far, swaps among them."""
-        steps = [f for f in self.findings if f.id == "swap" or f.theta.get("kind") in ("step", "pulse") or f.id == "gain"]
+        steps = [
+            f
+            for f in self.findings
+            if f.id == "swap" or f.theta.get("kind") in ("step", "pulse") or f.id == "gain"
+        ]
         return [t for f in steps for t in (f.start, f.end) if 0 < t < self.recording.time[-1]]
 
     def accept(self, finding):
@@ -187,8 +206,13 @@ def runs(x):
 
 
 def spans(flag, edges, least=2):
-    """Contiguous stretches [s] of windows that are True; edges (w + 1,) [s]. One window missing inside a stretch is bridged."""
+    """Contiguous stretches [s] of windows that are True; edges (w + 1,) [s]. One window missing inside a
+    stretch is bridged."""
     flag = np.asarray(flag, bool).copy()
     flag[1:-1] |= flag[:-2] & flag[2:]
     starts, lengths = runs(flag.astype(int))
-    return [(float(edges[s]), float(edges[s + n])) for s, n in zip(starts, lengths) if flag[s] and n >= min(least, len(flag))]
+    return [
+        (float(edges[s]), float(edges[s + n]))
+        for s, n in zip(starts, lengths)
+        if flag[s] and n >= min(least, len(flag))
+    ]

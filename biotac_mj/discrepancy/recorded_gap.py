@@ -1,4 +1,5 @@
-"""Before and after, on the part kept aside: of each finding by the number that shows it, and of the whole model in counts and newtons."""
+"""Before and after, on the part kept aside: of each finding by the number that shows it, and of the whole
+model in counts and newtons."""
 
 import numpy as np
 
@@ -13,7 +14,8 @@ __all__ = ["gap", "statistics"]
 
 
 def statistics(session) -> list:
-    """Fills `statistic` and `verified` of every finding; returns those that the part kept aside contradicts."""
+    """Fills `statistic` and `verified` of every finding; returns those that the part kept aside
+    contradicts."""
     for finding in session.findings:
         others = [f for f in session.findings if f is not finding]
         without = _replay(session, others)
@@ -54,7 +56,11 @@ def _compare(finding, without, both):
         name, unit = "RMS correlation of noise between electrodes", "1"
     elif isinstance(effect, LowPass):
         cuts = windows(without, rows)
-        value = float(np.nanmedian([np.nanmedian(_lag_one(c[2])[list(finding.channels)]) for c in quiet(cuts)])) if cuts else np.nan
+        value = (
+            float(np.nanmedian([np.nanmedian(_lag_one(c[2])[list(finding.channels)]) for c in quiet(cuts)]))
+            if cuts
+            else np.nan
+        )
         values = [value, -0.75]
         name, unit = "lag-1 correlation of third differences (white: -0.75)", "1"
         return {"name": name, "unit": unit, "before": value, "after": -0.75, "part": place}, (
@@ -68,9 +74,16 @@ def _compare(finding, without, both):
     else:
         flags = finding.effect.mask(recording.electrodes, recording.time, finding)
         share = float(flags[rows].any(1).mean()) if flags is not None else np.nan
-        return {"name": "share of rows affected", "unit": "1", "before": share, "after": 0.0, "part": place}, None if not active else True
+        return {
+            "name": "share of rows affected",
+            "unit": "1",
+            "before": share,
+            "after": 0.0,
+            "part": place,
+        }, None if not active else True
     before, after = values
-    # Under load the others predict an electrode to some per cent: a gain must do better than chance improvements.
+    # Under load the others predict an electrode to some per cent: a gain must do better than chance
+    # improvements.
     verified = None if not active else bool(after < (0.92 if effect.id == "gain" else 1.0) * before)
     return {"name": name, "unit": unit, "before": before, "after": after, "part": place}, verified
 
@@ -113,17 +126,20 @@ def _mean_correlation(session, rows):
 
 
 def _force_error(session):
-    """RMS error of force from electrodes, map and error both from the part kept aside, by blocks left out [N]."""
+    """RMS error of force from electrodes, map and error both from the part kept aside, by blocks left out
+    [N]."""
     view = session.force_view_of(~session.fit)
     return float("nan") if view is None else float(np.exp(0.5 * view.errors().mean()))
 
 
 def gap(session, findings, late=()) -> dict:
-    """Views of the whole model before and after, on the part kept aside: RMS, of electrodes also one by one [counts].
+    """Views of the whole model before and after, on the part kept aside: RMS, of electrodes also one by one
+    [counts].
 
     Args:
-      session: with the rows fitted and the samples masked; findings: accepted on the rows fitted, in that order; late: those that begin
-        in the part kept aside and have been fitted there: they enter `after_with_late` alone.
+      session: with the rows fitted and the samples masked; findings: accepted on the rows fitted, in that
+        order; late: those that begin in the part kept aside and have been fitted there: they enter
+        `after_with_late` alone.
 
     `amendments` says which of the findings each view takes, `trials` why: see `recorded_views`.
     """
@@ -143,12 +159,22 @@ def gap(session, findings, late=()) -> dict:
         choices, trials = chosen[name]
         before = _view(name, session, findings, [Choice("none", False)], locked)
         after = _view(name, session, findings, choices, locked)
-        view = views[name] = {"unit": "N" if name.startswith("force") else "counts", "before": before.pop("rms"), "after": after.pop("rms")}
+        view = views[name] = {
+            "unit": "N" if name.startswith("force") else "counts",
+            "before": before.pop("rms"),
+            "after": after.pop("rms"),
+        }
         view["variance_removed"] = 1 - (view["after"] / max(view["before"], 1e-12)) ** 2
         view |= {f"{key}_before": value for key, value in before.items() if key != "wander"}
         view |= {f"{key}_after": value for key, value in after.items() if key != "wander"}
         if "wander" in before:
-            floor = float(np.sqrt((noise_level(recording.electrodes[session.fit], recording.repeated[session.fit]) ** 2).mean()))
+            floor = float(
+                np.sqrt(
+                    (
+                        noise_level(recording.electrodes[session.fit], recording.repeated[session.fit]) ** 2
+                    ).mean()
+                )
+            )
             closable = max(view["before"] ** 2 - floor**2, 1e-12)
             view["noise"] = floor
             view["closed"] = (
@@ -165,7 +191,8 @@ def gap(session, findings, late=()) -> dict:
 
 
 def _view(name, session, findings, choices, locked):
-    """RMS of a view on the part kept aside, each of its components amended by its own choice (one choice: by that)."""
+    """RMS of a view on the part kept aside, each of its components amended by its own choice (one choice: by
+    that)."""
     said = None
     for choice in dict.fromkeys(choices):
         one, measured, time = VIEWS[name](Amended(session, findings, choice))
@@ -182,7 +209,8 @@ def _view(name, session, findings, choices, locked):
         "components" if name.startswith("force") else "channels": each.tolist(),
     }
     if counts:
-        # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset counts.
+        # Drift alone: means of many rows, about their own level, so that neither noise nor a constant offset
+        # counts.
         width = max(1, len(error) // 60)
         m = len(error) // width
         slow = error[: m * width].reshape(m, width, -1).mean(1)

@@ -1,4 +1,5 @@
-"""The report of a plain recording: verdict.json, report.html with figures, and the summary for the terminal."""
+"""The report of a plain recording: verdict.json, report.html with figures, and the summary for the
+terminal."""
 
 import html
 import json
@@ -35,11 +36,17 @@ def verdict_dict(diagnosis: RecordingDiagnosis) -> dict:
         "remainder": d.remainder,
         "cannot_be_known": d.notes,
         "recording": {
-            "name": d.recording.name, "rows": len(d.recording), "rate_hz": d.recording.rate, "rate_source": d.recording.rate_source,
-            "seconds": len(d.recording) / d.recording.rate, "force": d.recording.force is not None, "tdc": d.recording.tdc is not None,
-            "loaded": d.session.timeline().loaded, "locked_share": d.locked,
+            "name": d.recording.name,
+            "rows": len(d.recording),
+            "rate_hz": d.recording.rate,
+            "rate_source": d.recording.rate_source,
+            "seconds": len(d.recording) / d.recording.rate,
+            "force": d.recording.force is not None,
+            "tdc": d.recording.tdc is not None,
+            "loaded": d.session.timeline().loaded,
+            "locked_share": d.locked,
         },
-    }  # fmt: skip
+    }
     return _plain(out)
 
 
@@ -60,7 +67,9 @@ def _finding(f):
                 "value": value,
                 "unit": known.unit
                 if known
-                else {"counts": "counts", "change": "ln Z", "spread": "1", "delay_otherwise": "s"}.get(name, ""),
+                else {"counts": "counts", "change": "ln Z", "spread": "1", "delay_otherwise": "s"}.get(
+                    name, ""
+                ),
                 "interval95": [low, high],
                 "bounds": [known.low, known.high] if known else None,
                 "source": known.source if known else None,
@@ -68,11 +77,23 @@ def _finding(f):
             }
         )
     return {
-        "id": f.id, "name": f.effect.name, "stage": STAGES[f.effect.stage], "physics": f.effect.physics,
-        "channels": [f"e{k + 1}" for k in f.channels], "start_s": f.start, "end_s": f.end, "parameters": parameters,
-        "confidence": f.confidence, "nats": f.nats, "p": f.p, "confirmed": f.verified, "ties": list(f.ties), "note": f.note,
-        "gap": f.statistic, "confusable": f.effect.confusable,
-    }  # fmt: skip
+        "id": f.id,
+        "name": f.effect.name,
+        "stage": STAGES[f.effect.stage],
+        "physics": f.effect.physics,
+        "channels": [f"e{k + 1}" for k in f.channels],
+        "start_s": f.start,
+        "end_s": f.end,
+        "parameters": parameters,
+        "confidence": f.confidence,
+        "nats": f.nats,
+        "p": f.p,
+        "confirmed": f.verified,
+        "ties": list(f.ties),
+        "note": f.note,
+        "gap": f.statistic,
+        "confusable": f.effect.confusable,
+    }
 
 
 def summary(diagnosis: RecordingDiagnosis) -> str:
@@ -86,25 +107,39 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
     ]  # fmt: skip
     for f in d.findings:
         numbers = ", ".join(_number(n, *v, f.effect.params.get(n)) for n, v in f.parameters.items())
-        lines.append(f"  {f.effect.name} [{STAGES[f.effect.stage]}], confidence {f.confidence:.2f}, from {f.start:.1f} s to {f.end:.1f} s")
+        lines.append(
+            f"  {f.effect.name} [{STAGES[f.effect.stage]}], confidence {f.confidence:.2f}, from "
+            f"{f.start:.1f} s to {f.end:.1f} s"
+        )
         lines.append(f"    {numbers}")
         lines.append(f"    {f.note}")
-        apart = {e.name: f.effect.confusable[e.id] for e in EFFECTS if e.id in f.ties and e.id in f.effect.confusable}
+        apart = {
+            e.name: f.effect.confusable[e.id]
+            for e in EFFECTS
+            if e.id in f.ties and e.id in f.effect.confusable
+        }
         lines += [f"    to tell it from {name}: {how}" for name, how in apart.items()]
         s = f.statistic
         if s:
             sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[f.verified]
-            lines.append(f"    {s['part']}: {s['name']} {s['before']:.3g} -> {s['after']:.3g} {s['unit']} ({sign})")
+            lines.append(
+                f"    {s['part']}: {s['name']} {s['before']:.3g} -> {s['after']:.3g} {s['unit']} ({sign})"
+            )
     for f in d.rejected:
         lines.append(f"  not confirmed by the part kept aside, left out: {f.effect.name}")
     for name, view in d.gap.items():
-        lines.append(f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept aside")
+        lines.append(
+            f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept aside"
+        )
         lines.append(f"    amended by {_amendments(view)} (walk-forward trials in the part fitted)")
         if "after_with_late" in view:
-            lines.append(f"    {view['after_with_late']:.4g} with what begins in that part and was fitted there")
+            lines.append(
+                f"    {view['after_with_late']:.4g} with what begins in that part and was fitted there"
+            )
         if "drift_variance_removed" in view and view["before"] > 1.05 * view["noise"]:
             lines.append(
-                f"    variance removed {view['variance_removed']:.1%}, of the drift within that part {view['drift_variance_removed']:.1%}"
+                f"    variance removed {view['variance_removed']:.1%}, of the drift within that part "
+                f"{view['drift_variance_removed']:.1%}"
             )
     if d.remainder.get("force"):
         lines.append(f"  {d.remainder['force']['text']}")
@@ -112,7 +147,8 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
     if d.where:
         c = d.where[0]
         lines.append(
-            f"  where: {len(d.where)} cells (channel x tenth of the record) depart, most {c['channel']} at {c['from']:.0f}-{c['to']:.0f} s"
+            f"  where: {len(d.where)} cells (channel x tenth of the record) depart, most {c['channel']} at "
+            f"{c['from']:.0f}-{c['to']:.0f} s"
         )
     lines += [f"  cannot be known: {n}" for n in d.notes[1:]]
     return "\n".join(lines)
@@ -124,7 +160,10 @@ def _amendments(view):
     if len(set(choices)) == 1:
         return choices[0]
     names = ("Fx", "Fy", "Fz") if len(choices) == 3 else [f"e{k + 1}" for k in range(len(choices))]
-    return "; ".join(f"{' '.join(n for n, c in zip(names, choices) if c == choice)}: {choice}" for choice in dict.fromkeys(choices))
+    return "; ".join(
+        f"{' '.join(n for n, c in zip(names, choices) if c == choice)}: {choice}"
+        for choice in dict.fromkeys(choices)
+    )
 
 
 def write_report(diagnosis: RecordingDiagnosis, folder) -> list:
@@ -223,10 +262,22 @@ def _shapes(d, shaped):
         line, deviation, _ = whole_line(s)
         pattern = f.theta["pattern"][line.used]
         q = np.linalg.solve(line.covariance, pattern)
-        ax.plot(line.time, deviation @ q / (pattern @ q), lw=0.7, color="0.4", label="measured, the load filtered out")
+        ax.plot(
+            line.time,
+            deviation @ q / (pattern @ q),
+            lw=0.7,
+            color="0.4",
+            label="measured, the load filtered out",
+        )
         level = f.effect._level(d.recording.time, f.theta)
         inside = d.session.fit
-        ax.plot(d.recording.time, level - level[inside].mean(), color="tab:red", lw=1.2, label="fitted on the white part")
+        ax.plot(
+            d.recording.time,
+            level - level[inside].mean(),
+            color="tab:red",
+            lw=1.2,
+            label="fitted on the white part",
+        )
         ax.axvspan(d.recording.time[~inside][0], d.recording.time[-1], color="0.9", zorder=0)
         channels = "" if len(f.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in f.channels)
         ax.set_title(f.effect.name + channels, fontsize=9)
@@ -243,16 +294,22 @@ def _page(d, figures):
         numbers = "<br>".join(esc(_number(n, *v, f.effect.params.get(n))) for n, v in f.parameters.items())
         ties = ", ".join(e.name for e in EFFECTS if e.id in f.ties) or "none"
         s = f.statistic
-        proof = f"{esc(s['name'])}: {s['before']:.3g} → {s['after']:.3g} {esc(s['unit'])}, {esc(s['part'])}" if s else "not checked"
+        proof = (
+            f"{esc(s['name'])}: {s['before']:.3g} → {s['after']:.3g} {esc(s['unit'])}, {esc(s['part'])}"
+            if s
+            else "not checked"
+        )
         channels = "all" if len(f.channels) > 12 else ", ".join(f"e{k + 1}" for k in f.channels)
         rows.append(
             f"<tr><td><b>{esc(f.effect.name)}</b><br>{esc(f.effect.physics)}</td><td>{STAGES[f.effect.stage]}</td><td>{channels}</td>"
-            f"<td>{f.start:.1f}–{f.end:.1f} s</td><td>{numbers}</td><td>{f.confidence:.2f}<br>{f.nats:.0f} nats</td><td>{esc(ties)}</td>"
+            f"<td>{f.start:.1f}–{f.end:.1f} s</td><td>{numbers}</td><td>{f.confidence:.2f}<br>{f.nats:.0f} "
+            f"nats</td><td>{esc(ties)}</td>"
             f"<td>{proof}<br>{esc(f.note)}</td></tr>"
         )
     effects = "".join(rows) or "<tr><td colspan=8>none</td></tr>"
     cells = "".join(
-        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} s</td><td>{c['counts']:+.1f}</td><td>{c['p']:.1e}</td></tr>"
+        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} "
+        f"s</td><td>{c['counts']:+.1f}</td><td>{c['p']:.1e}</td></tr>"
         for c in d.where[:12]
     )
     gaps = "".join(
@@ -261,9 +318,13 @@ def _page(d, figures):
         for n, v in d.gap.items()
     )
     apart = "".join(
-        f"<li>{esc(f.effect.name)}: {esc('; '.join(f'{k}: {v}' for k, v in f.effect.confusable.items()))}</li>" for f in d.findings
+        f"<li>{esc(f.effect.name)}: "
+        f"{esc('; '.join(f'{k}: {v}' for k, v in f.effect.confusable.items()))}</li>"
+        for f in d.findings
     )
-    left = esc(d.remainder["text"]) + ("<br>" + esc(d.remainder["force"]["text"]) if d.remainder.get("force") else "")
+    left = esc(d.remainder["text"]) + (
+        "<br>" + esc(d.remainder["force"]["text"]) if d.remainder.get("force") else ""
+    )
     pictures = "".join(f'<img src="{name}" style="max-width:100%">' for name in figures)
     return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
 <style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}

@@ -15,8 +15,8 @@ _PARTS = 10
 
 
 def cells(session) -> list:
-    """Cells (channel or "all together") x tenth of the record in which the unamended recording departs from its own level, family-wise 5
-    %."""
+    """Cells (channel or "all together") x tenth of the record in which the unamended recording departs from
+    its own level, family-wise 5 %."""
     raw = Session(session.recording, session.fit)
     raw.masked = session.masked
     line, deviation, inside = whole_line(raw)
@@ -55,7 +55,10 @@ def remainder(session) -> dict:
     """Describes what the amended model leaves: dict with `significant`, `text` and shares."""
     out = _remainder(session)
     if session.unnamed:
-        out.update(significant=True, text="; ".join([*session.unnamed, *([out["text"]] if out["significant"] else [])]))
+        out.update(
+            significant=True,
+            text="; ".join([*session.unnamed, *([out["text"]] if out["significant"] else [])]),
+        )
     return out
 
 
@@ -64,7 +67,12 @@ def _remainder(session):
     slope = np.median(session.counts * (1 - session.counts / 4095), axis=0)[line.used]
     if not line.loaded:
         common = max(
-            (f.parameters["counts"][0] for f in session.findings if "counts" in f.parameters and len(f.channels) > 12), default=0.0
+            (
+                f.parameters["counts"][0]
+                for f in session.findings
+                if "counts" in f.parameters and len(f.channels) > 12
+            ),
+            default=0.0,
         )
         return _unloaded(line, deviation, slope, common)
     out = _loaded(line, deviation, slope)
@@ -77,14 +85,21 @@ def _unloaded(line, deviation, slope, common):
     """Excess over white noise of bins: of the common movement, and of every electrode."""
     one = np.ones(len(line.used))
     series = np.column_stack([deviation.mean(1), deviation - deviation.mean(1, keepdims=True)])
-    noise = np.concatenate([[np.sqrt((line.noise**2).sum()) / len(one)], line.noise * np.sqrt(1 - 1 / len(one))])
+    noise = np.concatenate(
+        [[np.sqrt((line.noise**2).sum()) / len(one)], line.noise * np.sqrt(1 - 1 / len(one))]
+    )
     size = np.concatenate([[np.median(slope)], slope])
     sample = line.noise * np.sqrt(line.width) * slope
     guilty = []
     for j in range(series.shape[1]):
         x = series[:, j] - series[:, j].mean()
         excess = np.sqrt(max(x.var() - noise[j] ** 2, 0)) * size[j]
-        windows = np.array([np.sqrt(max(w.var() + (w.mean()) ** 2 - noise[j] ** 2, 0)) for w in np.array_split(x, 24)]) * size[j]
+        windows = (
+            np.array(
+                [np.sqrt(max(w.var() + (w.mean()) ** 2 - noise[j] ** 2, 0)) for w in np.array_split(x, 24)]
+            )
+            * size[j]
+        )
         # A shape carried on beyond the part fitted is good to some per cent of the effect.
         floor = max(1.0, 0.5 * (np.median(sample) if j == 0 else sample[j - 1]), 0.03 * common)
         if (excess > floor and x.var() > 2 * noise[j] ** 2) or windows.max() > 4 * floor:
@@ -93,7 +108,11 @@ def _unloaded(line, deviation, slope, common):
             length = correlation_length(x) * line.period
             when = f"{line.time[0] + a * (line.time[-1] - line.time[0]) / 24:.0f} s"
             guilty.append(
-                (excess, f"{name}: {excess:.1f} counts RMS beyond noise, most at {when}, keeps its sign for about {length:.1f} s")
+                (
+                    excess,
+                    f"{name}: {excess:.1f} counts RMS beyond noise, most at {when}, keeps its sign for "
+                    f"about {length:.1f} s",
+                )
             )
     if not guilty:
         return {"significant": False, "text": "what is left is noise"}
@@ -115,8 +134,15 @@ def _loaded(line, deviation, slope):
         if (odd[2:] & odd[1:-1] & odd[:-2]).any():
             where = np.flatnonzero(odd)
             start, end = line.time[parts[where[0]][0]], line.time[parts[where[-1]][-1]]
-            guilty.append((size[odd].max() * slope[k], f"e{line.used[k] + 1} departs from the other electrodes by {size[odd].max() * slope[k]:.0f} counts"  # noqa: E501
-                           f" from {start:.0f} s to {end:.0f} s"))  # fmt: skip
+            guilty.append(
+                (
+                    size[odd].max() * slope[k],
+                    f"e{line.used[k] + 1} departs from the other "
+                    f"electrodes by {size[odd].max() * slope[k]:.0f} "
+                    "counts"  # noqa: E501
+                    f" from {start:.0f} s to {end:.0f} s",
+                )
+            )
     guilty.sort(reverse=True)
     text = "; ".join(g[1] for g in guilty[:3])
     return {
@@ -126,7 +152,8 @@ def _loaded(line, deviation, slope):
 
 
 def _by_force(session):
-    """Shares of the electrodes' variance explained on blocks left out: by force alone, and more by each group of further features."""
+    """Shares of the electrodes' variance explained on blocks left out: by force alone, and more by each group
+    of further features."""
     r = session.recording
     rows = np.arange(0, len(r), max(1, len(r) // 6000))
     y = log_impedance(session.counts)[rows]
@@ -136,18 +163,26 @@ def _by_force(session):
     t = (rows / len(r))[:, None]
     history = np.concatenate([(force - lagged(force, tau, r.rate))[rows] for tau in (1.0, 5.0)], axis=1)
     z = (y - y.mean(0)) / np.maximum(y.std(0), 1e-9)
-    groups = {"time": np.concatenate([t, t**2], axis=1), "rate of the force": rate, "history of the force (1 s, 5 s)": history}
+    groups = {
+        "time": np.concatenate([t, t**2], axis=1),
+        "rate of the force": rate,
+        "history of the force (1 s, 5 s)": history,
+    }
     static = _score(base, z)
     out = {"force alone": static}
     for name, x in groups.items():
         out[name] = _score(np.concatenate([base, x], axis=1), z) - static
-    # One electrode from the others is nearly complete where only the place of the contact is missing: a state, not a fault.
+    # One electrode from the others is nearly complete where only the place of the contact is missing: a
+    # state, not a fault.
     others = np.median([_score(np.delete(z, k, axis=1), z[:, [k]]) for k in range(19)])
     out["the other electrodes"] = float(others - static)
     missing = max((v, k) for k, v in out.items() if k != "force alone")[1]
     text = f"force alone explains {static:.0%} of the electrodes' variance on blocks left out"
     if missing == "the other electrodes":
-        text += f", the other electrodes {others:.0%}: place and torque of the contact, which the force does not say, make the rest"
+        text += (
+            f", the other electrodes {others:.0%}: place and torque of the contact, which the force "
+            "does not say, make the rest"
+        )
     else:
         text += f"; most of the rest depends on {missing} (+{out[missing]:.0%})"
     return {"shares": {k: float(v) for k, v in out.items()}, "text": text}

@@ -1,9 +1,10 @@
-"""Views of a recording: numbers that a model says without having been given them; and which amendments each view takes.
+"""Views of a recording: numbers that a model says without having been given them; and which amendments each
+view takes.
 
-What was found need not help everywhere. A shared gain that load has blurred, say, may be right for the lateral force and wrong for the
-normal one, whose own trend it resembles. Walk-forward trials inside the part fitted decide: what develops over time is fitted again on
-the first rows alone and used on those that follow, as the whole will be on the part kept aside, of which no row is looked at.
-"""
+What was found need not help everywhere. A shared gain that load has blurred, say, may be right for the
+lateral force and wrong for the normal one, whose own trend it resembles. Walk-forward trials inside the part
+fitted decide: what develops over time is fitted again on the first rows alone and used on those that follow,
+as the whole will be on the part kept aside, of which no row is looked at."""
 
 import dataclasses
 
@@ -18,7 +19,13 @@ from .recorded_effect import Session
 
 __all__ = ["Amended", "Choice", "VIEWS", "choose", "cross_residual", "options", "whole_line"]
 
-_EDGES = (0.4, 0.55, 0.7, 0.85, 1.0)  # of the part fitted: each trial uses all rows up to an edge and is judged up to the next
+_EDGES = (
+    0.4,
+    0.55,
+    0.7,
+    0.85,
+    1.0,
+)  # of the part fitted: each trial uses all rows up to an edge and is judged up to the next
 _WEIGHTS = (1.0, 2.0, 3.0, 4.0)  # of the trials: the last ones are the most like what is to come
 _LEAST_ROWS = 500  # in a trial
 _SLACK = 0.005  # of the logarithm of the error: less does not decide against what was found
@@ -60,7 +67,10 @@ class Amended:
         self.time = recording.time
         self.late = np.minimum(self.time, self.time[session.fit][-1]) if choice.time == "held" else self.time
         self.used = [
-            f for f in findings if (choice.time != "none" or not over_time(f)) and (choice.force or not isinstance(f.effect, ForceEffect))
+            f
+            for f in findings
+            if (choice.time != "none" or not over_time(f))
+            and (choice.force or not isinstance(f.effect, ForceEffect))
         ]  # noqa: E501
         self.rate = recording.rate
         self.session = Session(recording, session.fit)
@@ -96,7 +106,11 @@ class Amended:
 
 
 def electrodes_from_force(a):
-    return a.measured_counts(_from_force(a.force, a.counts, a.session.fit)), a.session.recording.electrodes, a.time
+    return (
+        a.measured_counts(_from_force(a.force, a.counts, a.session.fit)),
+        a.session.recording.electrodes,
+        a.time,
+    )
 
 
 def electrodes_at_rest(a):
@@ -130,27 +144,39 @@ VIEWS = {
 
 
 def squares(view, amended, rows):
-    """(components,) mean square error of a view on rows (n,) bool, of every force component or electrode; masked samples do not count."""
+    """(components,) mean square error of a view on rows (n,) bool, of every force component or electrode;
+    masked samples do not count."""
     said, measured, time = VIEWS[view](amended)
     inside = np.interp(time, amended.time, rows.astype(float)) > 0.5
     error = (said - measured)[inside] ** 2
-    good = ~amended.session.masked[inside] if error.shape[1] == 19 and len(said) == len(rows) else np.ones(error.shape, bool)
+    good = (
+        ~amended.session.masked[inside]
+        if error.shape[1] == 19 and len(said) == len(rows)
+        else np.ones(error.shape, bool)
+    )
     each = (error * good).sum(0) / np.maximum(good.sum(0), 1)
-    return np.array([each.mean()]) if view == "electrodes at rest" else each  # at rest all electrodes have the same choice
+    return (
+        np.array([each.mean()]) if view == "electrodes at rest" else each
+    )  # at rest all electrodes have the same choice
 
 
-# --- trials ----------------------------------------------------------------------------------------------------------------------------
+# --- trials  ---
 
 
 def options(view, findings) -> list:
     """The Choices that differ in a view, what was found first."""
     times = ("carried on", "held", "none") if any(over_time(f) for f in findings) else ("carried on",)
-    forces = (True, False) if "force" in view and any(isinstance(f.effect, ForceEffect) for f in findings) else (True,)
+    forces = (
+        (True, False)
+        if "force" in view and any(isinstance(f.effect, ForceEffect) for f in findings)
+        else (True,)
+    )
     return [Choice(t, f) for f in forces for t in times]
 
 
 def choose(session, findings, views) -> dict:
-    """view -> (Choice of each component or of all, {option's text: mean log error against none (components,)}), by trials.
+    """view -> (Choice of each component or of all, {option's text: mean log error against none
+    (components,)}), by trials.
 
     Where no trial can tell, because nothing was found in its first rows, the findings enter as found.
     """
@@ -180,15 +206,19 @@ def choose(session, findings, views) -> dict:
 
 
 def _best(asked, x, mean, wary):
-    """Number of the option with the least mean error (trials, options), what was found first where nothing tells.
+    """Number of the option with the least mean error (trials, options), what was found first where nothing
+    tells.
 
-    Wary, with force: regressions turn the load's own trend into a gain and a wrong gain into newtons, so two trials have to tell, and both
+    Wary, with force: regressions turn the load's own trend into a gain and a wrong gain into newtons, so two
+      trials have to tell, and both
     of the last two that do have to improve.
     """
     allowed = list(range(len(asked)))
     if wary:
         for i, option in enumerate(asked):
-            without = asked.index(Choice("none", option.force)) if Choice("none", option.force) in asked else i
+            without = (
+                asked.index(Choice("none", option.force)) if Choice("none", option.force) in asked else i
+            )
             told = [row[i] - row[without] for row in x if abs(row[i] - row[without]) > 1e-9]
             if i != without and not (len(told) >= 2 and max(told[-2:]) < 0):
                 allowed.remove(i)
@@ -196,12 +226,17 @@ def _best(asked, x, mean, wary):
 
 
 def _fitted_again(session, findings, fit):
-    """Session of the rows `fit`, with what develops over time found anew there; what is not found there is left out."""
+    """Session of the rows `fit`, with what develops over time found anew there; what is not found there is
+    left out."""
     trial = Session(session.recording, fit)
     trial.masked = session.masked.copy()
     for f in findings:
         if over_time(f):
-            again = [g for g in f.effect.find(trial) if g.channels == f.channels or min(len(g.channels), len(f.channels)) > 12]
+            again = [
+                g
+                for g in f.effect.find(trial)
+                if g.channels == f.channels or min(len(g.channels), len(f.channels)) > 12
+            ]
             if not again:
                 continue
             f = again[0]
@@ -209,11 +244,12 @@ def _fitted_again(session, findings, fit):
     return trial
 
 
-# --- what the views need -----------------------------------------------------------------------------------------------------------------
+# --- what the views need  ---
 
 
 def whole_line(session):
-    """Timeline of the whole record with the covariance of the part fitted: (timeline, deviation (m, c), rows fitted (m,))."""
+    """Timeline of the whole record with the covariance of the part fitted: (timeline, deviation (m, c), rows
+    fitted (m,))."""
     from .recording import Recording
     from .timeline import Timeline
 
@@ -236,7 +272,8 @@ def cross_residual(line, deviation):
 
 
 def _from_force(force, counts, fit):
-    """(n, 19) counts as a quadratic, static function of force says, fitted on the rows to fit; ridge chosen by blocks of time."""
+    """(n, 19) counts as a quadratic, static function of force says, fitted on the rows to fit; ridge chosen
+    by blocks of time."""
     y = log_impedance(counts)
     A = force_features(force)
     A[:, 1:] = (A[:, 1:] - A[fit, 1:].mean(0)) / np.maximum(A[fit, 1:].std(0), 1e-6)

@@ -1,4 +1,5 @@
-"""Linearised signatures: the screen of the catalogue, what one effect can mimic of another, and the experiment that tells them apart."""
+"""Linearised signatures: the screen of the catalogue, what one effect can mimic of another, and the
+experiment that tells them apart."""
 
 import numpy as np
 
@@ -11,7 +12,8 @@ _STEPS = {"log_modulus": 0.05, "log_friction": 0.1, "footprint": 0.02, "mesh": 0
 
 
 def columns(comparison, current, effect, shape, base, chosen):
-    """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a realistic size."""
+    """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a
+    realistic size."""
     out = []
     for name, size in _sizes(effect):
         theta = {**effect.default(), **shape}
@@ -39,12 +41,15 @@ def nuisance_space(comparison, current, base, chosen):
 
 
 def screen(comparison, current, effects, chosen):
-    """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may start), best first."""
+    """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
+    start), best first."""
     base = current.residuals(comparison)
     q = nuisance_space(comparison, current, base, chosen)
     sizes = [base[i].size for i in chosen]
     edges = np.concatenate([[0], np.cumsum(sizes)])
-    weight = np.concatenate([np.full(s, 1 / np.sqrt(max(m, 0.5))) for s, m in zip(sizes, mean_square(base)[chosen])])
+    weight = np.concatenate(
+        [np.full(s, 1 / np.sqrt(max(m, 0.5))) for s, m in zip(sizes, mean_square(base)[chosen])]
+    )
     y = np.concatenate([base[i].ravel() for i in chosen]) * weight
     q, _ = np.linalg.qr(q * weight[:, None])
     y = y - q @ (q.T @ y)
@@ -56,17 +61,28 @@ def screen(comparison, current, effects, chosen):
             S = S - q @ (q.T @ S)
             gain = []
             for f in range(4):
-                train = np.concatenate([np.arange(a, b) for a, b, g in zip(edges[:-1], edges[1:], folds) if g != f])
+                train = np.concatenate(
+                    [np.arange(a, b) for a, b, g in zip(edges[:-1], edges[1:], folds) if g != f]
+                )
                 ridge = np.eye(S.shape[1]) * 0.2
                 w = np.linalg.solve(S[train].T @ S[train] + ridge, S[train].T @ y[train])
                 for a, b, g in zip(edges[:-1], edges[1:], folds):
                     if g == f:
-                        gain.append(np.log(max((y[a:b] ** 2).mean(), 1e-9)) - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).mean(), 1e-9)))
+                        gain.append(
+                            np.log(max((y[a:b] ** 2).mean(), 1e-9))
+                            - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).mean(), 1e-9))
+                        )
             w = np.linalg.solve(S.T @ S + 0.2 * np.eye(S.shape[1]), S.T @ y)
             start = {**effect.default(), **shape}
             for (name, size), share in zip(_sizes(effect), w):
                 p = effect.params[name]
-                start[name] = float(np.clip(start[name] + np.clip(share, -3, 3) * size, p.low + 0.01 * p.scale, p.high - 0.01 * p.scale))
+                start[name] = float(
+                    np.clip(
+                        start[name] + np.clip(share, -3, 3) * size,
+                        p.low + 0.01 * p.scale,
+                        p.high - 0.01 * p.scale,
+                    )
+                )
             out.append((float(np.mean(gain)), effect, start))
     best = {}
     for score, effect, start in sorted(out, key=lambda o: -o[0]):
@@ -75,7 +91,8 @@ def screen(comparison, current, effects, chosen):
 
 
 def isolability(comparison, current, usable, found, chosen):
-    """M[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats that i makes at a realistic size."""
+    """M[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats that i
+    makes at a realistic size."""
     base = current.residuals(comparison)
     q = nuisance_space(comparison, current, base, chosen)
     ids, spaces, size = [], [], []
@@ -105,12 +122,16 @@ def isolability(comparison, current, usable, found, chosen):
 def next_experiment(effects, isolability):
     pairs = [(e, t) for e in effects for t in e["ties"]]
     if not pairs:
-        pairs = [(e, next((o for o in e["confusable"] if o in isolability["ids"]), None)) for e in effects[:1]]
+        pairs = [
+            (e, next((o for o in e["confusable"] if o in isolability["ids"]), None)) for e in effects[:1]
+        ]
     out = []
     for effect, other in pairs[:3]:
         if other is None:
             continue
-        text = effect["confusable"].get(other) or next((e.confusable.get(effect["id"]) for e in CATALOGUE if e.id == other), None)
+        text = effect["confusable"].get(other) or next(
+            (e.confusable.get(effect["id"]) for e in CATALOGUE if e.id == other), None
+        )
         ids = isolability["ids"]
         nats = ""
         if effect["id"] in ids and other in ids:

@@ -1,4 +1,5 @@
-"""Shapes over time (step, ramp, exponential, pulse) fitted to one series, with evidence that knows the series is not white."""
+"""Shapes over time (step, ramp, exponential, pulse) fitted to one series, with evidence that knows the series
+is not white."""
 
 import dataclasses
 import functools
@@ -12,15 +13,24 @@ __all__ = ["ShapeFit", "correlation_length", "evaluate_shape", "fit_shapes"]
 def _dictionary(n, first, last, kinds, onsets):
     """Labels (kind, onset, tau, end), centred columns (n, m) and their powers (m,) of all shapes to try."""
     t, length = np.linspace(first, last, n), last - first
-    grid = t[np.unique(np.linspace(max(2, n * 0.02), n * 0.97, 60).astype(int))] if onsets is None else np.asarray(onsets)
+    grid = (
+        t[np.unique(np.linspace(max(2, n * 0.02), n * 0.97, 60).astype(int))]
+        if onsets is None
+        else np.asarray(onsets)
+    )
     labels = []
     for kind in kinds:
         if kind == "exponential":
             start = np.concatenate([[t[0]], grid[::3]]) if onsets is None else grid
             taus = length * np.geomspace(0.01, 4, 14)
-            labels += [(kind, o, tau, t[-1]) for o in start for tau in taus if o + 0.5 * tau < t[-1] or o == t[0]]
+            labels += [
+                (kind, o, tau, t[-1]) for o in start for tau in taus if o + 0.5 * tau < t[-1] or o == t[0]
+            ]
         elif kind == "ramp":
-            labels += [(kind, o, 0.0, t[-1]) for o in (np.concatenate([[t[0]], grid[::2]]) if onsets is None else grid)]
+            labels += [
+                (kind, o, 0.0, t[-1])
+                for o in (np.concatenate([[t[0]], grid[::2]]) if onsets is None else grid)
+            ]
         elif kind == "step":
             labels += [(kind, o, 0.0, t[-1]) for o in grid]
         else:
@@ -35,7 +45,8 @@ class ShapeFit:
     """value(t) = level + amplitude * shape(t; onset, tau, end).
 
     Attributes:
-      kind: "step", "ramp", "exponential" or "pulse"; onset, end, tau [s]; amplitude, level in the series' unit.
+      kind: "step", "ramp", "exponential" or "pulse"; onset, end, tau [s]; amplitude, level in the series'
+        unit.
       nats: log-likelihood gained, of effectively independent samples, less the price of the parameters.
       sd: of the residual; neff: independent samples; explained: share of the variance.
       interval: name -> (low, high), 95 %.
@@ -79,20 +90,28 @@ def correlation_length(residual):
     return float(1 + 2 * rho[1 : stop[0] if len(stop) else len(rho)].sum())
 
 
-def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None, tests=1, floor=0.0, through=None) -> ShapeFit | None:
+def fit_shapes(
+    t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None, tests=1, floor=0.0, through=None
+) -> ShapeFit | None:
     """The best shape, or None where the constant does as well.
 
     Args:
       t: (n,) [s]; x: (n,). kinds: which shapes. onsets: times to try [s], None a grid over the record.
-      tests: how many series are looked at: its logarithm is part of the price. floor: noise of x known beforehand.
-      through: a linear function that x has been through and shapes have to go through, such as `Timeline.explained_by_others`.
+      tests: how many series are looked at: its logarithm is part of the price. floor: noise of x known
+        beforehand.
+      through: a linear function that x has been through and shapes have to go through, such as
+        `Timeline.explained_by_others`.
     """
     n, length = len(t), t[-1] - t[0]
-    labels, columns, power = _dictionary(n, float(t[0]), float(t[-1]), tuple(kinds), None if onsets is None else tuple(onsets))
+    labels, columns, power = _dictionary(
+        n, float(t[0]), float(t[-1]), tuple(kinds), None if onsets is None else tuple(onsets)
+    )
     if through is not None:
         columns = through(columns)
         columns = columns - columns.mean(0)
-        power = np.maximum((columns**2).sum(0), 0.02 * power)  # a shape that the others mimic is not found here
+        power = np.maximum(
+            (columns**2).sum(0), 0.02 * power
+        )  # a shape that the others mimic is not found here
     centred = x - x.mean()
     total = float(centred @ centred)
     if total <= 0:
@@ -118,10 +137,18 @@ def fit_shapes(t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None
             residual = x - design @ [level, amplitude]
             rss = float(residual @ residual) + n * floor**2 * 1e-3
             neff = min(n, max(4.0, n / correlation_length(residual)))
-            nats = 0.5 * neff * np.log(total / max(rss, 1e-30)) - 0.5 * price[i] * np.log(neff) - np.log(tests) - 1.5 - extra
+            nats = (
+                0.5 * neff * np.log(total / max(rss, 1e-30))
+                - 0.5 * price[i] * np.log(neff)
+                - np.log(tests)
+                - 1.5
+                - extra
+            )
             if nats > best + (1.0 if chosen else 0.0):
                 best = nats
-                chosen = ShapeFit(kind, onset, tau, end, amplitude, level, nats, np.sqrt(rss / n), neff, 1 - rss / total, {})
+                chosen = ShapeFit(
+                    kind, onset, tau, end, amplitude, level, nats, np.sqrt(rss / n), neff, 1 - rss / total, {}
+                )
     if chosen is None or chosen.nats <= 0:
         return None
     chosen.interval = _intervals(t, x, chosen, through)
@@ -133,7 +160,12 @@ def _polish(kind, t, x, label, length, through=None):
     _, onset, tau, end = label
     step = t[1] - t[0]
     values = {"onset": onset, "tau": tau, "end": end}
-    moves = {"step": ["onset"], "pulse": ["onset", "end"], "ramp": ["onset"], "exponential": ["tau", "onset"]}[kind]
+    moves = {
+        "step": ["onset"],
+        "pulse": ["onset", "end"],
+        "ramp": ["onset"],
+        "exponential": ["tau", "onset"],
+    }[kind]
     if kind in ("ramp", "exponential") and onset <= t[0]:
         moves = [m for m in moves if m != "onset"]
 
@@ -152,7 +184,9 @@ def _polish(kind, t, x, label, length, through=None):
             for sign in (1, -1):
                 trial = dict(values)
                 if name == "tau":
-                    trial[name] = float(np.clip(values[name] * np.exp(sign * size[name]), 0.002 * length, 20 * length))
+                    trial[name] = float(
+                        np.clip(values[name] * np.exp(sign * size[name]), 0.002 * length, 20 * length)
+                    )
                 else:
                     trial[name] = float(np.clip(values[name] + sign * size[name], t[0], t[-1]))
                 if trial["end"] <= trial["onset"]:
@@ -168,14 +202,24 @@ def _polish(kind, t, x, label, length, through=None):
 
 
 def _intervals(t, x, fit, through=None):
-    """95 % intervals by linearisation, the residual's correlation in its scale; a step's onset by its profile."""
+    """95 % intervals by linearisation, the residual's correlation in its scale; a step's onset by its
+    profile."""
     base = {"amplitude": fit.amplitude, "tau": fit.tau, "onset": fit.onset, "end": fit.end}
-    names = {"exponential": ["amplitude", "tau"], "ramp": ["amplitude"], "step": ["amplitude"], "pulse": ["amplitude"]}[fit.kind]
+    names = {
+        "exponential": ["amplitude", "tau"],
+        "ramp": ["amplitude"],
+        "step": ["amplitude"],
+        "pulse": ["amplitude"],
+    }[fit.kind]
     if fit.kind in ("exponential", "ramp") and fit.onset > t[0]:
         names.append("onset")
     columns = [np.ones(len(t))]
     for name in names:
-        h = {"amplitude": 1e-3 * (abs(fit.amplitude) + 1e-12), "tau": 1e-3 * max(fit.tau, 1e-9), "onset": 1e-3 * (t[-1] - t[0])}[name]
+        h = {
+            "amplitude": 1e-3 * (abs(fit.amplitude) + 1e-12),
+            "tau": 1e-3 * max(fit.tau, 1e-9),
+            "onset": 1e-3 * (t[-1] - t[0]),
+        }[name]
         side = []
         for sign in (1, -1):
             v = {**base, name: base[name] + sign * h}

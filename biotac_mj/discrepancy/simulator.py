@@ -1,7 +1,9 @@
 """The simulator as stages and effects: where objects are, skin, transduction, acquisition; saved as YAML.
 
-Poses go in, what the sensor would read comes out. The skin is solved for the poses as they are (`fields`), and once more for each small
-change of them: these differences make every effect of the set-up affordable, and what uses them says so (`exact=False`).
+Poses go in, what the sensor would read comes out. The skin is solved for the poses as they are (`fields`),
+and once more for each small
+change of them: these differences make every effect of the set-up affordable, and what uses them says so
+  (`exact=False`).
 `exact=True` solves the skin anew with the effects in place.
 """
 
@@ -58,21 +60,38 @@ class Simulator:
         other.modulus = self.modulus if modulus is None else modulus
         return other
 
-    # --- the skin --------------------------------------------------------------------------------------------------------------------
+    # --- the skin  ---
 
-    def solve(self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None) -> list:
-        """Per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19); kept in `cache`.
+    def solve(
+        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+    ) -> list:
+        """Per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
+        19); kept in `cache`.
 
         Args:
           offset: list of (n, 3) [m], or None; log_radius: list of floats, or None.
         """
         out, todo = [None] * len(trajectories), []
         for i, t in enumerate(trajectories):
-            tool, pos = placed(t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i]))
+            tool, pos = placed(
+                t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
+            )
             key = hashlib.sha256(
-                repr((self.skin, self.tier, self.material, self.sensor, tool, round(log_friction, 9), round(bubble * 1e12, 6), "v2")).encode()  # noqa: E501
-                + np.round(pos, 9).tobytes() + np.round(t.mat, 9).tobytes()
-            ).hexdigest()[:24]  # fmt: skip
+                repr(
+                    (
+                        self.skin,
+                        self.tier,
+                        self.material,
+                        self.sensor,
+                        tool,
+                        round(log_friction, 9),
+                        round(bubble * 1e12, 6),
+                        "v2",
+                    )
+                ).encode()  # noqa: E501
+                + np.round(pos, 9).tobytes()
+                + np.round(t.mat, 9).tobytes()
+            ).hexdigest()[:24]
             path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"
             if path is not None and path.exists():
                 with np.load(path) as file:
@@ -86,20 +105,27 @@ class Simulator:
         return out
 
     def _walk(self, todo, out, log_friction, bubble, progress):
-        """Solves trajectories (index, tool, pos, mat, path of the cache), each one world, and files what they gave."""
+        """Solves trajectories (index, tool, pos, mat, path of the cache), each one world, and files what they
+        gave."""
         from ..data.plan import Motion
         from ..data.simulate import simulate, simulate_condensed
 
         model, film = self._model(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate
         longest = max(len(pos) for _, _, pos, _, _ in todo)
-        rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _ in todo]  # who has arrived waits there
+        rows = [
+            np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _ in todo
+        ]  # who has arrived waits there
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _) in zip(rows, todo)]
         fields = walk(model, [tool for _, tool, _, _, _ in todo], motions)
         for w, (i, _, pos, _, path) in enumerate(todo):
             n = len(pos)
             impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
-            out[i] = {"force": fields.wrench[w, :n, :3].copy(), "pressure": fields.pressure[w, :n].copy(), "log_z": np.log(impedance)}
+            out[i] = {
+                "force": fields.wrench[w, :n, :3].copy(),
+                "pressure": fields.pressure[w, :n].copy(),
+                "log_z": np.log(impedance),
+            }
             if path is not None:
                 with replacing(path) as temporary:
                     np.savez(temporary, **out[i])
@@ -119,19 +145,28 @@ class Simulator:
             if bubble:
                 volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
                 # liquid and air in series: V / K + V0 / p0
-                options = dataclasses.replace(options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume)))
-            store[bubble] = SkinModel(geometry, material(self.material), options, "cpu" if self.tier == "condensed" else self.device)
+                options = dataclasses.replace(
+                    options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume))
+                )
+            store[bubble] = SkinModel(
+                geometry, material(self.material), options, "cpu" if self.tier == "condensed" else self.device
+            )
             store.setdefault("film", FilmConduction(geometry, sensor=self.sensor))
         model = store[bubble]
         if log_friction:
             model = copy.copy(model)
-            model.material = dataclasses.replace(model.material, friction=model.material.friction * float(np.exp(log_friction)))
+            model.material = dataclasses.replace(
+                model.material, friction=model.material.friction * float(np.exp(log_friction))
+            )
         return model, store["film"]
 
     def fields(self, trajectories, progress=True) -> "Fields":
-        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in `cache`."""
+        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in
+        `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
-        with tqdm.tqdm(total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False) as bar:
+        with tqdm.tqdm(
+            total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+        ) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
             slopes = {}
@@ -140,30 +175,44 @@ class Simulator:
                     dataclasses.replace(self, skin=skin, tier="condensed").solve(trajectories)
                     for skin in (self.skin, OTHER_MESH[self.skin])
                 )
-                slopes["mesh"] = [{k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)]
+                slopes["mesh"] = [
+                    {k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)
+                ]
                 tick(len(trajectories))
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
-                moved = self.solve(trajectories, offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories], progress=tick)
+                moved = self.solve(
+                    trajectories,
+                    offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
+                    progress=tick,
+                )
                 slopes["xyz"[axis]] = _difference(moved, base, _SHIFT)
             if spheres:
                 slopes["radius"] = _difference(
-                    self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick), base, _RADIUS
+                    self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
+                    base,
+                    _RADIUS,
                 )
-            slopes["friction"] = _difference(self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, _FRICTION)
-            slopes["bubble"] = _difference(self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE)
+            slopes["friction"] = _difference(
+                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, _FRICTION
+            )
+            slopes["bubble"] = _difference(
+                self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
+            )
         return Fields(base, slopes, trajectories)
 
-    # --- all stages ------------------------------------------------------------------------------------------------------------------
+    # --- all stages  ---
 
-    def run(self, trajectories, fields=None, exact=True, effects=None, modulus=None, offsets=None, nuisance=KNOWN) -> list[Run]:
+    def run(
+        self, trajectories, fields=None, exact=True, effects=None, modulus=None, offsets=None, nuisance=KNOWN
+    ) -> list[Run]:
         """What the sensor would read, without noise and rounding.
 
         Args:
           fields: Fields of the trajectories; None solves them.
-          exact: solve the skin anew where effects move the object; False uses the fields' differences; a list of indices does so for
-            those trajectories alone.
+          exact: solve the skin anew where effects move the object; False uses the fields' differences; a list
+            of indices does so for those trajectories alone.
           effects, modulus: None takes the simulator's; offsets: list of (3,) further shifts of the poses [m].
           nuisance: what the base model is off by; its modulus is a factor on the simulator's.
         """
@@ -178,7 +227,9 @@ class Simulator:
         for i, t in enumerate(trajectories):
             run = _begin(i, t, base[i], session, first)
             run.scale_load(modulus)
-            run.stiffness = modulus * _stiffness(base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t)
+            run.stiffness = modulus * _stiffness(
+                base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t
+            )
             run.log_friction = nuisance.log_friction
             if offsets is not None:
                 run.offset = run.offset + offsets[i]
@@ -208,35 +259,69 @@ class Simulator:
 
     def _mechanics(self, trajectories, runs, base, fields, exact, modulus):
         """Force, pressure and ln Z of runs whose object or contact has changed."""
-        changed = [i for i, r in enumerate(runs) if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble]
-        anew = changed if exact is True else [i for i in changed if i in set(np.atleast_1d(exact).tolist())] if exact is not False else []
+        changed = [
+            i
+            for i, r in enumerate(runs)
+            if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble
+        ]
+        anew = (
+            changed
+            if exact is True
+            else [i for i in changed if i in set(np.atleast_1d(exact).tolist())]
+            if exact is not False
+            else []
+        )
         if anew:
             kept = [runs[i] for i in anew]
-            solved = self.solve([trajectories[i] for i in anew], [r.offset for r in kept], [r.log_radius for r in kept],
-                                kept[0].log_friction, kept[0].bubble)  # fmt: skip
+            solved = self.solve(
+                [trajectories[i] for i in anew],
+                [r.offset for r in kept],
+                [r.log_radius for r in kept],
+                kept[0].log_friction,
+                kept[0].bubble,
+            )
             for run, one in zip(kept, solved):
-                run.force, run.pressure, run.log_z = modulus * one["force"], modulus * one["pressure"], one["log_z"].copy()
+                run.force, run.pressure, run.log_z = (
+                    modulus * one["force"],
+                    modulus * one["pressure"],
+                    one["log_z"].copy(),
+                )
         for i in sorted(set(changed) - set(anew)):
             run = runs[i]
             change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
-            parts = [("x", run.offset[:, 0]), ("y", run.offset[:, 1]), ("z", run.offset[:, 2]), ("radius", run.log_radius),
-                     ("friction", run.log_friction), ("bubble", run.bubble)]  # fmt: skip
+            parts = [
+                ("x", run.offset[:, 0]),
+                ("y", run.offset[:, 1]),
+                ("z", run.offset[:, 2]),
+                ("radius", run.log_radius),
+                ("friction", run.log_friction),
+                ("bubble", run.bubble),
+            ]
             for name, amount in parts:
                 if name in fields.slopes and np.any(amount):
                     for k in change:
                         slope = fields.slopes[name][i][k]
-                        change[k] = change[k] + (slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount))
+                        change[k] = change[k] + (
+                            slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount)
+                        )
             run.force = modulus * (base[i]["force"] + change["force"])
             run.pressure = modulus * (base[i]["pressure"] + change["pressure"])
             run.log_z = base[i]["log_z"] + change["log_z"]
 
-    # --- YAML ------------------------------------------------------------------------------------------------------------------------
+    # --- YAML  ---
 
     def save(self, path) -> None:
         """Writes the stages and effects as YAML."""
         import yaml
 
-        stages = {"set-up": [], "boundary": [], "contact": [], "constitutive": [], "transduction": [], "acquisition": []}
+        stages = {
+            "set-up": [],
+            "boundary": [],
+            "contact": [],
+            "constitutive": [],
+            "transduction": [],
+            "acquisition": [],
+        }
         for effect, theta in self.effects:
             parameters = {}
             for name, value in theta.items():
@@ -245,19 +330,27 @@ class Simulator:
                 if low is not None:
                     entry["interval95"] = [float(low), float(high)]
                 parameters[name] = entry
-            stages[STAGES[effect.stage]].append({"effect": effect.id, "name": effect.name, "parameters": parameters})
+            stages[STAGES[effect.stage]].append(
+                {"effect": effect.id, "name": effect.name, "parameters": parameters}
+            )
         document = {
-            "schema": SCHEMA, "skin": self.skin, "tier": self.tier, "material": self.material, "sensor": self.sensor,
-            "constitutive": self.constitutive, "modulus_factor": float(self.modulus), "stages": {k: v for k, v in stages.items() if v},
-        }  # fmt: skip
+            "schema": SCHEMA,
+            "skin": self.skin,
+            "tier": self.tier,
+            "material": self.material,
+            "sensor": self.sensor,
+            "constitutive": self.constitutive,
+            "modulus_factor": float(self.modulus),
+            "stages": {k: v for k, v in stages.items() if v},
+        }
         with replacing(path) as temporary:
             temporary.write_text(yaml.safe_dump(document, sort_keys=False))
 
 
 @dataclasses.dataclass
 class Fields:
-    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log (radius, friction), per m3;
-    "mesh": of another mesh, about rest."""
+    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
+    (radius, friction), per m3; "mesh": of another mesh, about rest."""
 
     base: list
     slopes: dict
@@ -276,14 +369,21 @@ def load_simulator(path, extra=()) -> Simulator:
 
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no sensor file {path}: write one with Simulator().save(path), or leave --sensor out")
+        raise FileNotFoundError(
+            f"no sensor file {path}: write one with Simulator().save(path), or leave --sensor out"
+        )
     try:
         document = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
-        raise ValueError(f"{path} is no YAML ({str(error).splitlines()[0]}): write one with Simulator().save(path)") from None
+        raise ValueError(
+            f"{path} is no YAML ({str(error).splitlines()[0]}): write one with Simulator().save(path)"
+        ) from None
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         found = document.get("schema") if isinstance(document, dict) else None
-        raise ValueError(f"{path} has schema {found!r}, {SCHEMA!r} is needed: write it with this version's Simulator().save(path)")
+        raise ValueError(
+            f"{path} has schema {found!r}, {SCHEMA!r} is needed: write it with this version's "
+            "Simulator().save(path)"
+        )
     effects, intervals = [], {}
     for stage, items in (document.get("stages") or {}).items():
         for item in items:
@@ -291,23 +391,31 @@ def load_simulator(path, extra=()) -> Simulator:
             theta = effect.default()
             for name, entry in item["parameters"].items():
                 if name not in effect.params:
-                    raise ValueError(f"{path}: effect {effect.id!r} has no parameter {name!r}; it has {', '.join(effect.params)}")
+                    raise ValueError(
+                        f"{path}: effect {effect.id!r} has no parameter {name!r}; it has "
+                        f"{', '.join(effect.params)}"
+                    )
                 theta[name] = float(entry["value"])
                 if "interval95" in entry:
                     intervals.setdefault(effect.id, {})[name] = tuple(entry["interval95"])
             if STAGES[effect.stage] != stage:
-                raise ValueError(f"{path}: effect {effect.id!r} acts at the stage {STAGES[effect.stage]!r}, not {stage!r}")
+                raise ValueError(
+                    f"{path}: effect {effect.id!r} acts at the stage {STAGES[effect.stage]!r}, not {stage!r}"
+                )
             effects.append((effect, theta))
     keys = {k: document[k] for k in ("skin", "tier", "material", "sensor") if k in document}
     kinds = {"reduced": Simulator, "in_skin": InSkinSimulator}
     kind = document.get("constitutive", "reduced")
     if kind not in kinds:
         raise ValueError(f"{path}: constitutive {kind!r} is none of {', '.join(kinds)}")
-    return kinds[kind](**keys, effects=effects, modulus=float(document.get("modulus_factor", 1.0)), intervals=intervals)
+    return kinds[kind](
+        **keys, effects=effects, modulus=float(document.get("modulus_factor", 1.0)), intervals=intervals
+    )
 
 
 def placed(t, shift=None, grow=0.0):
-    """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied by exp(grow), its tip kept."""
+    """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
+    by exp(grow), its tip kept."""
     tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)
     if grow and "sphere" in tool:
         radius = _sphere_radius(tool)
@@ -325,10 +433,21 @@ def _begin(order, t, base, session, first_tdc):
         warm = temperature_from_counts(t.tdc) - temperature_from_counts(first_tdc[0])
     touch = int(np.argmax(t.depth))
     return Run(
-        time=t.time, clock=t.clock + t.time, tool=t.tool, heading=t.heading, depth=t.depth, place=t.pos[touch], order=order,
-        offset=np.zeros((len(t.time), 3)), force=base["force"].copy(), pressure=base["pressure"].copy(), log_z=base["log_z"].copy(),
-        temperature=warm, session=session, rest_log_z=base["log_z"][0].copy(),
-    )  # fmt: skip
+        time=t.time,
+        clock=t.clock + t.time,
+        tool=t.tool,
+        heading=t.heading,
+        depth=t.depth,
+        place=t.pos[touch],
+        order=order,
+        offset=np.zeros((len(t.time), 3)),
+        force=base["force"].copy(),
+        pressure=base["pressure"].copy(),
+        log_z=base["log_z"].copy(),
+        temperature=warm,
+        session=session,
+        rest_log_z=base["log_z"][0].copy(),
+    )
 
 
 def _stiffness(base, slopes, t):

@@ -18,15 +18,18 @@ THRESHOLDS = {
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there
     "named": 0.8,  # of the closable log mean square that all have to close, else the rest is unknown
-    "significant": 1.1,  # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
+    # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
+    "significant": 1.1,
     "peak": 2.5,  # the same of the worst channel
-    "tie": 1.64,  # standard errors over trajectories by which a name has to lead, else the other is named with it
+    # standard errors over trajectories by which a name has to lead, else the other is named with it
+    "tie": 1.64,
     "alike": 0.97,  # share of its evidence beyond which the other is named with it too
     "simpler": 0.75,  # standard errors within which the one with fewer parameters comes first
     "most": 3,  # effects
     "refit": 6,  # effects that are refitted after the screen
 }
-# Logistic of a confidence; terms: 1, log1p(nats), share of the excess closed, log of what is left, lead over the runner-up [z], tied.
+# Logistic of a confidence; terms: 1, log1p(nats), share of the excess closed, log of what is left, lead over
+# the runner-up [z], tied.
 CONFIDENCE = (-0.84, 0.583, 1.103, -1.437, 0.064, 0.476)
 
 
@@ -39,7 +42,8 @@ def confidence(nats, closed, left, lead, ties) -> float:
     """Probability that a name is the right one.
 
     Args:
-      nats: per trajectory, left out. closed: share of the excess that all effects close. left: mean log mean square that remains.
+      nats: per trajectory, left out. closed: share of the excess that all effects close. left: mean log mean
+        square that remains.
       lead: over the runner-up, in standard errors over trajectories. ties: how many others do as well.
     """
     return float(1 / (1 + np.exp(-np.dot(CONFIDENCE, terms(nats, closed, left, lead, ties)))))

@@ -1,11 +1,11 @@
-"""How 19 electrodes move together: time bins, the load's covariance, and the amplitude of a pattern over time.
+"""How 19 electrodes move together: time bins, the load's covariance, and the amplitude of a pattern over
+time.
 
-ln Z of all electrodes moves on few dimensions while the skin is loaded. The covariance S of *fast* changes (within a few seconds) knows
-these and the noise, and hardly any drift. For a pattern p the amplitude a(t) = p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the
-load
-disturbs least (the minimum-variance filter, Capon, Proc. IEEE 57, 1969). With p = e_k it is the residual of predicting electrode k from the
-other 18, with p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain average: one formula for both.
-"""
+ln Z of all electrodes moves on few dimensions while the skin is loaded. The covariance S of *fast* changes
+(within a few seconds) knows these and the noise, and hardly any drift. For a pattern p the amplitude a(t) =
+p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the load disturbs least (the minimum-variance filter,
+Capon, Proc. IEEE 57, 1969). With p = e_k it is the residual of predicting electrode k from the other 18, with
+p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain average: one formula for both."""
 
 import numpy as np
 
@@ -24,10 +24,12 @@ class Timeline:
     Args:
       recording: Recording.
       counts: (n, 19) to use in its place, e.g. corrected for an effect.
-      masked: (n, 19) bool, samples that are no measurement; an electrode masked for more than half of the rows is left out.
+      masked: (n, 19) bool, samples that are no measurement; an electrode masked for more than half of the
+        rows is left out.
 
     Attributes:
-      width: rows per bin; time: (m,) [s] of the bins' middle; value: (m, c) ln Z; used: (c,) electrode numbers from 0.
+      width: rows per bin; time: (m,) [s] of the bins' middle; value: (m, c) ln Z; used: (c,) electrode
+        numbers from 0.
       noise: (c,) standard deviation of a bin's value from white noise of the samples [ln Z].
       covariance: (c, c) of fast changes; loaded: whether the skin was loaded.
     """
@@ -50,7 +52,9 @@ class Timeline:
         weight = good.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
             self.value = np.where(weight > 0, (y * good).sum(1) / weight, np.nan)
-        slope = 4095 / (np.clip(counts[:, self.used], 1, 4094) * (4095 - np.clip(counts[:, self.used], 1, 4094)))
+        slope = 4095 / (
+            np.clip(counts[:, self.used], 1, 4094) * (4095 - np.clip(counts[:, self.used], 1, 4094))
+        )
         sample = noise_level(counts[:, self.used], recording.repeated) * np.median(slope, axis=0)
         effective = max(1.0, self.width * (1 - recording.repeated.mean()))
         self.noise = np.maximum(sample, 1e-5) / np.sqrt(effective)
@@ -61,13 +65,19 @@ class Timeline:
         self._departures = {}
         self.covariance = self._fast_covariance()
         c = len(self.used)
-        apart = np.eye(c) - 1 / c  # what all electrodes do alike is no load: a contact raises some and lowers others
+        apart = (
+            np.eye(c) - 1 / c
+        )  # what all electrodes do alike is no load: a contact raises some and lowers others
         size = np.sqrt(np.diag(apart @ self.covariance @ apart))
         # A load moves electrodes by tens of counts within seconds; noise, filtered or not, does not.
-        self.loaded = bool(np.median(np.sort(size / white)[-6:]) > 5 and np.median(np.sort(size / np.median(slope, axis=0))[-6:]) > 6)
+        self.loaded = bool(
+            np.median(np.sort(size / white)[-6:]) > 5
+            and np.median(np.sort(size / np.median(slope, axis=0))[-6:]) > 6
+        )
 
     def _fill(self):
-        """Bins without a good sample take the conditional mean given the others, or the electrode's median."""
+        """Bins without a good sample take the conditional mean given the others, or the electrode's
+        median."""
         hole = np.isnan(self.value)
         self.hole = hole
         if not hole.any():
@@ -90,7 +100,8 @@ class Timeline:
         x = self.value[: k * span].reshape(k, span, -1)
         basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
         x = x - basis @ (basis.T @ x)
-        # A step inside one window is a change of the sensor, not the load's: the liveliest windows give way to the next.
+        # A step inside one window is a change of the sensor, not the load's: the liveliest windows give way
+        # to the next.
         energy = (x**2).sum((1, 2))
         x = x[energy <= np.quantile(energy, 0.98)].reshape(-1, x.shape[2])
         return x.T @ x / len(x) * span / (span - 2) + np.diag(self.noise**2)
@@ -102,7 +113,8 @@ class Timeline:
         return (self.value - self.value.mean(0)) @ q / scale, 1 / np.sqrt(scale)
 
     def jumps(self, known=(), seconds=0.6):
-        """Changes of level within a bin: rows (q,) of bins, change (q, c) of means over `seconds` before and after [ln Z], bins on a side.
+        """Changes of level within a bin: rows (q,) of bins, change (q, c) of means over `seconds` before and
+        after [ln Z], bins on a side.
 
         Bins near `known` times [s] of jumps already found are left out.
         """
@@ -114,7 +126,11 @@ class Timeline:
         at = np.arange(w, n - w - 1)
         for time in known:
             at = at[np.abs(self.time[at] - time) > (w + 2) * self.period]
-        return at, (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w, w  # bin `at` itself may be cut in two
+        return (
+            at,
+            (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w,
+            w,
+        )  # bin `at` itself may be cut in two
 
     def jump_at(self, row, known=(), seconds=6.0):
         """(c,) change of level at bin `row`, a straight line on either side taken into account [ln Z]."""
@@ -133,11 +149,12 @@ class Timeline:
         return np.linalg.lstsq(design, self.value[rows], rcond=None)[0][2]
 
     def explained_by_others(self, k):
-        """A function that takes out of (m,) or (m, q) what the other electrodes can say about electrode `used[k]`; loaded only.
+        """A function that takes out of (m,) or (m, q) what the other electrodes can say about electrode
+        `used[k]`; loaded only.
 
-        Ridge regression on the others and on squares and products of their six principal components, because the place of a contact bends
-        what two electrodes have to do with each other. What an effect does must go through the same function before it is fitted.
-        """
+        Ridge regression on the others and on squares and products of their six principal components, because
+        the place of a contact bends what two electrodes have to do with each other. What an effect does must
+        go through the same function before it is fitted."""
         if k not in self._departures:
             x = np.delete(self.value, k, axis=1)
             x = x - x.mean(0)
@@ -145,8 +162,16 @@ class Timeline:
             keep = s > 1e-9 * s[0]
             score = u[:, :6] * np.sqrt(len(x))
             i, j = np.triu_indices(score.shape[1])
-            a = np.concatenate([np.ones((len(x), 1)), u[:, keep] * np.sqrt(len(x)), score[:, i] * score[:, j]], axis=1)
-            weight = np.concatenate([[0.0], np.mean(self.noise**2) / np.maximum(s[keep] ** 2 / len(x), 1e-12), np.full(len(i), 0.02)])
+            a = np.concatenate(
+                [np.ones((len(x), 1)), u[:, keep] * np.sqrt(len(x)), score[:, i] * score[:, j]], axis=1
+            )
+            weight = np.concatenate(
+                [
+                    [0.0],
+                    np.mean(self.noise**2) / np.maximum(s[keep] ** 2 / len(x), 1e-12),
+                    np.full(len(i), 0.02),
+                ]
+            )
             inverse = np.linalg.inv(a.T @ a / len(x) + np.diag(weight)) @ a.T / len(x)
             self._departures[k] = a, inverse
         a, inverse = self._departures[k]
@@ -154,7 +179,8 @@ class Timeline:
 
 
 def noise_level(counts, repeated=None, least=0.05):
-    """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the quietest quarter of the record."""
+    """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the
+    quietest quarter of the record."""
     x = counts if repeated is None else counts[~repeated]
     d = np.diff(x, n=2, axis=0) / np.sqrt(6)
     size = max(20, len(d) // 60)

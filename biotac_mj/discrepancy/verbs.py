@@ -10,7 +10,10 @@ def diagnose_verb(args):
     if args.electrodes and args.data:
         raise ValueError("give either DATA (an HDF5 file with --sensor) or --electrodes, not both")
     if not (args.electrodes or args.data):
-        raise ValueError("nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 columns of raw counts)")
+        raise ValueError(
+            "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 "
+            "columns of raw counts)"
+        )
     if args.electrodes:
         from .plain import diagnose_recording
         from .recorded_report import summary, write_report

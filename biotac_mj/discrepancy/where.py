@@ -15,13 +15,17 @@ def phases(t) -> dict:
     limit = 0.1 * max(np.abs(speed).max(), 1e-9)
     slide = touch & (across > np.maximum(limit, np.abs(speed)))
     return {
-        "free": ~touch, "slide": slide, "approach": touch & ~slide & (speed > limit), "unload": touch & ~slide & (speed < -limit),
+        "free": ~touch,
+        "slide": slide,
+        "approach": touch & ~slide & (speed > limit),
+        "unload": touch & ~slide & (speed < -limit),
         "hold": touch & ~slide & (np.abs(speed) <= limit),
-    }  # fmt: skip
+    }
 
 
 def conditions(trajectories) -> dict:
-    """name -> per trajectory (boolean rows, weight): phases, load, tool, place, session's clock and temperature.
+    """name -> per trajectory (boolean rows, weight): phases, load, tool, place, session's clock and
+    temperature.
 
     A weight of 1 asks for the mean residual of the rows, a centred one for its trend over trajectories.
     """
@@ -37,27 +41,38 @@ def conditions(trajectories) -> dict:
     for tool in tools if len(tools) > 1 else ():
         out[tool] = [(rows & (t.tool == tool), 1.0) for t, rows in zip(trajectories, touch)]
     place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
-    trends = {"along finger": place[:, 0], "across finger": place[:, 2], "clock": [t.clock for t in trajectories]}
+    trends = {
+        "along finger": place[:, 0],
+        "across finger": place[:, 2],
+        "clock": [t.clock for t in trajectories],
+    }
     if all(t.tdc is not None for t in trajectories):
         trends["temperature"] = [float(t.tdc.mean()) for t in trajectories]
     for name, values in trends.items():
         spread = np.std(values)
         if spread > 0:
-            rows = [np.ones(len(t.time), bool) for t in trajectories] if name in ("clock", "temperature") else touch
+            rows = (
+                [np.ones(len(t.time), bool) for t in trajectories]
+                if name in ("clock", "temperature")
+                else touch
+            )
             out[name] = list(zip(rows, (values - np.mean(values)) / spread))
     return out
 
 
 def channel_groups(comparison) -> dict:
     """name -> slice of the residual's columns: every electrode, PDC, force."""
-    return {**{f"e{k + 1}": slice(k, k + 1) for k in range(19)}, **{k: s for k, s in comparison.groups.items() if k != "electrodes"}}
+    return {
+        **{f"e{k + 1}": slice(k, k + 1) for k in range(19)},
+        **{k: s for k, s in comparison.groups.items() if k != "electrodes"},
+    }
 
 
 def where(comparison, null, chosen):
     """Cells channel x condition that stand out; family-wise p by sign flips of whole trajectories.
 
-    All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times that, a trend 0.3 sigma.
-    """
+    All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times
+    that, a trend 0.3 sigma."""
     white = null.residuals(comparison)
     cells, names, large = [], [], []
     for condition, parts in conditions([comparison.trajectories[i] for i in chosen]).items():
@@ -74,7 +89,11 @@ def where(comparison, null, chosen):
     if not cells:
         return []
     t, p = max_t(np.array(cells).T)
-    out = [{"channel": n[0], "condition": n[1], "t": float(a), "p": float(b)} for n, a, b, c in zip(names, t, p, large) if b < 0.05 and c]
+    out = [
+        {"channel": n[0], "condition": n[1], "t": float(a), "p": float(b)}
+        for n, a, b, c in zip(names, t, p, large)
+        if b < 0.05 and c
+    ]
     return sorted(out, key=lambda c: -abs(c["t"]))
 
 
@@ -83,14 +102,18 @@ def _features(t):
     touched = np.cumsum(t.depth > 20e-6) > 0
     since = np.where(touched, t.time - t.time[np.argmax(touched)] if touched.any() else 0, 0)
     return {
-        "depth": t.depth / 1e-3, "speed": np.sign(speed) * np.log1p(np.abs(speed) / 1e-4), "time since contact": np.log1p(since / 0.1),
+        "depth": t.depth / 1e-3,
+        "speed": np.sign(speed) * np.log1p(np.abs(speed) / 1e-4),
+        "time since contact": np.log1p(since / 0.1),
         "place along the finger": np.full(len(t.time), t.pos[np.argmax(t.depth), 0] / 5e-3),
-        "place across": np.full(len(t.time), t.pos[np.argmax(t.depth), 2] / 5e-3), "session's clock": np.full(len(t.time), t.clock / 300),
-    }  # fmt: skip
+        "place across": np.full(len(t.time), t.pos[np.argmax(t.depth), 2] / 5e-3),
+        "session's clock": np.full(len(t.time), t.clock / 300),
+    }
 
 
 def depends_on(comparison, current, chosen):
-    """What the remainder depends on: held-out share that features explain, and what permuting each of them costs."""
+    """What the remainder depends on: held-out share that features explain, and what permuting each of them
+    costs."""
     white = current.residuals(comparison)
     y = np.concatenate([white[i] for i in chosen])
     u, s, vt = np.linalg.svd(y, full_matrices=False)
@@ -106,7 +129,10 @@ def depends_on(comparison, current, chosen):
     loss = {n: share - _explained(np.delete(x, k, axis=1), y, owner) for k, n in enumerate(names)}
     top = [n for n, v in sorted(loss.items(), key=lambda kv: -kv[1]) if v > 0.05 * share][:2]
     rest = [n for n in names if n not in top]
-    return f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; these explain {share:.0%} of it on trajectories left out"  # noqa: E501
+    return (
+        f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; "
+        f"these explain {share:.0%} of it on trajectories left out"
+    )  # noqa: E501
 
 
 def _explained(x, y, owner):

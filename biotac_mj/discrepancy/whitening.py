@@ -1,4 +1,5 @@
-"""Residuals of trajectories with noise, model resolution and repeatability of the set-up taken into account."""
+"""Residuals of trajectories with noise, model resolution and repeatability of the set-up taken into
+account."""
 
 import dataclasses
 
@@ -9,15 +10,19 @@ from .simulator import Fields, Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
 
-REPEATABILITY = 0.05e-3  # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
-_RESOLUTION = 0.01  # of a channel's largest change: the base model (mesh, tier, film) is not better than that (docs/condensed.md)
+REPEATABILITY = (
+    0.05e-3  # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
+)
+# of a channel's largest change: the base model (mesh, tier, film) is not better than that (docs/condensed.md)
+_RESOLUTION = 0.01
 
 
 @dataclasses.dataclass
 class Comparison:
     """Data against a simulator: trajectories, noise, fields.
 
-    Whitening marginalises the pose error b_i of every trial: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the fields' differences
+    Whitening marginalises the pose error b_i of every trial: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the
+      fields' differences
     (Woodbury, rank 3). Electrodes are compared about their rest: the mean over all trajectories of row 0.
     """
 
@@ -43,18 +48,27 @@ class Comparison:
             width += 3
         self.width = width
         self.measured = [
-            self._stack(t.electrodes - self.rest, None if t.pdc is None else t.pdc - self.rest_pdc, t.force) for t in self.trajectories
+            self._stack(t.electrodes - self.rest, None if t.pdc is None else t.pdc - self.rest_pdc, t.force)
+            for t in self.trajectories
         ]
         largest = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
         sigma = np.concatenate(
-            [self.noise["electrodes"], *([[self.noise["pdc"]]] if self.has_pdc else []), *([self.noise["force"]] if self.has_force else [])]
+            [
+                self.noise["electrodes"],
+                *([[self.noise["pdc"]]] if self.has_pdc else []),
+                *([self.noise["force"]] if self.has_force else []),
+            ]
         )
-        floor = np.concatenate([np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()])
+        floor = np.concatenate(
+            [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
+        )
         self.sigma = np.hypot(sigma, floor)
         self._prepare()
 
     def _stack(self, electrodes, pdc, force):
-        return np.column_stack([electrodes, *([pdc] if self.has_pdc else []), *([force] if self.has_force else [])])
+        return np.column_stack(
+            [electrodes, *([pdc] if self.has_pdc else []), *([force] if self.has_force else [])]
+        )
 
     def _prepare(self):
         """Whitened pose columns of every trajectory (orthonormal) and how much each is shrunk."""
@@ -66,7 +80,10 @@ class Comparison:
             columns = []
             for axis in "xyz":
                 slope = self.fields.slopes[axis][i]
-                columns.append(self._stack(counts_per_log * slope["log_z"], slope["pressure"] / 36.5, slope["force"]) / self.sigma)
+                columns.append(
+                    self._stack(counts_per_log * slope["log_z"], slope["pressure"] / 36.5, slope["force"])
+                    / self.sigma
+                )
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
             u, s, _ = np.linalg.svd(J, full_matrices=False)
             self._basis.append((u, 1 - 1 / np.sqrt(1 + s**2)))
@@ -85,10 +102,14 @@ class Comparison:
 
     def residuals(self, effects, nuisance=KNOWN, exact=False) -> list:
         """Whitened residuals of every trajectory."""
-        runs = self.sim.run(self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance)
+        runs = self.sim.run(
+            self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance
+        )
         return [self.whiten(i, m - p) for i, (m, p) in enumerate(zip(self.measured, self.predict(runs)))]
 
     def raw(self, effects, nuisance=KNOWN, exact=False) -> list:
         """Residuals (n, width) in counts, counts and newtons."""
-        runs = self.sim.run(self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance)
+        runs = self.sim.run(
+            self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance
+        )
         return [m - p for m, p in zip(self.measured, self.predict(runs))]

@@ -1,4 +1,5 @@
-"""The report of the full workflow: report.html with figures, verdict.json, sensor_amended.yaml, and the summary for the terminal."""
+"""The report of the full workflow: report.html with figures, verdict.json, sensor_amended.yaml, and the
+summary for the terminal."""
 
 import html
 import json
@@ -21,14 +22,23 @@ def diagnose_data(args) -> None:
     """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`."""
     out = pathlib.Path(args.out)
     data = read_trajectories(args.data)
-    sim = load_simulator(args.sensor) if args.sensor else InSkinSimulator() if args.in_skin else Simulator(tier=args.tier)
+    sim = (
+        load_simulator(args.sensor)
+        if args.sensor
+        else InSkinSimulator()
+        if args.in_skin
+        else Simulator(tier=args.tier)
+    )
     if args.in_skin and not isinstance(sim, InSkinSimulator):
         raise ValueError(
-            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: in_skin` into it, or leave --in-skin out"
+            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: in_skin` "
+            "into it, or leave --in-skin out"
         )
     sim.device = args.device
     if args.device != "cpu" and (sim.tier != "full" or args.in_skin):
-        raise ValueError(f"--device {args.device} is for the full tier without --in-skin: add --tier full, or leave it out")
+        raise ValueError(
+            f"--device {args.device} is for the full tier without --in-skin: add --tier full, or leave it out"
+        )
     sim.cache = str(out / "fields")  # solved fields stay: run again after an interruption
     report = diagnose(sim, data, locked=0.25 if args.locked is None else args.locked, progress=not args.quiet)
     files = write_report(report, sim, out)
@@ -42,15 +52,29 @@ def verdict_dict(report: Report) -> dict:
 
     return _plain(
         {
-            "schema": 1, "kind": "trajectories", "verdict": report.verdict, "significant": report.verdict != "no significant disagreement",
+            "schema": 1,
+            "kind": "trajectories",
+            "verdict": report.verdict,
+            "significant": report.verdict != "no significant disagreement",
             "effects": [{**e, "stage": STAGES[e["stage"]]} for e in report.effects],
-            "ranking": [{"id": i, "nats_per_trajectory": n, "p": p} for i, n, p in report.ranking], "where": report.where,
-            "gap_before": report.before, "gap_after": report.after, "share_closed": report.closed, "remainder": report.remainder,
-            "isolability": report.isolability, "next_experiment": report.next_experiment, "cannot_be_known": report.notes,
-            "trajectories": {"fitted": len(report.selection), "kept_aside": [report.comparison.trajectories[i].id for i in report.locked]},
-            "thresholds": THRESHOLDS, "threshold_hash": threshold_hash(), "repeatability_m": report.comparison.repeatability,
+            "ranking": [{"id": i, "nats_per_trajectory": n, "p": p} for i, n, p in report.ranking],
+            "where": report.where,
+            "gap_before": report.before,
+            "gap_after": report.after,
+            "share_closed": report.closed,
+            "remainder": report.remainder,
+            "isolability": report.isolability,
+            "next_experiment": report.next_experiment,
+            "cannot_be_known": report.notes,
+            "trajectories": {
+                "fitted": len(report.selection),
+                "kept_aside": [report.comparison.trajectories[i].id for i in report.locked],
+            },
+            "thresholds": THRESHOLDS,
+            "threshold_hash": threshold_hash(),
+            "repeatability_m": report.comparison.repeatability,
         }
-    )  # fmt: skip
+    )
 
 
 def summary(report: Report) -> str:
@@ -61,10 +85,14 @@ def summary(report: Report) -> str:
         lines.append(f"  where: {len(report.where)} cells of channel x condition at family-wise 5 %: {cells}")
     for e in report.effects:
         lines.append(
-            f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats per trajectory left out, p {e['p']:.2g}"  # noqa: E501
+            f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats "
+            f"per trajectory left out, p {e['p']:.2g}"  # noqa: E501
         )
         for p in e["parameters"][:4]:
-            lines.append(f"    {p['name']} {p['value']:.4g} {p['unit']} ({p['interval95'][0]:.4g} .. {p['interval95'][1]:.4g})")
+            lines.append(
+                f"    {p['name']} {p['value']:.4g} {p['unit']} ({p['interval95'][0]:.4g} .. "
+                f"{p['interval95'][1]:.4g})"
+            )
     lines.append(f"  proof on {len(report.locked)} trajectories kept aside, the skin solved again:")
     for group in report.comparison.groups:
         unit = "N" if group == "force" else "counts"
@@ -82,7 +110,12 @@ def write_report(report: Report, sim: Simulator, folder) -> list:
     """Writes report.html, verdict.json, sensor_amended.yaml and the figures; returns the paths."""
     folder = pathlib.Path(folder)
     pictures = []
-    for name, draw in (("channels.png", _channels), ("where.png", _where), ("evidence.png", _evidence), ("isolability.png", _isolability)):
+    for name, draw in (
+        ("channels.png", _channels),
+        ("where.png", _where),
+        ("evidence.png", _evidence),
+        ("isolability.png", _isolability),
+    ):
         figure = draw(report)
         with replacing(folder / name) as temporary:
             figure.savefig(temporary, dpi=110)
@@ -125,7 +158,8 @@ def _channels(report):
 
 
 def _where(report):
-    """Mean whitened residual of the model without effects (or its trend over trajectories), channel x condition; dots: significant."""
+    """Mean whitened residual of the model without effects (or its trend over trajectories), channel x
+    condition; dots: significant."""
     from .fitting import fit_effects
 
     c = report.comparison
@@ -133,7 +167,11 @@ def _where(report):
     names, asked = _channel_names(report), conditions([c.trajectories[i] for i in report.selection])
     table = np.full((len(asked), len(names)), np.nan)
     for k, parts in enumerate(asked.values()):
-        means = [weight * white[i][rows].mean(0) for i, (rows, weight) in zip(report.selection, parts) if rows.any()]
+        means = [
+            weight * white[i][rows].mean(0)
+            for i, (rows, weight) in zip(report.selection, parts)
+            if rows.any()
+        ]
         if means:
             table[k] = np.mean(means, axis=0)
     figure, ax = _figure(9, 0.8 + 0.28 * len(asked))
@@ -154,7 +192,9 @@ def _evidence(report):
     ax.barh(
         y,
         [n for _, n, _ in report.ranking],
-        color=["tab:blue" if any(e["id"] == i for e in report.effects) else "0.7" for i, _, _ in report.ranking],
+        color=[
+            "tab:blue" if any(e["id"] == i for e in report.effects) else "0.7" for i, _, _ in report.ranking
+        ],
     )
     ax.set_yticks(y, [i for i, _, _ in report.ranking], fontsize=8)
     ax.axvline(THRESHOLDS["gain"], color="k", lw=0.7, ls=":")
@@ -167,7 +207,11 @@ def _isolability(report):
     ids = report.isolability["ids"]
     image = ax.imshow(report.isolability["matrix"], vmin=0, vmax=1, cmap="viridis")
     ax.set_xticks(np.arange(len(ids)), ids, rotation=90, fontsize=7)
-    ax.set_yticks(np.arange(len(ids)), [f"{i} ({n:.2g} nats)" for i, n in zip(ids, report.isolability["nats"])], fontsize=7)
+    ax.set_yticks(
+        np.arange(len(ids)),
+        [f"{i} ({n:.2g} nats)" for i, n in zip(ids, report.isolability["nats"])],
+        fontsize=7,
+    )
     ax.set_title("share of the row's signature that the column cannot mimic", fontsize=9)
     figure.colorbar(image)
     return figure
@@ -178,19 +222,25 @@ def _page(report, pictures):
     rows = []
     for e in report.effects:
         numbers = "<br>".join(
-            f"{p['name']} {p['value']:.4g} {esc(p['unit'])} ({p['interval95'][0]:.4g} .. {p['interval95'][1]:.4g})" for p in e["parameters"]
+            f"{p['name']} {p['value']:.4g} {esc(p['unit'])} ({p['interval95'][0]:.4g} .. "
+            f"{p['interval95'][1]:.4g})"
+            for p in e["parameters"]
         )
         rows.append(
             f"<tr><td><b>{esc(e['name'])}</b><br>{esc(e['physics'])}</td><td>{STAGES[e['stage']]}</td><td>{numbers}</td><td>{e['confidence']:.2f}</td>"
             f"<td>{e['nats']:.1f}</td><td>{e['p']:.2g}</td><td>{esc(', '.join(e['ties']) or 'none')}</td></tr>"
         )
-    gap = "".join(f"<tr><td>{g}</td><td>{report.before[g]:.4g}</td><td>{report.after[g]:.4g}</td></tr>" for g in report.comparison.groups)
+    gap = "".join(
+        f"<tr><td>{g}</td><td>{report.before[g]:.4g}</td><td>{report.after[g]:.4g}</td></tr>"
+        for g in report.comparison.groups
+    )
     closed = f"{report.closed:.0%}" if np.isfinite(report.closed) else "nothing to close"
     notes = "".join(f"<li>{esc(n)}</li>" for n in report.notes)
     image = {name.split(".")[0]: f'<img src="{name}" style="max-width:100%">' for name in pictures}
     level, after = report.trace["before"], report.trace["after"]
     cells = "".join(
-        f"<tr><td>{c['channel']}</td><td>{c['condition']}</td><td>{c['t']:.1f}</td><td>{c['p']:.2g}</td></tr>" for c in report.where[:20]
+        f"<tr><td>{c['channel']}</td><td>{c['condition']}</td><td>{c['t']:.1f}</td><td>{c['p']:.2g}</td></tr>"
+        for c in report.where[:20]
     )
     return f"""<!doctype html><meta charset="utf-8"><title>diagnosis</title>
 <style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}table{{border-collapse:collapse;font-size:13px}}

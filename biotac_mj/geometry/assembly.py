@@ -1,4 +1,5 @@
-"""Puts a skin mesh and its rigid parts together: which surface is which, which nodes are held, where the electrodes are."""
+"""Puts a skin mesh and its rigid parts together: which surface is which, which nodes are held, where the
+electrodes are."""
 
 import numpy as np
 
@@ -20,7 +21,8 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     parts = mesh.boundary_components()
     if len(parts) != 2:
         raise ValueError(
-            f"the skin's boundary has {len(parts)} closed part{'s' * (len(parts) != 1)}, not an outer and an inner surface: "
+            f"the skin's boundary has {len(parts)} closed part{'s' * (len(parts) != 1)}, not an outer and "
+            "an inner surface: "
             "mesh the skin as one shell around one cavity"
         )
     outer, inner = parts
@@ -33,12 +35,16 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         or (box[0][0] > box[1][0]).any()
         or (box[0][1] < box[1][1]).any()
     ):
-        raise ValueError("the outer surface of the skin does not enclose the inner one: mesh the skin as one shell around one cavity")
+        raise ValueError(
+            "the outer surface of the skin does not enclose the inner one: mesh the skin as one shell "
+            "around one cavity"
+        )
     return outer, inner
 
 
 def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
-    """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m, 3)), ...].
+    """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m,
+    3)), ...].
 
     Distances are computed in millimetres: trimesh drops small triangles of a mesh in metres.
     """
@@ -53,11 +59,12 @@ def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
 
 
 def lin_electrodes_on(core_vert, core_face) -> tuple[np.ndarray, np.ndarray]:
-    """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19, 3).
+    """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19,
+    3).
 
-    The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a mean over the faces around the
-    point (area times a Gaussian of 0.25 mm), because one small face of a tessellated core says little.
-    """
+    The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a
+    mean over the faces around the point (area times a Gaussian of 0.25 mm), because one small face of a
+    tessellated core says little."""
     x, y, z = LIN_ELECTRODES.T
     point = np.stack([BioTacDimensions().electrode_origin_x - x, z, y], axis=-1) * 1e-3
     position, _, _ = _closest(core_vert, core_face, point)
@@ -73,12 +80,15 @@ def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> Sk
     """A checked SkinGeometry from a shell and three rigid bodies (vert [m], face).
 
     Raises:
-      ValueError: see `TetMesh.check` and `split_surfaces`; a rigid body that is open; no held node; wrong units.
+      ValueError: see `TetMesh.check` and `split_surfaces`; a rigid body that is open; no held node; wrong
+        units.
     """
     mesh.check()
     size = np.ptp(mesh.vert, axis=0).max() * 1e3
     if not 5.0 <= size <= 100.0:
-        raise ValueError(f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: is the file in metres?")
+        raise ValueError(
+            f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: is the file in metres?"
+        )
     outer, inner = split_surfaces(mesh)
     for (vert, face), label in ((core, "core"), (nail, "nail plate"), (clamp, "clamp plate")):
         check_closed(np.asarray(face), label)
@@ -87,13 +97,26 @@ def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> Sk
     fixed = held_nodes(mesh.vert, (core, nail, clamp))
     if not len(fixed):
         raise ValueError(
-            f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the same frame and units?"
+            f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the "
+            "same frame and units?"
         )
     position, normal = lin_electrodes_on(*core) if electrodes is None else electrodes
     return SkinGeometry(
-        name=name, vert=mesh.vert, elem=mesh.elem, outer_face=outer, inner_face=inner, fixed=fixed, core_vert=core[0], core_face=core[1],
-        nail_vert=nail[0], nail_face=nail[1], clamp_vert=clamp[0], clamp_face=clamp[1], electrode_pos=position, electrode_normal=normal,
-    )  # fmt: skip
+        name=name,
+        vert=mesh.vert,
+        elem=mesh.elem,
+        outer_face=outer,
+        inner_face=inner,
+        fixed=fixed,
+        core_vert=core[0],
+        core_face=core[1],
+        nail_vert=nail[0],
+        nail_face=nail[1],
+        clamp_vert=clamp[0],
+        clamp_face=clamp[1],
+        electrode_pos=position,
+        electrode_normal=normal,
+    )
 
 
 def _closest(vert, face, point):

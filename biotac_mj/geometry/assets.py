@@ -24,5 +24,6 @@ def asset_path(name: str) -> pathlib.Path:
             return root / name
     looked = " and ".join(str(root) for root in dict.fromkeys(roots))
     raise FileNotFoundError(
-        f"missing asset {name!r} (looked in {looked}): reinstall biotac_mj, or run `python scripts/make_assets.py` in a checkout"
+        f"missing asset {name!r} (looked in {looked}): reinstall biotac_mj, or run `python "
+        "scripts/make_assets.py` in a checkout"
     )

@@ -12,12 +12,12 @@ __all__ = ["skin_numbers", "write_card"]
 
 
 def skin_numbers(skin: SkinGeometry) -> dict:
-    """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the electrodes to the inner skin [mm].
+    """Numbers of a skin: counts, angles [deg], volumes [mm^3], thickness [mm], box [mm], gaps of the
+    electrodes to the inner skin [mm].
 
-    Ten-node tetrahedra count as the eight four-node ones that they make.
-    Thickness is the distance of each inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the
-    way from the electrode along its normal to the inner surface.
-    """
+    Ten-node tetrahedra count as the eight four-node ones that they make. Thickness is the distance of each
+    inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the way from
+    the electrode along its normal to the inner surface."""
     import trimesh
 
     mesh = TetMesh(skin.vert, skin.tets)
@@ -25,7 +25,10 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     outer = trimesh.Trimesh(vert, skin.outer_face, process=False)
     inner = trimesh.Trimesh(vert, skin.inner_face, process=False)
     _, thickness, _ = trimesh.proximity.closest_point(outer, vert[np.unique(skin.inner_face)])
-    cavity, core = -enclosed_volume(vert, skin.inner_face), enclosed_volume(skin.core_vert * 1e3, skin.core_face)
+    cavity, core = (
+        -enclosed_volume(vert, skin.inner_face),
+        enclosed_volume(skin.core_vert * 1e3, skin.core_face),
+    )
     lowest = np.degrees(mesh.dihedral_angles.min(axis=1))
     return {
         "nodes": skin.nvert,
@@ -36,7 +39,8 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "held nodes": len(skin.fixed),
         "minimum dihedral angle": lowest.min(),
         "minimum dihedral angle, 1st percentile over tetrahedra": np.percentile(lowest, 1),
-        "share of inner nodes two or more edges from the outside": 1 - np.mean(np.isin(*_inner_and_linked(skin))),
+        "share of inner nodes two or more edges from the outside": 1
+        - np.mean(np.isin(*_inner_and_linked(skin))),
         "skin volume": mesh.volumes.sum() * 1e9,
         "cavity volume": cavity,
         "core volume": core,
@@ -55,7 +59,8 @@ def _inner_and_linked(skin):
 
 
 def _ray_lengths(surface, origin, direction):
-    """Distance (n,) along each ray to the nearest face of a trimesh; nan where it misses (Moeller-Trumbore)."""
+    """Distance (n,) along each ray to the nearest face of a trimesh; nan where it misses
+    (Moeller-Trumbore)."""
     a, b, c = (surface.triangles[:, i] for i in range(3))
     length = np.full(len(origin), np.nan)
     for i, (o, d) in enumerate(zip(origin, direction)):
@@ -71,7 +76,8 @@ def _ray_lengths(surface, origin, direction):
 
 
 def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
-    """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came about."""
+    """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came
+    about."""
     n = skin_numbers(skin)
     low, high = n.pop("box")
     gaps = n.pop("gaps")
@@ -79,7 +85,9 @@ def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
     rows = []
     for key, value in n.items():
         number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
-        rows.append(f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |")
+        rows.append(
+            f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |"
+        )
     rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
     rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
     text = "\n".join([

@@ -8,22 +8,27 @@ from biotac_mj.geometry.skin_geometry import PARTS, SkinGeometry
 
 __all__ = ["EDGES", "with_edge_nodes"]
 
-EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])  # of the nodes 4..9, in the order of CalculiX's C3D10
+EDGES = np.array(
+    [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
+)  # of the nodes 4..9, in the order of CalculiX's C3D10
 
-_FOLD = 0.3  # least share of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in each of its parts
+# least share of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in each
+# of its parts
+_FOLD = 0.3
 
 
 def with_edge_nodes(geometry: SkinGeometry, project=None) -> SkinGeometry:
     """Puts a node on every edge of a skin of four-node tetrahedra.
 
-    The nodes of `geometry` come first and keep their numbers. Every boundary face f becomes four (4 f .. 4 f + 3). The new node of a
-    boundary edge is fixed where both its ends are.
+    The nodes of `geometry` come first and keep their numbers. Every boundary face f becomes four (4 f .. 4 f
+    + 3). The new node of a boundary edge is fixed where both its ends are.
 
     Args:
       geometry: a skin with elem (nelem, 4).
-      project: None leaves new nodes in the middle of their edges; else a function from points (n, 3) and a name, "outer" or "inner", to the
-        nearest points (n, 3) of that surface [m], applied to the new nodes of boundary edges. Where that would fold or nearly fold a
-        tetrahedron, its new nodes go only part of the way.
+      project: None leaves new nodes in the middle of their edges; else a function from points (n, 3) and a
+        name, "outer" or "inner", to the nearest points (n, 3) of that surface [m], applied to the new nodes
+        of boundary edges. Where that would fold or nearly fold a tetrahedron, its new nodes go only part of
+        the way.
 
     Returns:
       The same skin with elem (nelem, 10): corners, then edges in the order of `EDGES`.
@@ -71,7 +76,8 @@ def with_edge_nodes(geometry: SkinGeometry, project=None) -> SkinGeometry:
 
 
 def shape_gradients(points) -> np.ndarray:
-    """(npoint, 10, 3) derivatives of the ten shape functions by the barycentric coordinates 1..3 at barycentric points (npoint, 4)."""
+    """(npoint, 10, 3) derivatives of the ten shape functions by the barycentric coordinates 1..3 at
+    barycentric points (npoint, 4)."""
     by_all = np.zeros((len(points), 10, 4))
     for point, b in enumerate(points):
         for i in range(4):

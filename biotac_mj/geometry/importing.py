@@ -1,4 +1,5 @@
-"""Reads skins made elsewhere: `.tet` with `.obj` rigid bodies (as in NVlabs/biotac_sim), `.msh` and `.vtu` through meshio."""
+"""Reads skins made elsewhere: `.tet` with `.obj` rigid bodies (as in NVlabs/biotac_sim), `.msh` and `.vtu`
+through meshio."""
 
 import os
 import pathlib
@@ -18,13 +19,16 @@ _MESHES = (".tet", ".msh", ".vtu")
 def import_mesh(path, name: str | None = None) -> SkinGeometry:
     """A skin from a folder, or from a mesh file whose folder also holds the rigid bodies.
 
-    The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of the same folder is read;
-    together they must hold three closed bodies: the core (the largest), the nail plate, and the clamp plate (further to +x than the nail).
+    The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of
+    the same folder is read;
+    together they must hold three closed bodies: the core (the largest), the nail plate, and the clamp plate
+      (further to +x than the nail).
     Nodes within 1e-5 m of them are held; electrodes are Lin et al. 2013's, projected onto this core.
 
     Raises:
       FileNotFoundError: no such path, or no mesh in the folder.
-      ValueError: unreadable file, a mesh that `TetMesh.check` refuses, wrong units, missing rigid bodies; the text says what to do.
+      ValueError: unreadable file, a mesh that `TetMesh.check` refuses, wrong units, missing rigid bodies; the
+        text says what to do.
     """
     path = pathlib.Path(path)
     if path.is_dir():
@@ -32,20 +36,25 @@ def import_mesh(path, name: str | None = None) -> SkinGeometry:
         if not found:
             raise FileNotFoundError(f"no mesh in {path}: it needs one file ending in {', '.join(_MESHES)}")
         if len(found) > 1:
-            raise ValueError(f"{path} holds several meshes ({', '.join(p.name for p in found)}): pass the path of one of them")
+            raise ValueError(
+                f"{path} holds several meshes ({', '.join(p.name for p in found)}): pass the path of one of "
+                "them"
+            )
         path = found[0]
     mesh = read_tet_mesh(path).check()
     size = np.ptp(mesh.vert, axis=0).max()
     if not 0.005 <= size <= 0.1:
         raise ValueError(
-            f"{path.name}: the largest dimension is {size:.4g} m, not between 0.005 and 0.1 m (5 to 100 mm): scale the file to metres"
+            f"{path.name}: the largest dimension is {size:.4g} m, not between 0.005 and 0.1 m (5 to 100 "
+            "mm): scale the file to metres"
         )
     core, nail, clamp = _rigid_bodies(path.parent)
     return assemble(name or path.parent.name, mesh, core, nail, clamp)
 
 
 def read_tet_mesh(path) -> TetMesh:
-    """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; nodes of no tetrahedron are dropped for the last two.
+    """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; nodes of no tetrahedron
+    are dropped for the last two.
 
     Raises:
       FileNotFoundError: no such file.
@@ -67,11 +76,14 @@ def read_tet_mesh(path) -> TetMesh:
     elem = mesh.cells_dict.get("tetra")
     if elem is None:
         raise ValueError(
-            f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: mesh the volume with 4-node tetrahedra"
+            f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: mesh the "
+            "volume with 4-node tetrahedra"
         )
     if (elem >= len(mesh.points)).any() or (elem < 0).any():
         return TetMesh(mesh.points, elem)  # check() explains
-    used, elem = np.unique(elem, return_inverse=True)  # such files also hold the points of curves and surfaces
+    used, elem = np.unique(
+        elem, return_inverse=True
+    )  # such files also hold the points of curves and surfaces
     return TetMesh(mesh.points[used], elem.reshape(-1, 4))
 
 
@@ -85,12 +97,21 @@ def _read_tet(path) -> TetMesh:
             elif word and word[0] == "t":
                 elem.append([int(w) for w in word[1:5]])
         except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}; lines must read `v x y z w` or `t a b c d`") from error
-        if word and word[0] in "vt" and len((vert if word[0] == "v" else elem)[-1]) < (3 if word[0] == "v" else 4):
-            raise ValueError(f"{path}, line {number} is cut short: lines must read `v x y z w` or `t a b c d`")
+            raise ValueError(
+                f"{path}, line {number}: {error}; lines must read `v x y z w` or `t a b c d`"
+            ) from error
+        if (
+            word
+            and word[0] in "vt"
+            and len((vert if word[0] == "v" else elem)[-1]) < (3 if word[0] == "v" else 4)
+        ):
+            raise ValueError(
+                f"{path}, line {number} is cut short: lines must read `v x y z w` or `t a b c d`"
+            )
     if not vert or not elem:
         raise ValueError(
-            f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: lines must read `v x y z w` and `t a b c d` (0-based)"
+            f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: lines must read `v x y z w` and "
+            "`t a b c d` (0-based)"
         )
     return TetMesh(np.array(vert), np.array(elem))
 
@@ -103,7 +124,8 @@ def _lines(path):
 
 
 def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The connected bodies of a Wavefront .obj, polygons cut into triangles, equal positions merged: [(vert (n, 3), face (m, 3)), ...].
+    """The connected bodies of a Wavefront .obj, polygons cut into triangles, equal positions merged: [(vert
+    (n, 3), face (m, 3)), ...].
 
     Raises:
       ValueError: it cannot be read.
@@ -122,14 +144,19 @@ def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
                 corner = [c - 1 if c > 0 else len(vert) + c for c in corner]
                 face += [(corner[0], corner[i], corner[i + 1]) for i in range(1, len(corner) - 1)]
         except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}; export the rigid bodies again as .obj") from error
+            raise ValueError(
+                f"{path}, line {number}: {error}; export the rigid bodies again as .obj"
+            ) from error
     if not face or np.max(face) >= len(vert) or np.min(face) < 0:
         raise ValueError(
-            f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): export the rigid bodies again as .obj"
+            f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): export the rigid "
+            "bodies again as .obj"
         )
     vert, index = np.unique(np.array(vert), axis=0, return_inverse=True)
     face = index.reshape(-1)[np.array(face)]
-    graph = sparse.coo_matrix((np.ones(2 * len(face)), (face[:, :2].T.ravel(), face[:, 1:].T.ravel())), shape=(len(vert),) * 2)
+    graph = sparse.coo_matrix(
+        (np.ones(2 * len(face)), (face[:, :2].T.ravel(), face[:, 1:].T.ravel())), shape=(len(vert),) * 2
+    )
     _, label = sparse.csgraph.connected_components(graph, directed=False)
     bodies = []
     for part in np.unique(label[face[:, 0]]):
@@ -142,7 +169,9 @@ def write_obj(path, vert, face) -> pathlib.Path:
     """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1)
+    text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(
+        f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1
+    )
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".obj")
     with os.fdopen(handle, "w") as file:
         file.write(text)
@@ -157,7 +186,8 @@ def _rigid_bodies(folder):
     bodies = [body for file in files for body in read_obj(file)]
     if len(bodies) != 3:
         raise ValueError(
-            f"found {len(bodies)} rigid bodies in the .obj files of {folder} ({', '.join(p.name for p in files) or 'none'}), need three: "
+            f"found {len(bodies)} rigid bodies in the .obj files of {folder} "
+            f"({', '.join(p.name for p in files) or 'none'}), need three: "
             "core, nail plate and clamp plate, closed, in metres, in the skin's frame"
         )
     bodies = [(vert, face if enclosed_volume(vert, face) > 0 else face[:, ::-1]) for vert, face in bodies]

@@ -1,8 +1,9 @@
 """The eight indenters of Narang et al., ICRA 2021, as MuJoCo shapes. In the names the number is a diameter.
 
-The indenter frame: tip at the origin, pressing direction +y, so that the body lies in y <= 0. Dimensions were measured on the paper's
-meshes; handles and mounts, which never touch the skin, are left out. Edges of cylinders, cube and ring are rounded with 1 mm.
-"""
+The indenter frame: tip at the origin, pressing direction +y, so that the body lies in y <= 0. Dimensions were
+  measured on the paper's
+meshes; handles and mounts, which never touch the skin, are left out. Edges of cylinders, cube and ring are
+rounded with 1 mm."""
 
 import dataclasses
 
@@ -25,7 +26,8 @@ class Indenter:
       name: as in the paper.
       geom_type: MuJoCo's: "sphere", "cylinder", "box" or "mesh".
       size: MuJoCo's half sizes [m]: (radius,), (radius, half length), three half widths, or () for a mesh.
-      rounding: radius of the edges [m]: the true shape is the geom shrunk by it, then inflated by it. 0 for spheres.
+      rounding: radius of the edges [m]: the true shape is the geom shrunk by it, then inflated by it. 0 for
+        spheres.
       pos: centre of the geom in the indenter frame [m].
       quat: its orientation there (w, x, y, z).
       mesh_asset: name for `asset_path`, of the shape with its rounded edges in the indenter frame [m].
@@ -43,11 +45,14 @@ class Indenter:
         return f"indenters/{self.name}.obj"
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """The shape with its rounded edges as a closed mesh: vert (n, 3) [m], indenter frame, face (m, 3), normals outwards."""
+        """The shape with its rounded edges as a closed mesh: vert (n, 3) [m], indenter frame, face (m, 3),
+        normals outwards."""
         if self.geom_type == "sphere":
             radius = self.size[0]
             angle = np.linspace(0.0, np.pi, 49)
-            vert, face = _revolve(np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1), closed=False)
+            vert, face = _revolve(
+                np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1), closed=False
+            )
         elif self.geom_type == "cylinder":
             radius, half = self.size
             vert, face = _revolve(_rounded_rectangle(0.0, radius, -half, half, self.rounding), closed=False)
@@ -55,7 +60,9 @@ class Indenter:
         elif self.geom_type == "box":
             vert, face = _rounded_box(np.array(self.size), self.rounding)
         else:
-            vert, face = _revolve(_rounded_rectangle(*_RING, -_RING_HEIGHT / 2, _RING_HEIGHT / 2, self.rounding), closed=True)
+            vert, face = _revolve(
+                _rounded_rectangle(*_RING, -_RING_HEIGHT / 2, _RING_HEIGHT / 2, self.rounding), closed=True
+            )
         return vert + np.array(self.pos), face
 
 
@@ -93,7 +100,8 @@ def indenter(name: str) -> Indenter:
 
 
 def _rounded_rectangle(inner, outer, low, high, edge, arc=9):
-    """Clockwise profile (n, 2) of (radius, height), corners rounded; for inner = 0 it runs from the axis at `high` to the axis at `low`."""
+    """Clockwise profile (n, 2) of (radius, height), corners rounded; for inner = 0 it runs from the axis at
+    `high` to the axis at `low`."""
     quarter = np.linspace(0.0, np.pi / 2, arc)
 
     def corner(r, y, start):
@@ -107,29 +115,44 @@ def _rounded_rectangle(inner, outer, low, high, edge, arc=9):
 
 
 def _revolve(profile, closed, count=96):
-    """Closed mesh by turning a clockwise profile (n, 2) of (radius, height) about y; an open profile starts and ends on the axis."""
+    """Closed mesh by turning a clockwise profile (n, 2) of (radius, height) about y; an open profile starts
+    and ends on the axis."""
     angle = np.arange(count) * 2 * np.pi / count
     if not closed:
         top, bottom, profile = profile[0], profile[-1], profile[1:-1]
     n = len(profile)
     vert = np.stack(
-        [np.outer(np.cos(angle), profile[:, 0]), np.tile(profile[:, 1], (count, 1)), np.outer(np.sin(angle), profile[:, 0])], axis=-1
+        [
+            np.outer(np.cos(angle), profile[:, 0]),
+            np.tile(profile[:, 1], (count, 1)),
+            np.outer(np.sin(angle), profile[:, 0]),
+        ],
+        axis=-1,
     ).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(count), np.arange(n if closed else n - 1), indexing="ij")
     a, b = i * n + j, i * n + (j + 1) % n
     c, d = (a + n) % (count * n), ((i + 1) % count) * n + (j + 1) % n
-    face = np.concatenate([np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)])
+    face = np.concatenate(
+        [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)]
+    )
     if not closed:
         ring = np.arange(count) * n
         following = np.roll(ring, -1)
         poles = np.full(count, len(vert))
-        face = np.concatenate([face, np.stack([poles, following, ring], -1), np.stack([poles + 1, ring + n - 1, following + n - 1], -1)])
+        face = np.concatenate(
+            [
+                face,
+                np.stack([poles, following, ring], -1),
+                np.stack([poles + 1, ring + n - 1, following + n - 1], -1),
+            ]
+        )
         vert = np.concatenate([vert, [[0.0, top[1], 0.0], [0.0, bottom[1], 0.0]]])
     return vert, face.astype(np.int32)
 
 
 def _rounded_box(half, edge, arc=9):
-    """Closed mesh of a box with half widths (3,) and rounded edges: a cube's grid, whose outer cells are bent round the edges."""
+    """Closed mesh of a box with half widths (3,) and rounded edges: a cube's grid, whose outer cells are bent
+    round the edges."""
     bend = np.tan(np.linspace(0.0, np.pi / 4, (arc + 1) // 2))  # equal angles on each half of an edge
     line = np.concatenate([-1 - bend[::-1], [0.0], 1 + bend])  # |coordinate| >= 1: in the rounding
     n = len(line)

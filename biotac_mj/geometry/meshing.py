@@ -1,8 +1,8 @@
-"""Tetrahedral meshes between parametric bodies, made with fTetWild (development extras `pytetwild` and `pyvista`). Millimetres throughout.
+"""Tetrahedral meshes between parametric bodies, made with fTetWild (development extras `pytetwild` and
+`pyvista`). Millimetres throughout.
 
-fTetWild keeps within an envelope of the surfaces it is given; afterwards boundary nodes are moved onto the parametric surfaces, and all
-nodes move, along the surfaces and inside, to round the worst tetrahedra.
-"""
+fTetWild keeps within an envelope of the surfaces it is given; afterwards boundary nodes are moved onto the
+parametric surfaces, and all nodes move, along the surfaces and inside, to round the worst tetrahedra."""
 
 import contextlib
 import tempfile
@@ -14,11 +14,14 @@ from biotac_mj.geometry.tet_mesh import TetMesh
 __all__ = ["improve", "mesh_between", "surface_mesh"]
 
 # Edge matrix (columns) of the regular tetrahedron, inverted: the rest shape of the mean-ratio measure.
-_REGULAR = np.linalg.inv(np.array([[1.0, 0.5, 0.5], [0.0, np.sqrt(3) / 2, np.sqrt(3) / 6], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]))
+_REGULAR = np.linalg.inv(
+    np.array([[1.0, 0.5, 0.5], [0.0, np.sqrt(3) / 2, np.sqrt(3) / 6], [0.0, 0.0, np.sqrt(2.0 / 3.0)]])
+)
 
 
 def surface_mesh(body, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Closed triangle mesh of a `Body`: vert (n, 3), face (m, 3), symmetric in z; a contour on a grid of `spacing` [mm], projected."""
+    """Closed triangle mesh of a `Body`: vert (n, 3), face (m, 3), symmetric in z; a contour on a grid of
+    `spacing` [mm], projected."""
     import pyvista
 
     low, high = np.array([-22.0, -9.0, -8.0]), np.array([7.5, 6.0, 8.0])
@@ -49,9 +52,18 @@ def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coar
     if inner is not None:
         face = np.concatenate([face, surfaces[1][1][:, ::-1] + len(vert)])
         vert = np.concatenate([vert, surfaces[1][0]])
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # fTetWild leaves a file where it runs
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.chdir(folder),
+    ):  # fTetWild leaves a file where it runs
         vert, elem = pytetwild.tetrahedralize(
-            vert, face.astype(np.int32), edge_length_abs=edge, epsilon=epsilon, stop_energy=8.0, coarsen=coarsen, num_threads=1
+            vert,
+            face.astype(np.int32),
+            edge_length_abs=edge,
+            epsilon=epsilon,
+            stop_energy=8.0,
+            coarsen=coarsen,
+            num_threads=1,
         )
     mesh = TetMesh(vert, elem)
     inverted = mesh.volumes < 0
@@ -60,13 +72,13 @@ def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coar
 
 
 def improve(mesh: TetMesh, bodies, iterations: int = 150, power: float = 8.0) -> TetMesh:
-    """Moves nodes to round the tetrahedra; nodes of the boundary part i stay on bodies[i] (parts by decreasing enclosed volume).
+    """Moves nodes to round the tetrahedra; nodes of the boundary part i stay on bodies[i] (parts by
+    decreasing enclosed volume).
 
-    Lowers the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular tetrahedron: 1 for a
-    regular one, infinite for a flat one (mean ratio); the power lets the worst count.
-    Descent with a step per node in the surfaces' tangent planes, projected
-    back onto the surfaces, halved until the energy falls.
-    """
+    Lowers the sum over tetrahedra of (|F|^2 / (3 det(F)^(2/3)))^power, F the map from the regular
+    tetrahedron: 1 for a regular one, infinite for a flat one (mean ratio); the power lets the worst count.
+    Descent with a step per node in the surfaces' tangent planes, projected back onto the surfaces, halved
+    until the energy falls."""
     vert, elem = mesh.vert.copy(), mesh.elem
     owner = np.full(len(vert), -1)
     for i, part in enumerate(mesh.boundary_components()):
@@ -90,12 +102,19 @@ def improve(mesh: TetMesh, bodies, iterations: int = 150, power: float = 8.0) ->
             length *= 0.5
         else:
             break
-        vert, value, gradient, share, length = trial, new_value, new_gradient, new_share, min(2.0 * length, 4.0)
+        vert, value, gradient, share, length = (
+            trial,
+            new_value,
+            new_gradient,
+            new_share,
+            min(2.0 * length, 4.0),
+        )
     return TetMesh(vert, elem)
 
 
 def _roundness(vert, elem, power):
-    """Energy of `improve`, its gradient (nvert, 3) and the tetrahedra's shares (nelem,); infinite when one is inverted."""
+    """Energy of `improve`, its gradient (nvert, 3) and the tetrahedra's shares (nelem,); infinite when one is
+    inverted."""
     corner = vert[elem]
     edges = np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)
     shape = edges @ _REGULAR
@@ -105,7 +124,8 @@ def _roundness(vert, elem, power):
     norm = np.sum(shape**2, axis=(1, 2))
     ratio = norm / (3 * det ** (2 / 3))
     slope = (power * ratio ** (power - 1))[:, None, None] * (
-        2 * shape / (3 * det ** (2 / 3))[:, None, None] - (2 / 3) * ratio[:, None, None] * np.swapaxes(np.linalg.inv(shape), 1, 2)
+        2 * shape / (3 * det ** (2 / 3))[:, None, None]
+        - (2 / 3) * ratio[:, None, None] * np.swapaxes(np.linalg.inv(shape), 1, 2)
     )
     force = np.swapaxes(slope @ _REGULAR.T, 1, 2)  # (nelem, 3 corners, 3)
     gradient = np.zeros_like(vert)
@@ -116,7 +136,8 @@ def _roundness(vert, elem, power):
 
 
 def _project(vert, owner, bodies, elem, fallback=None):
-    """Nodes moved onto their surfaces; nodes of tetrahedra that this inverts go part of the way (or back to `fallback`)."""
+    """Nodes moved onto their surfaces; nodes of tetrahedra that this inverts go part of the way (or back to
+    `fallback`)."""
     target = vert.copy()
     for i, body in enumerate(bodies):
         target[owner == i] = body.project(vert[owner == i])

@@ -1,18 +1,29 @@
 """The parametric BioTac: skin, core, nail plate, clamp plate and electrodes as smooth implicit bodies.
 
-The shape is described in millimetres, as it was published and measured; `SkinGeometry`, which the rest of the package sees, is in metres.
+The shape is described in millimetres, as it was published and measured; `SkinGeometry`, which the rest of the
+package sees, is in metres.
 
 Sources of the numbers:
   [lin]  the 19 electrode coordinates and the 30 degree facet of Lin et al. 2013.
-  [nv]   dimensions measured on the mesh of Narang et al., ICRA 2021 (NVlabs/biotac_sim, MIT): least-squares fits of the section family
-         below to its surface vertices, rounded to 0.01 mm; its vertices lie within 0.06 mm RMS of these surfaces, most of it at the clamp.
+  [nv]   dimensions measured on the mesh of Narang et al., ICRA 2021 (NVlabs/biotac_sim, MIT): least-squares
+  fits of the section family
+         below to its surface vertices, rounded to 0.01 mm; its vertices lie within 0.06 mm RMS of these
+         surfaces, most of it at the clamp.
 """
 
 import dataclasses
 
 import numpy as np
 
-__all__ = ["BioTacDimensions", "Body", "LIN_ELECTRODES", "biotac_bodies", "clamp_plate", "electrodes", "nail_plate"]
+__all__ = [
+    "BioTacDimensions",
+    "Body",
+    "LIN_ELECTRODES",
+    "biotac_bodies",
+    "clamp_plate",
+    "electrodes",
+    "nail_plate",
+]
 
 # [lin]: E1..E19 in Lin's frame (x to the fingertip, z out of the nail) [mm]; E11..E16 mirror E1..E6 in y.
 _LEFT = (
@@ -28,8 +39,9 @@ _SPINE = ((-2.8, 0.0, -5.08), (-9.8, 0.0, -5.08), (-13.6, 0.0, -5.08))
 LIN_ELECTRODES = np.array(_LEFT + _MIDDLE + tuple((x, -y, z) for x, y, z in _LEFT) + _SPINE)
 LIN_ELECTRODES.setflags(write=False)
 
-# Sections at x [mm]: (x, centre y, radius, height of the flat top, radius of the edge between them). [nv]
-# The flat tops are constant up to x = 0: there the skin is bonded to the nail plate (outside) and to the core (inside).
+# Sections at x [mm]: (x, centre y, radius, height of the flat top, radius of the edge between them). [nv] The
+# flat tops are constant up to x = 0: there the skin is bonded to the nail plate (outside) and to the core
+# (inside).
 _OUTER = (
     (-18.0, -0.79, 6.97, 3.479, 3.60),
     (-15.0, -0.89, 6.99, 3.479, 3.60),
@@ -72,12 +84,14 @@ _CORE = (
 class BioTacDimensions:
     """Every dimension of the parametric BioTac [mm], BioTac frame (tip -x, pad -y, nail +y, clamp +x).
 
-    A body is a row of sections, each a disc cut by a flat top with a rounded edge: rows (x, centre y, radius, top, edge radius).
-    Beyond `*_tip` towards the fingertip the last section is turned about the y axis, which makes the spherical tip.
-    """
+    A body is a row of sections, each a disc cut by a flat top with a rounded edge: rows (x, centre y, radius,
+    top, edge radius). Beyond `*_tip` towards the fingertip the last section is turned about the y axis, which
+    makes the spherical tip."""
 
     outer: tuple = _OUTER  # outer skin [nv]
-    outer_tip: float = -14.34  # centre of the tip sphere [nv]: the outermost point of the mesh is at x = -21.31
+    outer_tip: float = (
+        -14.34
+    )  # centre of the tip sphere [nv]: the outermost point of the mesh is at x = -21.31
     outer_end: float = 6.65  # end face on the clamp plate [nv]
     outer_end_edge: float = 1.80  # its rounded edge [nv]
     cavity: tuple = _CAVITY  # inner skin [nv]
@@ -86,9 +100,16 @@ class BioTacDimensions:
     cavity_end_edge: float = 0.42  # [nv]
     core: tuple = _CORE  # rigid core, 10.65 mm in diameter [nv]
     core_tip: float = -13.98  # [nv]
-    core_end: float = 5.08  # [nv] has 5.105, 0.025 mm inside the skin; equal to cavity_end here, so that the skin is bonded without overlap
-    core_end_edge: float = 0.90  # [nv] has 0.5; wider, so that chords of the skin across its own edge of 0.42 do not cut into the core
-    facet_normal: tuple = (-0.5, -0.8660254037844386, 0.0)  # flat of electrodes E7-E10, 30 degrees to the axis [lin]
+    # [nv] has 5.105, 0.025 mm inside the skin; equal to cavity_end here, so that the skin is bonded without
+    # overlap
+    core_end: float = 5.08
+    # [nv] has 0.5; wider, so that chords of the skin across its own edge of 0.42 do not cut into the core
+    core_end_edge: float = 0.90
+    facet_normal: tuple = (
+        -0.5,
+        -0.8660254037844386,
+        0.0,
+    )  # flat of electrodes E7-E10, 30 degrees to the axis [lin]
     facet_offset: float = 10.795  # its distance from the origin [nv]
     facet_edge: float = 0.30  # [nv]
     nail_thickness: float = 1.0  # [nv]
@@ -97,11 +118,14 @@ class BioTacDimensions:
     clamp_thickness: float = 1.0  # [nv]
     clamp_centre_y: float = -0.8125  # [nv]
     clamp_radius: float = 4.1245  # [nv]
-    electrode_origin_x: float = -12.30  # x' = -x - 12.30, y' = z, z' = y turns Lin's frame into the BioTac frame (a proper rotation)
+    electrode_origin_x: float = (
+        -12.30
+    )  # x' = -x - 12.30, y' = z, z' = y turns Lin's frame into the BioTac frame (a proper rotation)
 
 
 def _cut_disc(y, w, radius, top):
-    """Signed distance in the (w, y) half plane, w >= 0, to the disc of `radius` about the origin cut at y = top; exact outside it."""
+    """Signed distance in the (w, y) half plane, w >= 0, to the disc of `radius` about the origin cut at y =
+    top; exact outside it."""
     top = np.minimum(top, radius)
     half = np.sqrt(radius * radius - top * top)
     corner = np.where(w <= half, y - top, np.hypot(w - half, y - top))
@@ -110,18 +134,25 @@ def _cut_disc(y, w, radius, top):
 
 def _rounded_max(a, b, edge):
     """Intersection of two distance fields with a rounded edge."""
-    return np.minimum(np.maximum(a, b) + edge, 0.0) + np.hypot(np.maximum(a + edge, 0.0), np.maximum(b + edge, 0.0)) - edge
+    return (
+        np.minimum(np.maximum(a, b) + edge, 0.0)
+        + np.hypot(np.maximum(a + edge, 0.0), np.maximum(b + edge, 0.0))
+        - edge
+    )
 
 
 class Body:
-    """A smooth solid, negative inside: sections along x, a turned tip, a flat end and perhaps a facet. Millimetres."""
+    """A smooth solid, negative inside: sections along x, a turned tip, a flat end and perhaps a facet.
+    Millimetres."""
 
     def __init__(self, sections, tip: float, end: float, end_edge: float, facet=None):
         from scipy.interpolate import PchipInterpolator
 
         table = np.asarray(sections, dtype=float)
         self._x, self._tip, self._end, self._end_edge, self._facet = table[:, 0], tip, end, end_edge, facet
-        self._section = PchipInterpolator(table[:, 0], table[:, 1:], axis=0)  # monotone, so that the flat tops stay exactly flat
+        self._section = PchipInterpolator(
+            table[:, 0], table[:, 1:], axis=0
+        )  # monotone, so that the flat tops stay exactly flat
 
     def field(self, point: np.ndarray) -> np.ndarray:
         """Implicit function at (n, 3) [mm] -> (n,); close to a distance, zero on the surface."""
@@ -137,7 +168,9 @@ class Body:
     def gradient(self, point: np.ndarray, step: float = 1e-4) -> np.ndarray:
         """(n, 3) gradient of `field` by central differences; step [mm]."""
         shift = step * np.eye(3)
-        return np.stack([(self.field(point + s) - self.field(point - s)) / (2 * step) for s in shift], axis=-1)
+        return np.stack(
+            [(self.field(point + s) - self.field(point - s)) / (2 * step) for s in shift], axis=-1
+        )
 
     def normal(self, point: np.ndarray) -> np.ndarray:
         """(n, 3) unit outward normals."""
@@ -163,11 +196,15 @@ def biotac_bodies(dimensions: BioTacDimensions = BioTacDimensions()) -> dict[str
     return {
         "outer": Body(d.outer, d.outer_tip, d.outer_end, d.outer_end_edge),
         "cavity": Body(d.cavity, d.cavity_tip, d.cavity_end, d.cavity_end_edge),
-        "core": Body(d.core, d.core_tip, d.core_end, d.core_end_edge, (d.facet_normal, d.facet_offset, d.facet_edge)),
+        "core": Body(
+            d.core, d.core_tip, d.core_end, d.core_end_edge, (d.facet_normal, d.facet_offset, d.facet_edge)
+        ),
     }
 
 
-def electrodes(core: Body, dimensions: BioTacDimensions = BioTacDimensions()) -> tuple[np.ndarray, np.ndarray]:
+def electrodes(
+    core: Body, dimensions: BioTacDimensions = BioTacDimensions()
+) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 on the core: positions (19, 3) [mm] and unit outward normals (19, 3)."""
     x, y, z = LIN_ELECTRODES.T
     position = core.project(np.stack([dimensions.electrode_origin_x - x, z, y], axis=-1))
@@ -175,11 +212,14 @@ def electrodes(core: Body, dimensions: BioTacDimensions = BioTacDimensions()) ->
 
 
 def nail_plate(dimensions: BioTacDimensions = BioTacDimensions()) -> tuple[np.ndarray, np.ndarray]:
-    """Closed mesh of the nail plate on the flat top of the outer skin: vert (n, 3) [mm], face (m, 3); its end at the tip is round."""
+    """Closed mesh of the nail plate on the flat top of the outer skin: vert (n, 3) [mm], face (m, 3); its end
+    at the tip is round."""
     d = dimensions
     angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 25)
     centre = d.nail_x[0] + d.nail_half_width
-    outline = np.stack([centre + d.nail_half_width * np.cos(angle), d.nail_half_width * np.sin(angle)], axis=1)
+    outline = np.stack(
+        [centre + d.nail_half_width * np.cos(angle), d.nail_half_width * np.sin(angle)], axis=1
+    )
     side = np.linspace(0.0, 1.0, 10)[1:, None]
     low = outline[-1] + side * (np.array([d.nail_x[1], -d.nail_half_width]) - outline[-1])
     outline = np.concatenate([outline, low, low[::-1] * [1.0, -1.0]])  # counter-clockwise in (x, z)
@@ -189,16 +229,20 @@ def nail_plate(dimensions: BioTacDimensions = BioTacDimensions()) -> tuple[np.nd
 
 
 def clamp_plate(dimensions: BioTacDimensions = BioTacDimensions()) -> tuple[np.ndarray, np.ndarray]:
-    """Closed mesh of the clamp plate: vert (n, 3) [mm], face (m, 3), a disc on the end face of the outer skin."""
+    """Closed mesh of the clamp plate: vert (n, 3) [mm], face (m, 3), a disc on the end face of the outer
+    skin."""
     d = dimensions
     angle = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
-    outline = np.stack([d.clamp_centre_y + d.clamp_radius * np.cos(angle), d.clamp_radius * np.sin(angle)], axis=1)
+    outline = np.stack(
+        [d.clamp_centre_y + d.clamp_radius * np.cos(angle), d.clamp_radius * np.sin(angle)], axis=1
+    )
     vert, face = _prism(outline, d.outer_end, d.outer_end + d.clamp_thickness)
     return vert[:, [2, 0, 1]], face  # (y, z, x) -> (x, y, z) is a rotation
 
 
 def _prism(outline, low, high):
-    """Convex prism over a counter-clockwise outline (n, 2), from `low` to `high` along the third axis: closed, normals outwards."""
+    """Convex prism over a counter-clockwise outline (n, 2), from `low` to `high` along the third axis:
+    closed, normals outwards."""
     n = len(outline)
     middle = outline.mean(axis=0)
     ring = np.concatenate([outline, middle[None]])

@@ -1,4 +1,5 @@
-"""What a BioTac skin is: a tetrahedral shell, its surfaces, the rigid parts that hold it and the electrodes."""
+"""What a BioTac skin is: a tetrahedral shell, its surfaces, the rigid parts that hold it and the
+electrodes."""
 
 import dataclasses
 import os
@@ -9,21 +10,37 @@ import numpy as np
 
 __all__ = ["PARTS", "SkinGeometry"]
 
-# the eight four-node tetrahedra that ten nodes make: four at the corners, four around the octahedron's diagonal 4-9
-PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3], [4, 9, 5, 6], [4, 9, 8, 5], [4, 9, 7, 8], [4, 9, 6, 7]])
+# the eight four-node tetrahedra that ten nodes make: four at the corners, four around the octahedron's
+# diagonal 4-9
+PARTS = np.array(
+    [
+        [0, 4, 6, 7],
+        [4, 1, 5, 8],
+        [6, 5, 2, 9],
+        [7, 8, 9, 3],
+        [4, 9, 5, 6],
+        [4, 9, 8, 5],
+        [4, 9, 7, 8],
+        [4, 9, 6, 7],
+    ]
+)
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
 
 
 @dataclasses.dataclass(frozen=True)
 class SkinGeometry:
-    """A skin and the rigid parts around it, in the BioTac frame (tip at -x, pad at -y, nail at +y, clamp at +x).
+    """A skin and the rigid parts around it, in the BioTac frame (tip at -x, pad at -y, nail at +y, clamp at
+    +x).
 
     Attributes:
       name: what it is called in cards, data sets and messages.
       vert: (nvert, 3) float64, nodes at rest [m].
-      elem: (nelem, 4) or (nelem, 10) int32, tetrahedra with positive volume; ten nodes are corners, then edges (`edge_nodes.EDGES`).
-      outer_face: (nouter, 3) int32, the surface that touches the world; normals point out of the skin material.
-      inner_face: (ninner, 3) int32, the surface towards the liquid; normals point out of the skin material, towards the core.
+      elem: (nelem, 4) or (nelem, 10) int32, tetrahedra with positive volume; ten nodes are corners, then
+        edges (`edge_nodes.EDGES`).
+      outer_face: (nouter, 3) int32, the surface that touches the world; normals point out of the skin
+        material.
+      inner_face: (ninner, 3) int32, the surface towards the liquid; normals point out of the skin material,
+        towards the core.
       fixed: (nfixed,) int32, sorted nodes held by core, nail plate and clamp.
       core_vert, core_face: (n, 3) float64 [m], (m, 3) int32, the rigid core: closed, normals outwards.
       nail_vert, nail_face, clamp_vert, clamp_face: the same for nail plate and clamp plate.
@@ -53,7 +70,9 @@ class SkinGeometry:
             dtype = np.int32 if field.name in _INT_FIELDS else np.float64
             object.__setattr__(self, field.name, np.ascontiguousarray(getattr(self, field.name), dtype=dtype))
         if self.elem.ndim != 2 or self.elem.shape[1] not in (4, 10):
-            raise ValueError(f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices")
+            raise ValueError(
+                f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices"
+            )
 
     @property
     def nvert(self) -> int:
@@ -70,11 +89,13 @@ class SkinGeometry:
 
     @property
     def tets(self) -> np.ndarray:
-        """(n, 4) int32 four-node tetrahedra over all nodes: elem, or the eight parts (8 e .. 8 e + 7) of each ten-node tetrahedron e."""
+        """(n, 4) int32 four-node tetrahedra over all nodes: elem, or the eight parts (8 e .. 8 e + 7) of each
+        ten-node tetrahedron e."""
         return self.elem if self.element == "linear" else self.elem[:, PARTS].reshape(-1, 4)
 
     def save(self, path) -> pathlib.Path:
-        """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is bit-equal."""
+        """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
+        bit-equal."""
         path = pathlib.Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
@@ -98,9 +119,18 @@ class SkinGeometry:
         """
         path = pathlib.Path(path)
         if not path.is_file():
-            raise FileNotFoundError(f"no skin at {path}: pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`")
+            raise FileNotFoundError(
+                f"no skin at {path}: pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
+            )
         try:
             with np.load(path, allow_pickle=False) as file:
-                return cls(**{f.name: file[f.name] if f.name != "name" else str(file["name"]) for f in dataclasses.fields(cls)})
+                return cls(
+                    **{
+                        f.name: file[f.name] if f.name != "name" else str(file["name"])
+                        for f in dataclasses.fields(cls)
+                    }
+                )
         except (KeyError, OSError, ValueError) as error:
-            raise ValueError(f"{path} is not a stored skin ({error}): make one with `biotac import-mesh`") from error
+            raise ValueError(
+                f"{path} is not a stored skin ({error}): make one with `biotac import-mesh`"
+            ) from error

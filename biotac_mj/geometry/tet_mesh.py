@@ -1,4 +1,5 @@
-"""A tetrahedral mesh and what can be asked of it: volumes, angles, boundary, and whether it may be simulated."""
+"""A tetrahedral mesh and what can be asked of it: volumes, angles, boundary, and whether it may be
+simulated."""
 
 import dataclasses
 import functools
@@ -7,10 +8,13 @@ import numpy as np
 
 __all__ = ["TetMesh"]
 
-# Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is opposite to vertex i.
+# Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is
+# opposite to vertex i.
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _FACE_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-_DEGENERATE = 1e-6  # volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat to rounding of its file
+# volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat to rounding of its
+# file
+_DEGENERATE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +35,9 @@ class TetMesh:
         if vert.ndim != 2 or vert.shape[1] != 3:
             raise ValueError(f"vert has shape {vert.shape}: pass (nvert, 3) positions in metres")
         if elem.ndim != 2 or elem.shape[1] != 4 or not len(elem):
-            raise ValueError(f"elem has shape {elem.shape}: pass (nelem, 4) vertex indices, at least one tetrahedron")
+            raise ValueError(
+                f"elem has shape {elem.shape}: pass (nelem, 4) vertex indices, at least one tetrahedron"
+            )
         object.__setattr__(self, "vert", vert)
         object.__setattr__(self, "elem", elem)
 
@@ -57,7 +63,8 @@ class TetMesh:
         _, first, count = np.unique(np.sort(face, axis=1), axis=0, return_index=True, return_counts=True)
         if count.max() > 2:
             raise ValueError(
-                f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first: {face[first[count > 2][0]].tolist()}: "
+                f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first: "
+                f"{face[first[count > 2][0]].tolist()}: "
                 "remove duplicate or overlapping tetrahedra"
             )
         return np.ascontiguousarray(face[np.sort(first[count == 1])])
@@ -81,12 +88,15 @@ class TetMesh:
         """Returns itself when it can be simulated.
 
         Raises:
-          ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or non-manifold surface, unused
-            vertices; the text says how many, which comes first and what to do.
+          ValueError: non-finite vertices, indices out of range, inverted or flat tetrahedra, an open or
+            non-manifold surface, unused vertices; the text says how many, which comes first and what to do.
         """
         bad = np.flatnonzero(~np.isfinite(self.vert).all(axis=1))
         if len(bad):
-            raise ValueError(f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: the file is damaged, export it again")
+            raise ValueError(
+                f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: the file is "
+                "damaged, export it again"
+            )
         bad = np.flatnonzero(((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1))
         if len(bad):
             raise ValueError(
@@ -95,42 +105,54 @@ class TetMesh:
                 "indices must be 0-based (subtract 1 if the file counts from 1)"
             )
         corner = self.vert[self.elem]
-        longest = np.max([np.linalg.norm(corner[:, i] - corner[:, j], axis=1) for i, j in _FACE_PAIRS], axis=0)
+        longest = np.max(
+            [np.linalg.norm(corner[:, i] - corner[:, j], axis=1) for i, j in _FACE_PAIRS], axis=0
+        )
         flat = np.flatnonzero(np.abs(self.volumes) <= _DEGENERATE * longest**3)
         if len(flat):
             raise ValueError(
-                f"{len(flat)} tetrahedra are degenerate (no volume), the first is tetrahedron {flat[0]} = {self.elem[flat[0]].tolist()}: "
+                f"{len(flat)} tetrahedra are degenerate (no volume), the first is tetrahedron {flat[0]} = "
+                f"{self.elem[flat[0]].tolist()}: "
                 "merge its nodes or mesh again with a larger edge length"
             )
         inverted = np.flatnonzero(self.volumes < 0)
         if len(inverted):
             remedy = (
-                "swap two indices of every tetrahedron" if len(inverted) == len(self.elem) else "swap two of its indices, or mesh again"
+                "swap two indices of every tetrahedron"
+                if len(inverted) == len(self.elem)
+                else "swap two of its indices, or mesh again"
             )
             raise ValueError(
-                f"{len(inverted)} tetrahedra are inverted (negative volume), the first is tetrahedron {inverted[0]} = "
+                f"{len(inverted)} tetrahedra are inverted (negative volume), the first is tetrahedron "
+                f"{inverted[0]} = "
                 f"{self.elem[inverted[0]].tolist()}: {remedy}"
             )
         check_closed(self.boundary)
         unused = np.setdiff1d(np.arange(len(self.vert)), self.elem)
         if len(unused):
-            raise ValueError(f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: remove them and renumber")
+            raise ValueError(
+                f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: remove "
+                "them and renumber"
+            )
         return self
 
 
 def check_closed(face: np.ndarray, name: str = "surface") -> None:
-    """Raises ValueError unless every edge of `face` (nface, 3) belongs to exactly two faces that run through it in opposite directions."""
+    """Raises ValueError unless every edge of `face` (nface, 3) belongs to exactly two faces that run through
+    it in opposite directions."""
     edge = face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, first, count = np.unique(np.sort(edge, axis=1), axis=0, return_index=True, return_counts=True)
     if (count == 1).any():
         where = edge[first[count == 1][0]].tolist()
         raise ValueError(
-            f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices {where}: fill the holes"
+            f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices "
+            f"{where}: fill the holes"
         )
     if (count > 2).any():
         where = edge[first[count > 2][0]].tolist()
         raise ValueError(
-            f"the {name} is not a manifold: {np.sum(count > 2)} edges have more than two faces, the first joins vertices {where}: "
+            f"the {name} is not a manifold: {np.sum(count > 2)} edges have more than two faces, the first "
+            f"joins vertices {where}: "
             "separate the parts that touch along them"
         )
     if len(np.unique(edge, axis=0)) != len(edge):

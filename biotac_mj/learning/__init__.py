@@ -1,1 +1,2 @@
-"""Learned models between the deformed skin and the electrodes: training, evaluation, use. torch is loaded when a model is."""
+"""Learned models between the deformed skin and the electrodes: training, evaluation, use. torch is loaded
+when a model is."""

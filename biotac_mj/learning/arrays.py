@@ -18,7 +18,8 @@ class Arrays:
       field: (n, nvert, 3) float16 displacements [mm].
       owner: (n,) number of the interaction; first: (n,) row of its first step; time: (n,) seconds since then.
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
-      counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the interaction's first row.
+      counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the
+        interaction's first row.
       simulated: (n, 19) counts of the simulation's own film, without noise where the set has its impedances.
       force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
       geometry: SkinGeometry. path: of the set.
@@ -43,7 +44,8 @@ class Arrays:
         return self.field.device
 
     def rows(self, interactions, labelled=False) -> torch.Tensor:
-        """Rows of these interactions; with `labelled` only rows with measured counts, without each interaction's tare row.
+        """Rows of these interactions; with `labelled` only rows with measured counts, without each
+        interaction's tare row.
 
         Raises:
           ValueError: there are none.
@@ -52,11 +54,14 @@ class Arrays:
         wanted[torch.as_tensor(np.asarray(interactions, dtype=np.int64), device=self.device)] = True
         mask = wanted[self.owner]
         if labelled:
-            mask &= torch.isfinite(self.counts).all(1) & (torch.arange(len(mask), device=self.device) != self.first)
+            mask &= torch.isfinite(self.counts).all(1) & (
+                torch.arange(len(mask), device=self.device) != self.first
+            )
         rows = mask.nonzero()[:, 0]
         if not len(rows):
             raise ValueError(
-                f"a part of the split has no {'labelled ' if labelled else ''}time steps: more interactions with measured counts are "
+                f"a part of the split has no {'labelled ' if labelled else ''}time steps: more interactions "
+                "with measured counts are "
                 "needed (biotac generate --labelled), or another object"
             )
         return rows
@@ -67,7 +72,9 @@ class Arrays:
 
     def log_change(self, rows):
         """(k, 19) d ln Z of rows against their tare."""
-        value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(self.tare[rows].double().cpu().numpy())
+        value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(
+            self.tare[rows].double().cpu().numpy()
+        )
         return torch.as_tensor(value, dtype=torch.float32, device=self.device)
 
 
@@ -79,7 +86,8 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
 
     Raises:
       FileNotFoundError: no such set.
-      ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions without a row before touch.
+      ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions
+        without a row before touch.
     """
     from ..data import TactileSet
 
@@ -87,12 +95,16 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         for name in ("displacement", "counts", "measured_counts", "contact_force"):
             if name not in data.columns:
                 raise ValueError(
-                    f"{path} has no column {name}, only {', '.join(data.columns)}: make a set with `biotac generate --labelled N`"
+                    f"{path} has no column {name}, only {', '.join(data.columns)}: make a set with `biotac "
+                    "generate --labelled N`"
                 )
         for file in data._files:
             channels = [c.decode() if isinstance(c, bytes) else str(c) for c in file.attrs["channels"]]
             if tuple(channels) != CHANNELS:
-                raise ValueError(f"{file.filename} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is needed")
+                raise ValueError(
+                    f"{file.filename} has its channels in the order {' '.join(channels)}: "
+                    f"{' '.join(CHANNELS)} is needed"
+                )
         stop = len(data) if limit is None else min(limit, len(data))
         nstep = int(data.stop[stop - 1])
         good = data["converged"][:nstep].astype(bool) if "converged" in data.columns else np.ones(nstep, bool)
@@ -104,14 +116,21 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         for a in range(0, len(keep), 2048):
             field[a : a + 2048] = 1e3 * data["displacement"][keep[a : a + 2048]]
         if not np.isfinite(field).all():
-            raise ValueError(f"{path} holds displacements that are not finite: make the set again, or leave those interactions out")
+            raise ValueError(
+                f"{path} holds displacements that are not finite: make the set again, or leave those "
+                "interactions out"
+            )
         measured = data["measured_counts"][keep][:, :19]
         labelled = np.asarray(data.labelled[:stop])
         force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
         for a in range(0, len(keep), 2048):
             force[a : a + 2048] = np.linalg.norm(data["contact_force"][keep[a : a + 2048]], axis=2)
         time = data["time"][keep]
-        simulated = counts_from_impedance(data["impedance"][keep]) if "impedance" in data.columns else data["counts"][keep][:, :19]
+        simulated = (
+            counts_from_impedance(data["impedance"][keep])
+            if "impedance" in data.columns
+            else data["counts"][keep][:, :19]
+        )
         tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731
         return Arrays(
             field=tensor(field, torch.float16),

@@ -7,27 +7,36 @@ __all__ = ["LearningConfig"]
 
 @dataclasses.dataclass(frozen=True)
 class LearningConfig:
-    """Choices of models and training. The numbers in brackets are those of the ambiguities in docs/learning.md.
+    """Choices of models and training. The numbers in brackets are those of the ambiguities in
+    docs/learning.md.
 
     Attributes:
       mesh_order: K of the Chebyshev convolutions: 6, as COMA and ACROSS take it [1].
-      mesh_scale: displacements are divided by this length [m], not z-scored node by node: fixed nodes would amplify solver noise [2].
+      mesh_scale: displacements are divided by this length [m], not z-scored node by node: fixed nodes would
+        amplify solver noise [2].
       reconstruction: "mse" or "l1" of the VAEs: MSE matches the RMS metric [3].
-      mesh_kl, electrode_kl: weight of the divergence, summed over the code, against squared error summed over the field (in units of its
-        scale), without annealing [4].
-      mesh_channels, mesh_factors, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for mean and log variance follow the
-        hidden layer [5]; no normalisation layers, no activation at the output, no bias in the last convolution [11].
+      mesh_kl, electrode_kl: weight of the divergence, summed over the code, against squared error summed over
+        the field (in units of its scale), without annealing [4].
+      mesh_channels, mesh_factors, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for
+      mean and log variance follow the
+        hidden layer [5]; no normalisation layers, no activation at the output, no bias in the last
+        convolution [11].
       electrode_hidden, electrode_latent: of the paper.
-      forward_hidden, inverse_hidden: the paper's widths are read as hidden, with a linear layer to the code behind them [6].
+      forward_hidden, inverse_hidden: the paper's widths are read as hidden, with a linear layer to the code
+        behind them [6].
       sample_codes: train projections on samples of the codes, not their means; evaluated with means [7].
       projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
       dropout: of the projections, the paper's.
-      learning_rate, decay: Adam's, and the factor per epoch; 20 epochs' worth of decay is spread over a training whatever its length [9].
-      batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++, with the same batch;
-        mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best state on the validation interactions is kept.
+      learning_rate, decay: Adam's, and the factor per epoch; 20 epochs' worth of decay is spread over a
+        training whatever its length [9].
+      batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++,
+        with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best
+        state on the validation interactions is kept.
       hierarchy: nodes by geodesic farthest points, affine-exact interpolation [12]; the only one there is.
-      tare: row 0 of each interaction, before touch, is subtracted [17]; counts are divided by `scale` = 2048 for the paper's unit.
-      pod: modes of the principal components of the mesh. width: of our networks. mirror: they also see every touch mirrored in z.
+      tare: row 0 of each interaction, before touch, is subtracted [17]; counts are divided by `scale` = 2048
+        for the paper's unit.
+      pod: modes of the principal components of the mesh. width: of our networks. mirror: they also see every
+        touch mirrored in z.
       window: time constants [s] of the causal averages of their features.
       members: networks that are averaged in the best model.
       graphs: on a GPU training steps are replayed as CUDA graphs.
@@ -84,4 +93,7 @@ class LearningConfig:
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: choose from {', '.join(allowed)}")
         if len(self.mesh_channels) != len(self.mesh_factors):
-            raise ValueError(f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally many")
+            raise ValueError(
+                f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally "
+                "many"
+            )

@@ -1,4 +1,5 @@
-"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant that starts as principal components."""
+"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant that starts as
+principal components."""
 
 import torch
 from torch import nn
@@ -19,12 +20,14 @@ def mlp(widths, dropout=0.0) -> nn.Sequential:
 
 
 class ElectrodeVAE(nn.Module):
-    """Code of the 19 electrodes. "64, 8" of the paper is read as a hidden layer of 64 and heads of 8 for mean and log variance.
+    """Code of the 19 electrodes. "64, 8" of the paper is read as a hidden layer of 64 and heads of 8 for mean
+    and log variance.
 
     Args:
       channels: 19. hidden: widths of the encoder. latent: size of the code.
-      linear: the variant: (latent, channels) orthonormal rows, principal components of the inputs. The code is then
-        the components plus what the network adds, and so is the decoder, so training starts near PCA's error. None is the paper's network.
+      linear: the variant: (latent, channels) orthonormal rows, principal components of the inputs. The code
+        is then the components plus what the network adds, and so is the decoder, so training starts near
+        PCA's error. None is the paper's network.
     """
 
     def __init__(self, channels=19, hidden=(256, 128, 64), latent=8, linear=None):
@@ -35,8 +38,14 @@ class ElectrodeVAE(nn.Module):
         self.skip_in = self.skip_out = None
         if linear is not None:
             if tuple(linear.shape) != (latent, channels):
-                raise ValueError(f"linear has shape {tuple(linear.shape)}: the code of {latent} from {channels} channels needs that shape")
-            self.skip_in, self.skip_out = nn.Linear(channels, latent, bias=False), nn.Linear(latent, channels, bias=False)
+                raise ValueError(
+                    f"linear has shape {tuple(linear.shape)}: the code of {latent} from {channels} channels "
+                    "needs that shape"
+                )
+            self.skip_in, self.skip_out = (
+                nn.Linear(channels, latent, bias=False),
+                nn.Linear(latent, channels, bias=False),
+            )
             with torch.no_grad():
                 self.skip_in.weight.copy_(linear), self.skip_out.weight.copy_(linear.T)
                 for last in (self.encoder[-1], self.decoder[-1]):
@@ -54,7 +63,8 @@ class ElectrodeVAE(nn.Module):
         return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)
 
     def forward(self, x):
-        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log variance."""
+        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
+        variance."""
         mean, log_variance = self.encode(x)
         z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
         return self.decode(z), mean, log_variance

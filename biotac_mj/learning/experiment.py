@@ -1,4 +1,5 @@
-"""`biotac train`: every model on every split and seed of a data set; predictions, errors and the weights worth keeping go to a folder."""
+"""`biotac train`: every model on every split and seed of a data set; predictions, errors and the weights
+worth keeping go to a folder."""
 
 import dataclasses
 import json
@@ -34,15 +35,27 @@ FORWARD = {
 }
 
 
-def train_all(path, out, seeds=(0, 1, 2, 3, 4), splits=("trajectory", "ring_7mm"), config=None, device="cpu", paper=True, only=None,
-              limit=None, progress=True):  # fmt: skip
-    """Trains and predicts for all splits and seeds; what is there already is kept, so an interrupted run goes on.
+def train_all(
+    path,
+    out,
+    seeds=(0, 1, 2, 3, 4),
+    splits=("trajectory", "ring_7mm"),
+    config=None,
+    device="cpu",
+    paper=True,
+    only=None,
+    limit=None,
+    progress=True,
+):
+    """Trains and predicts for all splits and seeds; what is there already is kept, so an interrupted run goes
+    on.
 
     Args:
       path: data set. out: folder.
-      seeds: of divisions, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the object (or objects, with +)
-        that only the test sees.
-      config: LearningConfig. device: of torch. paper: False leaves out what is slow without a GPU: latent projection and PointNet++.
+      seeds: of divisions, weights and batches. splits: "trajectory" (72/18/10 % of the interactions), or the
+        object (or objects, with +) that only the test sees.
+      config: LearningConfig. device: of torch. paper: False leaves out what is slow without a GPU: latent
+        projection and PointNet++.
       only: names of our models to train; None takes all of FORWARD. limit: interactions to read.
     """
     from tqdm import tqdm
@@ -60,15 +73,30 @@ def train_all(path, out, seeds=(0, 1, 2, 3, 4), splits=("trajectory", "ring_7mm"
     for name in names:
         if name not in FORWARD:
             raise ValueError(f"unknown model {name!r}: choose from {', '.join(FORWARD)}")
-    print(f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps read in {time.time() - begun:.0f} s")
+    print(
+        f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps read in "
+        f"{time.time() - begun:.0f} s"
+    )
     with tqdm(jobs, disable=not progress, desc="train") as bar:
         for split, seed in bar:
             bar.set_postfix_str(f"{split}, seed {seed}")
-            train_split(arrays, features, path, split, seed, config, out, names, paper, step=lambda text: bar.set_postfix_str(text))
+            train_split(
+                arrays,
+                features,
+                path,
+                split,
+                seed,
+                config,
+                out,
+                names,
+                paper,
+                step=lambda text: bar.set_postfix_str(text),
+            )
 
 
 def train_split(arrays, features, path, split, seed, config, out, names, paper=True, step=None):
-    """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0, and last SPLIT-SEED.json."""
+    """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
+    and last SPLIT-SEED.json."""
     division = _division(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -98,35 +126,67 @@ def train_split(arrays, features, path, split, seed, config, out, names, paper=T
 
     models = {}
     for name in names:
-        models[name] = timed(name, lambda name=name: train_head(features, train, validation, config, seed=seed, pod=pod, **FORWARD[name]))
+        models[name] = timed(
+            name,
+            lambda name=name: train_head(
+                features, train, validation, config, seed=seed, pod=pod, **FORWARD[name]
+            ),
+        )
         predictions[name] = models[name](both)
     if names:
-        # what the validation interactions like best, several times over. Windows stay out: interactions of a second do not teach what
-        # a long hold is, and a simulation may hold for as long as it likes
+        # what the validation interactions like best, several times over. Windows stay out: interactions of a
+        # second do not teach what a long hold is, and a simulation may hold for as long as it likes
         steady = [name for name in names if not FORWARD[name]["window"]] or names
-        errors = {name: _median(predictions[name][: len(check)], truth[: len(check)], arrays.owner[check]) for name in steady}
+        errors = {
+            name: _median(predictions[name][: len(check)], truth[: len(check)], arrays.owner[check])
+            for name in steady
+        }
         best = min(errors, key=errors.get)
-        more = [timed(f"{best} again {k}", lambda k=k: train_head(features, train, validation, config, seed=1000 * (k + 1) + seed, pod=pod,
-                                                                   **FORWARD[best])) for k in range(config.members - 1)]  # fmt: skip
+        more = [
+            timed(
+                f"{best} again {k}",
+                lambda k=k: train_head(
+                    features, train, validation, config, seed=1000 * (k + 1) + seed, pod=pod, **FORWARD[best]
+                ),
+            )
+            for k in range(config.members - 1)
+        ]
         members = [models[best], *more]
         predictions["ensemble"] = torch.stack([m(both) for m in members]).mean(0)
 
-    inverses = {name: timed(name, lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach))
-                for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))}  # fmt: skip
+    inverses = {
+        name: timed(
+            name, lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach)
+        )
+        for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))
+    }
     best_inverse = min(inverses, key=lambda name: inverses[name].validation)
-    report = {"split": split, "seed": seed, "config": dataclasses.asdict(config), "set": str(path), "interactions": len(arrays.objects),
-              "labelled": int(arrays.labelled.sum()), "test_interactions": len(np.unique(arrays.owner[rows].cpu())),
-              "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device)}  # fmt: skip
+    report = {
+        "split": split,
+        "seed": seed,
+        "config": dataclasses.asdict(config),
+        "set": str(path),
+        "interactions": len(arrays.objects),
+        "labelled": int(arrays.labelled.sum()),
+        "test_interactions": len(np.unique(arrays.owner[rows].cpu())),
+        "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device),
+    }
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
     back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
     if paper:
-        lp = timed("latent_projection", lambda: train_latent_projection(arrays, train, validation, config, seed))
+        lp = timed(
+            "latent_projection", lambda: train_latent_projection(arrays, train, validation, config, seed)
+        )
         unit = 1e-3 / config.mesh_scale
-        predictions["latent_projection"] = _in_parts(lambda r: config.scale * lp(unit * arrays.field[r].float()), both)
+        predictions["latent_projection"] = _in_parts(
+            lambda r: config.scale * lp(unit * arrays.field[r].float()), both
+        )
         predictions["electrode_vae"] = config.scale * lp.electrode(truth / config.scale)[0].detach()
         net = timed("pointnet", lambda: train_pointnet(arrays, train, validation, config, seed))
-        predictions["pointnet"] = _in_parts(lambda r: config.scale * net(unit * arrays.field[r].float()), both)
+        predictions["pointnet"] = _in_parts(
+            lambda r: config.scale * net(unit * arrays.field[r].float()), both
+        )
         codes["mesh_vae"] = lambda u: lp.mesh.decode(lp.mesh.encode(unit * u)[0]) / unit
         back["latent_inverse"] = lambda r: (lp.inverse(arrays.change(r) / config.scale) / unit, None)
     report["mesh"] = {name: _mesh_errors(arrays, code, every) for name, code in codes.items()}
@@ -138,15 +198,30 @@ def train_split(arrays, features, path, split, seed, config, out, names, paper=T
         kept = {"split": split, "seed": seed, "set": "synthetic", "nvert": arrays.geometry.nvert}
         if names:
             save_forward(
-                out / f"forward-{split}.safetensors", members, basis, config, FORWARD[best], arrays.geometry, kept | {"model": best}
+                out / f"forward-{split}.safetensors",
+                members,
+                basis,
+                config,
+                FORWARD[best],
+                arrays.geometry,
+                kept | {"model": best},
             )
-        save_inverse(out / f"inverse-{split}.safetensors", inverses[best_inverse], arrays.geometry, kept | {"model": best_inverse})
+        save_inverse(
+            out / f"inverse-{split}.safetensors",
+            inverses[best_inverse],
+            arrays.geometry,
+            kept | {"model": best_inverse},
+        )
     _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
 
 
 def _division(path, split, seed, count):
     with TactileSet(path) as data:
-        whole = split_by_interaction(data, seed) if split == "trajectory" else split_by_object(data, split.split("+"), seed)
+        whole = (
+            split_by_interaction(data, seed)
+            if split == "trajectory"
+            else split_by_object(data, split.split("+"), seed)
+        )
     return Split(*(part[part < count] for part in (whole.train, whole.validation, whole.test))).check()
 
 
@@ -156,7 +231,9 @@ def _linear(arrays, now, fit, check, both):
     xc, yc = now[check].double().cpu().numpy(), arrays.change(check).double().cpu().numpy()
     fits = [ridge(x, y, s) for s in (1e-3, 1e-2, 1e-1, 1.0, 10.0)]
     w, b = min(fits, key=lambda f: ((xc @ f[0] + f[1] - yc) ** 2).mean())
-    return torch.as_tensor(now[both].double().cpu().numpy() @ w + b, dtype=torch.float32, device=arrays.device)
+    return torch.as_tensor(
+        now[both].double().cpu().numpy() @ w + b, dtype=torch.float32, device=arrays.device
+    )
 
 
 def _physics_gain(arrays, fit, both):
@@ -164,7 +241,9 @@ def _physics_gain(arrays, fit, both):
     from ..sensor.channels import log_impedance
     from .local import counts_change
 
-    z = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device)
+    z = torch.as_tensor(
+        log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
+    )
     z = z - z[arrays.first]
     y = arrays.log_change(fit)
     gain = (z[fit] * y).sum(0) / z[fit].square().sum(0).clamp(min=1e-9)
@@ -214,19 +293,30 @@ def _inverse_errors(arrays, model, rows):
     known = touching & np.isfinite(centres)
     if known.any():
         q25, q50, q75 = np.percentile(1e3 * centres[known], [25, 50, 75])
-        out |= {"centre_median": float(q50), "centre_quartiles": [float(q25), float(q75)], "overlap_mean": float(overlaps[known].mean())}
+        out |= {
+            "centre_median": float(q50),
+            "centre_quartiles": [float(q25), float(q75)],
+            "overlap_mean": float(overlaps[known].mean()),
+        }
     return out
 
 
 def _write(out, name, arrays, check, rows, both, truth, predictions, report):
     owner = arrays.owner[both].cpu().numpy()
     content = {
-        "truth": truth, "tare": arrays.tare[both], "time": arrays.time[both], "owner": owner, "object": arrays.objects[owner].astype("S32"),
+        "truth": truth,
+        "tare": arrays.tare[both],
+        "time": arrays.time[both],
+        "owner": owner,
+        "object": arrays.objects[owner].astype("S32"),
         "test": np.arange(len(both)) >= len(check),
-    }  # fmt: skip
+    }
     tare = arrays.tare[both]
     # no reading lies outside 0..4095, whatever a model says
-    content |= {f"predicted_{k}": torch.minimum(torch.maximum(v, -tare), FULL_SCALE - tare).half() for k, v in predictions.items()}
+    content |= {
+        f"predicted_{k}": torch.minimum(torch.maximum(v, -tare), FULL_SCALE - tare).half()
+        for k, v in predictions.items()
+    }
     content = {k: v.detach().cpu().numpy() if torch.is_tensor(v) else v for k, v in content.items()}
     with replacing(out / f"{name}.npz") as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **content)

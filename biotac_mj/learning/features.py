@@ -1,4 +1,5 @@
-"""What a field of displacements says about the electrodes: principal components, film and strain over each electrode, the mirror image."""
+"""What a field of displacements says about the electrodes: principal components, film and strain over each
+electrode, the mirror image."""
 
 import numpy as np
 import torch
@@ -15,7 +16,8 @@ _FILM = 50e-6  # [m] left where the skin lies on the core, as in sensor.film
 
 
 class Pod(nn.Module):
-    """Principal components of displacement fields (proper orthogonal decomposition), not centred: rest is zero.
+    """Principal components of displacement fields (proper orthogonal decomposition), not centred: rest is
+    zero.
 
     Args:
       nvert: nodes. modes: components.
@@ -32,7 +34,8 @@ class Pod(nn.Module):
 
     @classmethod
     def fit(cls, field, rows, modes=128, most=16000, seed=0):
-        """Fits to rows of a field (n, nvert, 3) [mm], at most `most` of them, by a randomised decomposition."""
+        """Fits to rows of a field (n, nvert, 3) [mm], at most `most` of them, by a randomised
+        decomposition."""
         generator = torch.Generator().manual_seed(seed)
         if len(rows) > most:
             rows = rows[torch.randperm(len(rows), generator=generator)[:most].to(rows.device)]
@@ -56,10 +59,13 @@ class Pod(nn.Module):
 class FilmFeatures(nn.Module):
     """Film and strain of the inner skin over each electrode, for one head that all electrodes share.
 
-    The gap h of an inner node is its rest value plus the displacement along the direction away from the core (linearised), at least 50 um.
-    For Gaussian patches of three radii around each electrode: mean ln(h / h0), mean h0 / h - 1, displacement along the electrode's
-    normal and two tangents [mm]; the slopes of the displacement over the patch of the middle radius (6, the skin's local strain
-    and tilt); and mean ln(h / h0) near the four excitation electrodes and over the whole film (5), which all currents cross.
+    The gap h of an inner node is its rest value plus the displacement along the direction away from the core
+    (linearised), at least 50 um.
+    For Gaussian patches of three radii around each electrode: mean ln(h / h0), mean h0 / h - 1, displacement
+      along the electrode's
+    normal and two tangents [mm]; the slopes of the displacement over the patch of the middle radius (6, the
+    skin's local strain and tilt); and mean ln(h / h0) near the four excitation electrodes and over the whole
+    film (5), which all currents cross.
 
     The second tangent points away from the midplane, so that an electrode and its mirror image see alike.
 
@@ -87,11 +93,14 @@ class FilmFeatures(nn.Module):
         along = np.array([1.0, 0, 0]) - normal[:, :1] * normal
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         across = np.cross(normal, along)
-        side = np.where(np.abs(geometry.electrode_pos[:, 2]) < 5e-4, 1.0, np.sign(geometry.electrode_pos[:, 2]))
+        side = np.where(
+            np.abs(geometry.electrode_pos[:, 2]) < 5e-4, 1.0, np.sign(geometry.electrode_pos[:, 2])
+        )
         across *= (np.sign(across[:, 2]) * side)[:, None]
         frame = np.stack([normal, along, across], 1)  # (19, 3, 3): rows are directions
 
-        # over an electrode: distance along the surface, from where its normal meets the skin; what lies across the finger is far in depth
+        # over an electrode: distance along the surface, from where its normal meets the skin; what lies
+        # across the finger is far in depth
         offset = place[None] - geometry.electrode_pos[:, None]
         height = np.einsum("enk,ek->en", offset, normal)
         flat = np.linalg.norm(offset - height[..., None] * normal[:, None], axis=2)
@@ -99,26 +108,42 @@ class FilmFeatures(nn.Module):
         patches = []
         for radius in _RADII:
             w = np.exp(-0.5 * (flat / radius) ** 2) * (height > -1.5e-3) * np.clip(facing, 0, 1)
-            w = np.where(w.sum(1, keepdims=True) > 1e-6, w, np.exp(-0.5 * (np.linalg.norm(offset, axis=2) / radius) ** 2) + 1e-30)
+            w = np.where(
+                w.sum(1, keepdims=True) > 1e-6,
+                w,
+                np.exp(-0.5 * (np.linalg.norm(offset, axis=2) / radius) ** 2) + 1e-30,
+            )
             patches.append(w / w.sum(1, keepdims=True))
         w = patches[1]
         tangent = np.einsum("enk,eak->ena", offset, frame[:, 1:])  # (19, n, 2)
         centred = tangent - np.einsum("en,ena->ea", w, tangent)[:, None]
         spread = np.einsum("en,ena,enb->eab", w, centred, centred)
-        slope = np.einsum("en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2)))  # (19, 2, n)
+        slope = np.einsum(
+            "en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2))
+        )  # (19, 2, n)
         operators = [w_[:, None] for w_ in patches] + [1e-3 * slope]
         operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
         linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(19 * operator.shape[1] * 3, -1)
 
         angle = np.array(EXCITATION)
-        seeds = np.stack([angle[:, 0], -_CORE_RADIUS * np.cos(angle[:, 1]), _CORE_RADIUS * np.sin(angle[:, 1])], 1)
+        seeds = np.stack(
+            [angle[:, 0], -_CORE_RADIUS * np.cos(angle[:, 1]), _CORE_RADIUS * np.sin(angle[:, 1])], 1
+        )
         g = np.exp(-0.5 * (np.linalg.norm(place[None] - seeds[:, None], axis=2) / 3e-3) ** 2)
         g = np.concatenate([g, np.ones((1, len(node)))])
         g /= g.sum(1, keepdims=True)
         # each electrode sees those of its own side first
-        order = np.where(geometry.electrode_pos[:, 2:] * np.sign(seeds[1, 2]) > 0, [[1, 0, 3, 2, 4]], [[0, 1, 2, 3, 4]])
+        order = np.where(
+            geometry.electrode_pos[:, 2:] * np.sign(seeds[1, 2]) > 0, [[1, 0, 3, 2, 4]], [[0, 1, 2, 3, 4]]
+        )
         self.register_buffer("order", torch.as_tensor(order), persistent=False)
-        for name, value in (("linear", linear), ("away", away), ("patch", np.concatenate(patches)), ("whole", g), ("gap", 1e3 * gap)):
+        for name, value in (
+            ("linear", linear),
+            ("away", away),
+            ("patch", np.concatenate(patches)),
+            ("whole", g),
+            ("gap", 1e3 * gap),
+        ):
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
         self.register_buffer("node", torch.as_tensor(node), persistent=False)
 
@@ -132,14 +157,19 @@ class FilmFeatures(nn.Module):
         inverse = self.gap / film - 1
         local = torch.cat([thinner, torch.log1p(inverse.clamp(min=-0.9))], 0)
         local = (local @ self.patch.T).view(2, n, len(_RADII), 19).permute(1, 3, 0, 2).flatten(2)
-        mean_inverse = torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), 19).transpose(1, 2)
-        local[..., len(_RADII) :] = mean_inverse  # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
+        mean_inverse = (
+            torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), 19).transpose(1, 2)
+        )
+        local[..., len(_RADII) :] = (
+            mean_inverse  # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
+        )
         whole = (thinner @ self.whole.T)[:, self.order]
         return torch.cat([local, linear, whole], 2)
 
 
 def mirror_matrix(geometry):
-    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0, by the shape functions of the tetrahedra there."""
+    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0, by the shape functions of
+    the tetrahedra there."""
     vert, tets = geometry.vert, geometry.tets
     target = vert * [1, 1, -1]
     corner = vert[tets]
@@ -148,7 +178,9 @@ def mirror_matrix(geometry):
     b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
     b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
     best = np.argmax(b.min(2), axis=1)
-    chosen = np.clip(b[np.arange(len(b)), best], 0, None)  # curved surfaces do not mirror onto themselves exactly
+    chosen = np.clip(
+        b[np.arange(len(b)), best], 0, None
+    )  # curved surfaces do not mirror onto themselves exactly
     chosen /= chosen.sum(1, keepdims=True)
     node = tets[near[np.arange(len(b)), best]]
     rows = np.repeat(np.arange(len(vert)), 4)

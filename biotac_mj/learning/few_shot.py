@@ -1,4 +1,5 @@
-"""A new sensor with few touches: what a trained model makes of it as it is, and after a gain for each electrode was fitted."""
+"""A new sensor with few touches: what a trained model makes of it as it is, and after a gain for each
+electrode was fitted."""
 
 import itertools
 import json
@@ -23,42 +24,59 @@ _WITHIN, _BETWEEN, _COMMON = 0.1, 0.05, 0.2  # probable scatters, and that of th
 
 
 def adapt(predicted, measured, owner, slope) -> np.ndarray:
-    """Gains (19,) that bring predicted d ln Z (n, 19) of a new sensor's touches to measured ones; 1 where the touches do not ask for any.
+    """Gains (19,) that bring predicted d ln Z (n, 19) of a new sensor's touches to measured ones; 1 where the
+    touches do not ask for any.
 
-    Every touch gives every electrode a gain by least squares in counts. Those scatter from touch to touch, and the electrodes' own gains
-    scatter around a common one; both scatters are taken from the touches themselves (the likeliest of a grid, weighed by what other
-    synthetic sensors showed), and each gain is the posterior mean given them: empirical Bayes with random effects. They are believed where
-    touches left out, one after another, are predicted better with the others' gains than without (one-sided, 90 %).
+    Every touch gives every electrode a gain by least squares in counts. Those scatter from touch to touch,
+    and the electrodes' own gains scatter around a common one; both scatters are taken from the touches
+    themselves (the likeliest of a grid, weighed by what other synthetic sensors showed), and each gain is the
+    posterior mean given them: empirical Bayes with random effects. They are believed where touches left out,
+    one after another, are predicted better with the others' gains than without (one-sided, 90 %).
 
     Args:
-      predicted, measured: (n, 19) d ln Z. owner: (n,) touch of each row. slope: (n, 19) d counts / d ln Z [counts].
+      predicted, measured: (n, 19) d ln Z. owner: (n,) touch of each row. slope: (n, 19) d counts / d ln Z
+        [counts].
 
     Raises:
       ValueError: shapes that differ, or no rows.
     """
     predicted, measured, slope, owner = (np.asarray(v, float) for v in (predicted, measured, slope, owner))
-    if predicted.shape != measured.shape or predicted.shape != slope.shape or predicted.shape[1:] != (19,) or not len(predicted):
+    if (
+        predicted.shape != measured.shape
+        or predicted.shape != slope.shape
+        or predicted.shape[1:] != (19,)
+        or not len(predicted)
+    ):
         raise ValueError(
-            f"predicted {predicted.shape}, measured {measured.shape}, slope {slope.shape}: the same rows (n, 19) are needed, at least one"
+            f"predicted {predicted.shape}, measured {measured.shape}, slope {slope.shape}: the same rows "
+            "(n, 19) are needed, at least one"
         )
     touches = [owner == k for k in np.unique(owner)]
     if len(touches) < 3:
         return np.ones(19)
-    x, y = [slope[t] * predicted[t] for t in touches], [slope[t] * measured[t] for t in touches]  # changes of counts, to first order
+    x, y = (
+        [slope[t] * predicted[t] for t in touches],
+        [slope[t] * measured[t] for t in touches],
+    )  # changes of counts, to first order
     square = np.stack([(a**2).sum(0) for a in x]) + 1e-12
     gain = np.stack([(a * b).sum(0) for a, b in zip(x, y)]) / square
     noise = _FLOOR**2 * np.array([[len(a)] for a in x]) / square
     better = []
     for k, (a, b) in enumerate(zip(x, y)):
         others = np.arange(len(touches)) != k
-        error = [np.sqrt(((g * a - b) ** 2).mean(1)).mean() for g in (1.0, _posterior(gain[others], noise[others]))]
+        error = [
+            np.sqrt(((g * a - b) ** 2).mean(1)).mean() for g in (1.0, _posterior(gain[others], noise[others]))
+        ]
         better.append(np.log(error[0] / error[1]))  # of touches light and hard alike
-    sure = np.mean(better) > t_quantile.ppf(0.9, len(better) - 1) * np.std(better, ddof=1) / len(better) ** 0.5
+    sure = (
+        np.mean(better) > t_quantile.ppf(0.9, len(better) - 1) * np.std(better, ddof=1) / len(better) ** 0.5
+    )
     return _posterior(gain, noise) if sure else np.ones(19)
 
 
 def _posterior(gain, noise):
-    """Means (19,) of the electrodes' gains, given those of the touches (touches, 19) and the variances of their noise."""
+    """Means (19,) of the electrodes' gains, given those of the touches (touches, 19) and the variances of
+    their noise."""
     best, result = -np.inf, None
     for within, between in itertools.product(_SCATTER, _SCATTER):
         weight = 1 / (within**2 + noise)
@@ -67,9 +85,16 @@ def _posterior(gain, noise):
         precision = 1 / _COMMON**2 + (1 / each).sum()
         common = (1 / _COMMON**2 + (mean / each).sum()) / precision
         # marginal likelihood of all gains, and how probable the scatters are
-        spread = (weight * (gain - mean) ** 2).sum() + ((mean - common) ** 2 / each).sum() + (common - 1) ** 2 / _COMMON**2
+        spread = (
+            (weight * (gain - mean) ** 2).sum()
+            + ((mean - common) ** 2 / each).sum()
+            + (common - 1) ** 2 / _COMMON**2
+        )
         size = -np.log(weight).sum() + np.log(weight.sum(0)).sum() + np.log(each).sum() + np.log(precision)
-        score = -0.5 * (spread + size) - 0.5 * (np.log(within / _WITHIN) ** 2 + np.log(between / _BETWEEN) ** 2) / np.log(2) ** 2
+        score = (
+            -0.5 * (spread + size)
+            - 0.5 * (np.log(within / _WITHIN) ** 2 + np.log(between / _BETWEEN) ** 2) / np.log(2) ** 2
+        )
         if score > best:
             best, trust = score, between**2 / each
             result = trust * mean + (1 - trust) * common
@@ -77,10 +102,12 @@ def _posterior(gain, noise):
 
 
 def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, seed=0, device="cpu") -> dict:
-    """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains were fitted to k of its touches.
+    """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains were fitted
+    to k of its touches.
 
     Args:
-      path: labelled set of that sensor. weights: forward model. out: JSON. draws: random choices of the k touches, averaged.
+      path: labelled set of that sensor. weights: forward model. out: JSON. draws: random choices of the k
+        touches, averaged.
 
     Raises:
       ValueError: fewer than 10 labelled touches.
@@ -89,11 +116,18 @@ def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, see
     model = load_forward(weights, arrays.geometry).to(device)
     labelled = np.flatnonzero(arrays.labelled)
     if len(labelled) < 10:
-        raise ValueError(f"{path} has {len(labelled)} labelled interactions: at least 10 are needed to adapt on some and judge on others")
+        raise ValueError(
+            f"{path} has {len(labelled)} labelled interactions: at least 10 are needed to adapt on some and "
+            "judge on others"
+        )
     predicted = _log_changes(model, arrays)
     rows = arrays.rows(labelled, labelled=True)
     p, y = predicted[rows].cpu().numpy(), arrays.log_change(rows).cpu().numpy()
-    tare, truth, owner = arrays.tare[rows], arrays.change(rows).cpu().numpy(), arrays.owner[rows].cpu().numpy()
+    tare, truth, owner = (
+        arrays.tare[rows],
+        arrays.change(rows).cpu().numpy(),
+        arrays.owner[rows].cpu().numpy(),
+    )
     counts = arrays.counts[rows].cpu().numpy().clip(0.5, FULL_SCALE - 0.5)
     slope = counts * (1 - counts / FULL_SCALE)  # of counts = FULL_SCALE Z / (Z + R)
     rng = np.random.default_rng(seed)
@@ -106,11 +140,26 @@ def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, see
         for _ in range(draws if k else 1):
             chosen = np.isin(owner, rng.choice(labelled, k, replace=False))
             gain = adapt(p[chosen], y[chosen], owner[chosen], slope[chosen]) if k else np.ones(19)
-            changes = (counts_change(torch.as_tensor(g * p, dtype=torch.float32, device=device), tare).cpu().numpy() for g in (gain, 1.0))
-            values.append([np.median(interaction_errors(c[~chosen], truth[~chosen], owner[~chosen])[1]) for c in changes])
+            changes = (
+                counts_change(torch.as_tensor(g * p, dtype=torch.float32, device=device), tare).cpu().numpy()
+                for g in (gain, 1.0)
+            )
+            values.append(
+                [
+                    np.median(interaction_errors(c[~chosen], truth[~chosen], owner[~chosen])[1])
+                    for c in changes
+                ]
+            )
         table[str(k)], without[str(k)] = np.mean(values, axis=0).tolist()
-    result = {"schema": "biotac_mj.learning.new_sensor/1", "data": "synthetic", "set": str(path), "weights": str(weights),
-              "interactions": len(labelled), "median_rms_counts_after_touches": table, "as_it_is_on_the_same_touches": without}  # fmt: skip
+    result = {
+        "schema": "biotac_mj.learning.new_sensor/1",
+        "data": "synthetic",
+        "set": str(path),
+        "weights": str(weights),
+        "interactions": len(labelled),
+        "median_rms_counts_after_touches": table,
+        "as_it_is_on_the_same_touches": without,
+    }
     out = pathlib.Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as temporary:

@@ -1,6 +1,8 @@
-"""One loop for all networks: minibatches from tensors on the device, one cycle of the learning rate, the best state on validation kept.
+"""One loop for all networks: minibatches from tensors on the device, one cycle of the learning rate, the best
+state on validation kept.
 
-These networks are small: on a GPU a step is mostly launches, so it is recorded once as a CUDA graph and replayed.
+These networks are small: on a GPU a step is mostly launches, so it is recorded once as a CUDA graph and
+  replayed.
 """
 
 import contextlib
@@ -16,7 +18,8 @@ _WARM = 5  # steps before one is recorded
 
 @contextlib.contextmanager
 def fast_products():
-    """TF32 for matrix products on a GPU: good enough inside a network, not for features and components, whose small parts it would blur."""
+    """TF32 for matrix products on a GPU: good enough inside a network, not for features and components, whose
+    small parts it would blur."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:
@@ -30,17 +33,33 @@ def root_mean_square(error):
     return (error.square().mean(-1) + 1e-10).sqrt().mean()
 
 
-def cycle(module, loss, rows, batch, steps, learning_rate, validate=None, checks=12, weight_decay=0.0, decay=None, seed=0, graph=True,
-          progress=None):  # fmt: skip
+def cycle(
+    module,
+    loss,
+    rows,
+    batch,
+    steps,
+    learning_rate,
+    validate=None,
+    checks=12,
+    weight_decay=0.0,
+    decay=None,
+    seed=0,
+    graph=True,
+    progress=None,
+):
     """Trains in place.
 
     Args:
       module: module that is trained (parameters that need no gradient stay).
       loss: function of a tensor of rows -> scalar.
       rows: (k,) rows to draw from, on the device.
-      decay: the rate falls by this factor twenty times over the training, as the paper's does every epoch; None: one cycle up and down.
-      graph: whether a step is replayed as a CUDA graph where there is CUDA; the loss must then do without the host.
-      validate: function () -> float, called `checks` times; the state of its smallest value is kept at the end. None keeps the last.
+      decay: the rate falls by this factor twenty times over the training, as the paper's does every epoch;
+        None: one cycle up and down.
+      graph: whether a step is replayed as a CUDA graph where there is CUDA; the loss must then do without the
+        host.
+      validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
+        end. None keeps the last.
 
     Returns:
       smallest value of validate, or None.
@@ -52,7 +71,9 @@ def cycle(module, loss, rows, batch, steps, learning_rate, validate=None, checks
         raise ValueError("no rows to train on: the train part of the split is empty")
     parameters = [p for p in module.parameters() if p.requires_grad]
     cuda = rows.is_cuda
-    rate = torch.tensor(float(learning_rate), device=rows.device)  # in the device's memory, where a replayed step finds it
+    rate = torch.tensor(
+        float(learning_rate), device=rows.device
+    )  # in the device's memory, where a replayed step finds it
     optimizer = torch.optim.AdamW(parameters, rate, weight_decay=weight_decay, fused=cuda, capturable=cuda)
     generator = torch.Generator(device=rows.device).manual_seed(seed)
     chosen = torch.zeros(min(batch, len(rows)), dtype=rows.dtype, device=rows.device)
@@ -69,7 +90,9 @@ def cycle(module, loss, rows, batch, steps, learning_rate, validate=None, checks
 
     replay = None
     for step in range(steps):
-        rate.fill_(learning_rate * (_one_cycle(step / steps) if decay is None else decay ** (20 * step / steps)))
+        rate.fill_(
+            learning_rate * (_one_cycle(step / steps) if decay is None else decay ** (20 * step / steps))
+        )
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
@@ -81,7 +104,8 @@ def cycle(module, loss, rows, batch, steps, learning_rate, validate=None, checks
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
-                    f"the loss is {float(value)} at step {step}: look for values that are not finite in the data, or lower the rate"
+                    f"the loss is {float(value)} at step {step}: look for values that are not finite in the "
+                    "data, or lower the rate"
                 )
             if validate is not None:
                 module.eval()
@@ -99,7 +123,8 @@ def cycle(module, loss, rows, batch, steps, learning_rate, validate=None, checks
 
 
 def _one_cycle(share):
-    """Factor of the learning rate: from 0.08 up to 2 in the first 15 % of the training and down to nothing, along cosines (Smith, 2018)."""
+    """Factor of the learning rate: from 0.08 up to 2 in the first 15 % of the training and down to nothing,
+    along cosines (Smith, 2018)."""
     if share < 0.15:
         return 2 - 1.92 * 0.5 * (1 + math.cos(math.pi * share / 0.15))
     return 2 * 0.5 * (1 + math.cos(math.pi * (share - 0.15) / 0.85))

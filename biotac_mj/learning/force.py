@@ -1,10 +1,11 @@
-"""Force from electrodes, causal: nothing later than the row that is predicted, and nothing of the test part, is ever used.
+"""Force from electrodes, causal: nothing later than the row that is predicted, and nothing of the test part,
+is ever used.
 
-ln Z of the 19 electrodes, causal averages of it and products of its first principal components go into ridge regressions. The sensor's
-warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t / tau): with its own weight for each force component, or as
-one gain shared by all electrodes and removed from ln Z. Which of these, and how strong the ridge, is chosen for every component by walk-
-forward trials inside the training part. A small network then learns what the ridge leaves, where it helps in those trials.
-"""
+ln Z of the 19 electrodes, causal averages of it and products of its first principal components go into ridge
+regressions. The sensor's warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t /
+tau): with its own weight for each force component, or as one gain shared by all electrodes and removed from
+ln Z. Which of these, and how strong the ridge, is chosen for every component by walk- forward trials inside
+the training part. A small network then learns what the ridge leaves, where it helps in those trials."""
 
 import dataclasses
 import itertools
@@ -35,16 +36,21 @@ def walk_forward(n, folds=4, first=0.4):
 
 
 def ridge(x, y, strength):
-    """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y (n, m)."""
+    """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y
+    (n, m)."""
     mean, scale = x.mean(0), x.std(0)
     scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
     a = (x - mean) / scale
-    weight = np.linalg.solve(a.T @ a / len(a) + strength * np.eye(a.shape[1]), a.T @ (y - y.mean(0)) / len(a)) / scale[:, None]
+    weight = (
+        np.linalg.solve(a.T @ a / len(a) + strength * np.eye(a.shape[1]), a.T @ (y - y.mean(0)) / len(a))
+        / scale[:, None]
+    )
     return weight, y.mean(0) - mean @ weight
 
 
 def shared_gain(log_z, force, tau):
-    """Amplitude a of the gain a (1 - exp(-t / tau)) that all electrodes have in common in ln Z besides what the force explains.
+    """Amplitude a of the gain a (1 - exp(-t / tau)) that all electrodes have in common in ln Z besides what
+    the force explains.
 
     Args:
       log_z: (n, 19); force: (n, 3) [N]; tau: [rows].
@@ -96,7 +102,8 @@ def _kinds(candidates):
 
 
 def _features(log_z, force, part, candidate):
-    """All rows' features; what has to be fitted is fitted on the rows of `part`. tau is relative to the length of `part`."""
+    """All rows' features; what has to be fitted is fitted on the rows of `part`. tau is relative to the
+    length of `part`."""
     n = len(log_z)
     rise = None
     if candidate.warm_up:
@@ -111,7 +118,9 @@ def _features(log_z, force, part, candidate):
         centred = log_z - log_z[part].mean(0)
         covariance = centred[part].T @ centred[part]
         main = centred @ np.linalg.eigh(covariance)[1][:, ::-1][:, : candidate.products]
-        main = np.clip(main, main[part].min(0), main[part].max(0))  # products must not run away beyond what was seen
+        main = np.clip(
+            main, main[part].min(0), main[part].max(0)
+        )  # products must not run away beyond what was seen
         i, j = np.triu_indices(candidate.products)
         columns.append(main[:, i] * main[:, j])
     if rise is not None and not candidate.shared:
@@ -129,7 +138,13 @@ class ForceModel:
     """
 
     def __init__(self, prediction, chosen, network, trials, gain):
-        self.prediction, self.chosen, self.network, self.trials, self.gain = prediction, chosen, network, trials, gain
+        self.prediction, self.chosen, self.network, self.trials, self.gain = (
+            prediction,
+            chosen,
+            network,
+            trials,
+            gain,
+        )
 
 
 def fit_force(counts, force, ntrain, seed=0, network=True, progress=None) -> ForceModel:
@@ -157,11 +172,16 @@ def fit_force(counts, force, ntrain, seed=0, network=True, progress=None) -> For
                 error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
         if progress:
             progress()
-    # one of each degree of flexibility, with and without warm-up: their mean is steadier than any of them where something new comes
-    best = [[min(kin, key=lambda c: np.mean(error[c], axis=0)[k]) for kin in _kinds(candidates)] for k in range(3)]
+    # one of each degree of flexibility, with and without warm-up: their mean is steadier than any of them
+    # where something new comes
+    best = [
+        [min(kin, key=lambda c: np.mean(error[c], axis=0)[k]) for kin in _kinds(candidates)] for k in range(3)
+    ]
     prediction = _mean_of(best, log_z, force, slice(0, ntrain))
     base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]
-    plain = np.array([np.sqrt(((b[test] - force[test]) ** 2).mean(0)) for b, (_, test) in zip(base, folds)]).mean(0)
+    plain = np.array(
+        [np.sqrt(((b[test] - force[test]) ** 2).mean(0)) for b, (_, test) in zip(base, folds)]
+    ).mean(0)
     trials, kept = {"ridge": plain.tolist()}, [False] * 3
     if network:
         helped = []
@@ -191,7 +211,8 @@ def _mean_of(best, log_z, force, part):
 
 
 def _network(log_z, target, part, seed, members=2, epochs=8, width=64, batch=256):
-    """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a common gain, against drift."""
+    """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a
+    common gain, against drift."""
     import torch
 
     mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)

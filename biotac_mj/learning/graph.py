@@ -11,7 +11,8 @@ __all__ = ["ChebConv", "SparseMatrix", "sparse_product"]
 
 
 class _Product(torch.autograd.Function):
-    """matrix (n, m) @ x (m, c), with the transpose given, so that the gradient is a product of the same kind."""
+    """matrix (n, m) @ x (m, c), with the transpose given, so that the gradient is a product of the same
+    kind."""
 
     @staticmethod
     def forward(ctx, x, matrix, transpose):
@@ -25,7 +26,8 @@ class _Product(torch.autograd.Function):
 
 
 class SparseMatrix(nn.Module):
-    """A constant sparse matrix that moves with its module; not among the parameters or the saved weights: it follows from the mesh."""
+    """A constant sparse matrix that moves with its module; not among the parameters or the saved weights: it
+    follows from the mesh."""
 
     def __init__(self, matrix, symmetric=False):
         super().__init__()
@@ -44,7 +46,9 @@ class SparseMatrix(nn.Module):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # torch calls its CSR matrices a beta
                 pair = [
-                    torch.sparse_csr_tensor(getattr(self, s + "crow"), getattr(self, s + "col"), getattr(self, s + "value"), size)
+                    torch.sparse_csr_tensor(
+                        getattr(self, s + "crow"), getattr(self, s + "col"), getattr(self, s + "value"), size
+                    )
                     for s, size in (("forward_", (n, m)), ("backward_", (m, n)))
                 ]
             self._made = key, pair
@@ -62,14 +66,17 @@ def sparse_product(pair, x):
 
 
 class ChebConv(nn.Module):
-    """y = sum over k < K of T_k(L) x W_k + b on a graph; L the scaled Laplacian, T_k Chebyshev polynomials (Defferrard et al., 2016).
+    """y = sum over k < K of T_k(L) x W_k + b on a graph; L the scaled Laplacian, T_k Chebyshev polynomials
+    (Defferrard et al., 2016).
 
-    On the CPU the recurrence runs on whichever is narrower, inputs or outputs (Clenshaw's scheme for the latter): the sparse products are
-    what costs. On a GPU, where the graph becomes coarser or finer, all T_k stand as one dense matrix, cut to the nodes that are wanted:
-    one product instead of K - 1 sparse ones, which take five times as long there.
+    On the CPU the recurrence runs on whichever is narrower, inputs or outputs (Clenshaw's scheme for the
+    latter): the sparse products are what costs. On a GPU, where the graph becomes coarser or finer, all T_k
+    stand as one dense matrix, cut to the nodes that are wanted: one product instead of K - 1 sparse ones,
+    which take five times as long there.
 
     Args:
-      laplacian: SparseMatrix, symmetric. inputs, outputs: channels. order: K. bias: COMA's last layer has none.
+      laplacian: SparseMatrix, symmetric. inputs, outputs: channels. order: K. bias: COMA's last layer has
+        none.
       keep: (m,) nodes at which the result is wanted; None: all.
       up: SparseMatrix (n, m) that brings the input from a coarser graph; None: it is given on this one.
     """

@@ -1,4 +1,5 @@
-"""Networks from features of the deformed skin to d ln Z of the electrodes, all of them exactly zero for a skin at rest."""
+"""Networks from features of the deformed skin to d ln Z of the electrodes, all of them exactly zero for a
+skin at rest."""
 
 import torch
 from torch import nn
@@ -29,7 +30,8 @@ class PodHead(nn.Module):
 
 
 class LocalHead(nn.Module):
-    """One head for all electrodes on what lies over each, a linear part for each electrode, and a small residual that sees the whole mesh.
+    """One head for all electrodes on what lies over each, a linear part for each electrode, and a small
+    residual that sees the whole mesh.
 
     The head has 19 times the data that a head for each would have, and has no way to recognise an indenter.
 
@@ -52,7 +54,11 @@ class LocalHead(nn.Module):
         """(n, 19) of local (n, 19, features) and pod (n, modes)."""
         x = local / self.scale
         own = (x * self.own).sum(-1)
-        return self._curved(_plain, x, pod * self.damp) + own - self._curved(steady, torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
+        return (
+            self._curved(_plain, x, pod * self.damp)
+            + own
+            - self._curved(steady, torch.zeros_like(x[:1]), torch.zeros_like(pod[:1]))
+        )
 
     def _curved(self, apply, x, pod):
         embedding = self.embedding.expand(len(x), -1, -1)
@@ -76,11 +82,17 @@ def next_average(average, value, dt, tau):
     Args:
       average: (len(tau), ...) before; value: (...) now. dt: float, or a tensor that fits value.
     """
-    return torch.stack([a + (1 - torch.exp(torch.as_tensor(-dt / t, dtype=value.dtype))) * (value - a) for a, t in zip(average, tau)])
+    return torch.stack(
+        [
+            a + (1 - torch.exp(torch.as_tensor(-dt / t, dtype=value.dtype))) * (value - a)
+            for a, t in zip(average, tau)
+        ]
+    )
 
 
 def averages(value, first, time, tau):
-    """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal averages, which begin at zero.
+    """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal
+    averages, which begin at zero.
 
     Args:
       first: (n,) row of each row's interaction's start. time: (n,) [s] within it. tau: time constants [s].
@@ -92,6 +104,8 @@ def averages(value, first, time, tau):
         for k in range(1, int(position.max()) + 1):
             row = (position == k).nonzero()[:, 0]
             share = 1 - torch.exp(-(time[row] - time[row - 1]) / t)
-            average[row] = average[row - 1] + share.view(-1, *[1] * (value.ndim - 1)) * (value[row] - average[row - 1])
+            average[row] = average[row - 1] + share.view(-1, *[1] * (value.ndim - 1)) * (
+                value[row] - average[row - 1]
+            )
         out.append(value - average)
     return torch.cat(out, -1)

@@ -1,8 +1,10 @@
 """Coarser and coarser graphs of a tetrahedral mesh, with the matrices that take a field down and up.
 
-Nodes of a level are chosen by farthest-point sampling in geodesic distance along the edges, which keeps the two faces of the thin skin
-apart; the coarse graph is the dual of their Voronoi cells. Down is the selection of those nodes. Up is affine-exact moving least squares
-over the nearest kept nodes: fields that are linear in space pass unchanged. (Quadric simplification, as COMA uses it, measures a
+Nodes of a level are chosen by farthest-point sampling in geodesic distance along the edges, which keeps the
+two faces of the thin skin apart; the coarse graph is the dual of their Voronoi cells. Down is the selection
+of those nodes. Up is affine-exact moving least squares
+over the nearest kept nodes: fields that are linear in space pass unchanged. (Quadric simplification, as COMA
+  uses it, measures a
 surface's flatness and has no meaning inside a volume.)
 """
 
@@ -39,7 +41,8 @@ def edges_of(elem) -> np.ndarray:
 
 
 def scaled_laplacian(adjacency) -> csr_matrix:
-    """L - 1, the argument of the Chebyshev polynomials: L = 1 - D^-1/2 A D^-1/2, and 2 is taken as its largest eigenvalue."""
+    """L - 1, the argument of the Chebyshev polynomials: L = 1 - D^-1/2 A D^-1/2, and 2 is taken as its
+    largest eigenvalue."""
     degree = np.asarray(adjacency.sum(1)).ravel()
     inverse = 1 / np.sqrt(np.maximum(degree, 1e-12))
     scaled = adjacency.multiply(inverse[:, None]).multiply(inverse[None]).tocsr()
@@ -62,12 +65,18 @@ def build_hierarchy(vert, elem, factors=(4, 4, 4, 2)) -> list[Level]:
     length = np.linalg.norm(vert[edge[:, 0]] - vert[edge[:, 1]], axis=1)
     graph = _symmetric(edge, length, n)
     if connected_components(graph, directed=False)[0] > 1:
-        raise ValueError("the mesh is not connected: a graph network on it would not see all of it; import a mesh of one piece")
+        raise ValueError(
+            "the mesh is not connected: a graph network on it would not see all of it; import a mesh of one "
+            "piece"
+        )
     levels, here = [], vert
     for factor in factors:
         m = int(np.ceil(len(here) / factor))
         if m < 5:
-            raise ValueError(f"{n} nodes are too few for factors {tuple(factors)}: the coarsest level would have {m} nodes, fewer than 5")
+            raise ValueError(
+                f"{n} nodes are too few for factors {tuple(factors)}: the coarsest level would have {m} "
+                "nodes, fewer than 5"
+            )
         keep, owner = _farthest(graph, m)
         up = _interpolation(graph, here, keep)
         levels.append(Level(scaled_laplacian(_binary(graph)), keep, up))
@@ -86,7 +95,8 @@ def _binary(graph):
 
 
 def _farthest(graph, count):
-    """Nodes (count,) chosen one after another, each the farthest from those before, and of all nodes the nearest chosen one."""
+    """Nodes (count,) chosen one after another, each the farthest from those before, and of all nodes the
+    nearest chosen one."""
     nearest = np.full(graph.shape[0], np.inf)
     owner = np.zeros(graph.shape[0], int)
     keep, new = [], 0
@@ -119,7 +129,8 @@ def _interpolation(graph, vert, keep):
     offset = vert[keep[near]] - vert[:, None]  # (n, k, 3)
     scale = np.sqrt((offset**2).sum(2).mean(1))[:, None, None]
     p = np.concatenate([np.ones((n, k, 1)), offset / scale], axis=2)
-    # Minimise sum |c|^2 / w subject to P^T c = e1: c = W P (P^T W P)^-1 e1. The small ridge acts where the neighbours lie in a plane.
+    # Minimise sum |c|^2 / w subject to P^T c = e1: c = W P (P^T W P)^-1 e1. The small ridge acts where the
+    # neighbours lie in a plane.
     gram = np.einsum("nka,nk,nkb->nab", p, weight, p)
     ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.diag([0.0, 1, 1, 1])
     c = np.linalg.solve(gram + ridge, np.broadcast_to(np.eye(4)[0], (n, 4))[..., None])[..., 0]

@@ -16,10 +16,12 @@ PATCH = 0.15  # of the largest nodal force: nodes above it are the patch
 
 
 class InverseHead(nn.Module):
-    """d ln Z of the 19 electrodes -> displacements of all nodes and contact force on the outer ones, through components of both.
+    """d ln Z of the 19 electrodes -> displacements of all nodes and contact force on the outer ones, through
+    components of both.
 
     Args:
-      pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes. width, dropout: of the network.
+      pod: Pod of the displacements. force_modes: components of the force. nouter: outer nodes. width,
+        dropout: of the network.
     """
 
     def __init__(self, pod, force_modes, nouter, width=256, dropout=0.2):
@@ -32,7 +34,8 @@ class InverseHead(nn.Module):
         self.net = mlp([19, width, width, self.modes + force_modes], dropout)
 
     def codes(self, log_change):
-        """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z (n, 19)."""
+        """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z
+        (n, 19)."""
         out = self.net(log_change / self.scale) - steady(self.net, torch.zeros_like(log_change[:1]))
         return out.split([self.modes, self.force_basis.shape[1]], 1)
 
@@ -40,14 +43,17 @@ class InverseHead(nn.Module):
         """Displacements (n, nvert, 3) [mm] and norm of the contact force (n, nouter) [N], at least 0."""
         u, f = self.codes(log_change)
         field = (u * self.pod.scale[0]) @ self.pod.basis.T
-        return field.view(len(u), self.pod.nvert, 3), ((f * self.force_scale[0]) @ self.force_basis.T).clamp(min=0)
+        return field.view(len(u), self.pod.nvert, 3), ((f * self.force_scale[0]) @ self.force_basis.T).clamp(
+            min=0
+        )
 
 
 def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, progress=None) -> InverseHead:
-    """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or None).
+    """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or
+    None).
 
-    The loss weighs components by their size, so it is the error of the fields themselves. teach: first learn from the simulation's own
-    film on all interactions of the training part, labelled or not.
+    The loss weighs components by their size, so it is the error of the fields themselves. teach: first learn
+    from the simulation's own film on all interactions of the training part, labelled or not.
 
     Returns:
       the head; its attribute `validation` is its error on the validation part [unit of the loss].
@@ -81,19 +87,41 @@ def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, p
         return error(r, source=source) + (0.5 * error(r, True, source) if then is not None else 0)
 
     if teach:
-        film = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device)
+        film = torch.as_tensor(
+            log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
+        )
         film = film - film[arrays.first]
-        cycle(head, lambda r: loss(r, film), every, 2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed,
-              graph=config.graphs, progress=progress)  # fmt: skip
+        cycle(
+            head,
+            lambda r: loss(r, film),
+            every,
+            2 * config.batch,
+            2 * config.steps,
+            2 * config.learning_rate,
+            seed=seed,
+            graph=config.graphs,
+            progress=progress,
+        )
     rate = config.learning_rate * (0.5 if teach else 1)
-    head.validation = cycle(head, loss, rows, config.batch, config.steps, rate, lambda: error(check), weight_decay=0.01, seed=seed,
-                            graph=config.graphs, progress=progress)  # fmt: skip
+    head.validation = cycle(
+        head,
+        loss,
+        rows,
+        config.batch,
+        config.steps,
+        rate,
+        lambda: error(check),
+        weight_decay=0.01,
+        seed=seed,
+        graph=config.graphs,
+        progress=progress,
+    )
     return head
 
 
 def field_errors(got, truth) -> dict:
-    """Errors [mm] of fields (n, nvert, 3) [mm], each (n,): mean of all nodes, of those displaced by more than 50 um, of the largest
-    displacement."""
+    """Errors [mm] of fields (n, nvert, 3) [mm], each (n,): mean of all nodes, of those displaced by more than
+    50 um, of the largest displacement."""
     size = truth.norm(dim=2)
     error = (got - truth).norm(dim=2)
     moved = (size > 0.05).float()
@@ -105,7 +133,8 @@ def field_errors(got, truth) -> dict:
 
 
 def contact_centre(force, place):
-    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), place (nouter, 3) [m] of the nodes."""
+    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), place
+    (nouter, 3) [m] of the nodes."""
     force = np.asarray(force, float)
     weight = np.where(force > PATCH * force.max(1, keepdims=True), force, 0)
     total = weight.sum(1, keepdims=True)
@@ -114,7 +143,8 @@ def contact_centre(force, place):
 
 
 def patch_overlap(got, truth):
-    """(n,) intersection over union of the nodes above PATCH of their largest force; NaN where nothing touches."""
+    """(n,) intersection over union of the nodes above PATCH of their largest force; NaN where nothing
+    touches."""
     a = got > PATCH * got.max(1, keepdims=True)
     b = truth > PATCH * truth.max(1, keepdims=True)
     union = (a | b).sum(1)
@@ -129,8 +159,12 @@ def log_change_of(counts, tare):
     """
     counts, tare = np.asarray(counts, float), np.asarray(tare, float)
     if counts.shape[-1:] != (19,) or tare.shape[-1:] != (19,):
-        raise ValueError(f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed")
+        raise ValueError(
+            f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed"
+        )
     for name, value in (("counts", counts), ("tare", tare)):
         if not np.isfinite(value).all() or value.min() < 0 or value.max() > 4095:
-            raise ValueError(f"{name} hold values that are not finite or outside 0..4095: pass raw counts, not tared ones")
+            raise ValueError(
+                f"{name} hold values that are not finite or outside 0..4095: pass raw counts, not tared ones"
+            )
     return log_impedance(counts) - log_impedance(tare)

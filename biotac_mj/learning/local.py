@@ -1,4 +1,5 @@
-"""The better models: principal components or local film features, d ln Z as the target, the simulation's film as a teacher."""
+"""The better models: principal components or local film features, d ln Z as the target, the simulation's film
+as a teacher."""
 
 import torch
 
@@ -24,7 +25,8 @@ class Features:
       arrays: Arrays. config: LearningConfig.
 
     Attributes:
-      film: FilmFeatures. local: (n, 19, k) now, and then minus its causal averages. mirrored: the same of the mirrored touches, or None.
+      film: FilmFeatures. local: (n, 19, k) now, and then minus its causal averages. mirrored: the same of the
+        mirrored touches, or None.
     """
 
     def __init__(self, arrays, config):
@@ -38,13 +40,19 @@ class Features:
 
     def mirror(self, u):
         """Fields (n, nvert, 3) of the touches mirrored in the plane z = 0."""
-        return self.matrix(u.float().transpose(0, 1).contiguous()).transpose(0, 1) * torch.tensor([1.0, 1.0, -1.0], device=u.device)
+        return self.matrix(u.float().transpose(0, 1).contiguous()).transpose(0, 1) * torch.tensor(
+            [1.0, 1.0, -1.0], device=u.device
+        )
 
     @torch.no_grad()
     def _local(self, change):
         a = self.arrays
         value = torch.cat([self.film(change(u)) for u in a.field.split(256)])
-        return torch.cat([value, averages(value, a.first, a.time, self.config.window)], -1) if self.config.window else value
+        return (
+            torch.cat([value, averages(value, a.first, a.time, self.config.window)], -1)
+            if self.config.window
+            else value
+        )
 
     @torch.no_grad()
     def components(self, pod, mirrored=False):
@@ -53,14 +61,27 @@ class Features:
         return torch.cat([pod(change(u)) for u in self.arrays.field.split(512)])
 
 
-def train_head(features, train, validation, config, kind="local", window=True, teach=True, mirror=True, log=True, seed=0,
-               pod=None, progress=None):  # fmt: skip
+def train_head(
+    features,
+    train,
+    validation,
+    config,
+    kind="local",
+    window=True,
+    teach=True,
+    mirror=True,
+    log=True,
+    seed=0,
+    pod=None,
+    progress=None,
+):
     """Trains one head.
 
     Args:
       features: Features. train, validation: numbers of interactions.
-      kind: "pod" or "local". window: with causal averages. teach: first learn the d ln Z of the simulation's own film on all interactions
-        of the training part, labelled or not. mirror: with mirrored touches. log: targets d ln Z against a known tare; False: tared counts.
+      kind: "pod" or "local". window: with causal averages. teach: first learn the d ln Z of the simulation's
+        own film on all interactions of the training part, labelled or not. mirror: with mirrored touches.
+        log: targets d ln Z against a known tare; False: tared counts.
       pod: (Pod, components, mirrored components or None), fitted on the training part.
 
     Returns:
@@ -101,18 +122,44 @@ def train_head(features, train, validation, config, kind="local", window=True, t
 
     labelled, check = a.rows(train, labelled=True), a.rows(validation, labelled=True)
     if teach and log:
-        target = torch.as_tensor(log_impedance(a.simulated.cpu().numpy()), dtype=torch.float32, device=a.device)
+        target = torch.as_tensor(
+            log_impedance(a.simulated.cpu().numpy()), dtype=torch.float32, device=a.device
+        )
         target = target - target[a.first]
 
         def teacher_loss(rows):
             value = root_mean_square(output(rows) - target[rows])
-            return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order]) if mirror else value
+            return (
+                value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
+                if mirror
+                else value
+            )
 
-        cycle(head, teacher_loss, a.rows(train), 2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed,
-              graph=config.graphs, progress=progress)  # fmt: skip
+        cycle(
+            head,
+            teacher_loss,
+            a.rows(train),
+            2 * config.batch,
+            config.steps,
+            2 * config.learning_rate,
+            seed=seed,
+            graph=config.graphs,
+            progress=progress,
+        )
     rate = config.learning_rate * (0.5 if teach else 1)
-    cycle(head, loss, labelled, config.batch, config.steps, rate, lambda: root_mean_square(predict(check) - a.change(check)),
-          weight_decay=0.01, seed=seed, graph=config.graphs, progress=progress)  # fmt: skip
+    cycle(
+        head,
+        loss,
+        labelled,
+        config.batch,
+        config.steps,
+        rate,
+        lambda: root_mean_square(predict(check) - a.change(check)),
+        weight_decay=0.01,
+        seed=seed,
+        graph=config.graphs,
+        progress=progress,
+    )
 
     @torch.no_grad()
     def evaluate(rows):

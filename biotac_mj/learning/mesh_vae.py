@@ -1,4 +1,5 @@
-"""The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, down to a code of 128."""
+"""The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, down to a
+code of 128."""
 
 import torch
 from torch import nn
@@ -11,19 +12,27 @@ __all__ = ["MeshVAE"]
 class MeshVAE(nn.Module):
     """Code of a displacement field.
 
-    Encoder: convolution to `channels[0]` ("conv 128"), then for every factor a convolution and a selection of nodes, a last convolution,
-    fully connected layers to mean and log variance. The decoder mirrors it, interpolating up before each convolution.
+    Encoder: convolution to `channels[0]` ("conv 128"), then for every factor a convolution and a selection of
+      nodes, a last convolution,
+    fully connected layers to mean and log variance. The decoder mirrors it, interpolating up before each
+    convolution.
 
     Args:
       levels: of `build_hierarchy`, one more than there are entries in `channels`.
-      first: channels of the first convolution. channels: of those before each downsampling. last: of the one behind them.
+      first: channels of the first convolution. channels: of those before each downsampling. last: of the one
+        behind them.
       hidden: width of the fully connected layer. latent: size of the code. order: K of the convolutions.
     """
 
-    def __init__(self, levels, first=128, channels=(128, 128, 256, 64), last=64, hidden=512, latent=128, order=6):
+    def __init__(
+        self, levels, first=128, channels=(128, 128, 256, 64), last=64, hidden=512, latent=128, order=6
+    ):
         super().__init__()
         if len(levels) != len(channels) + 1:
-            raise ValueError(f"{len(levels)} levels for {len(channels)} stages of channels: one more level than stages is needed")
+            raise ValueError(
+                f"{len(levels)} levels for {len(channels)} stages of channels: one more level than stages "
+                "is needed"
+            )
         self.nvert, self.latent, self.order = levels[0].laplacian.shape[0], latent, order
         self.coarsest = levels[-1].laplacian.shape[0]
         graphs = [SparseMatrix(level.laplacian, symmetric=True) for level in levels]
@@ -35,11 +44,18 @@ class MeshVAE(nn.Module):
             + [ChebConv(g, a, b, order, keep=keep) for (g, keep, _), a, b in zip(stages, widths, widths[1:])]
             + [ChebConv(graphs[-1], channels[-1], last, order)]
         )
-        self.encode_dense = nn.Sequential(nn.Linear(self.coarsest * last, hidden), nn.ELU(), nn.Linear(hidden, 2 * latent))
-        self.decode_dense = nn.Sequential(nn.Linear(latent, hidden), nn.ELU(), nn.Linear(hidden, self.coarsest * last), nn.ELU())
+        self.encode_dense = nn.Sequential(
+            nn.Linear(self.coarsest * last, hidden), nn.ELU(), nn.Linear(hidden, 2 * latent)
+        )
+        self.decode_dense = nn.Sequential(
+            nn.Linear(latent, hidden), nn.ELU(), nn.Linear(hidden, self.coarsest * last), nn.ELU()
+        )
         self.decode_convs = nn.ModuleList(
             [ChebConv(graphs[-1], last, channels[-1], order)]
-            + [ChebConv(g, b, a, order, up=up) for (g, _, up), a, b in reversed(list(zip(stages, widths, widths[1:])))]
+            + [
+                ChebConv(g, b, a, order, up=up)
+                for (g, _, up), a, b in reversed(list(zip(stages, widths, widths[1:])))
+            ]
             + [ChebConv(graphs[0], first, 3, order, bias=False)]
         )
         self.last = last
@@ -64,7 +80,8 @@ class MeshVAE(nn.Module):
         return self.decode_convs[-1](x).transpose(0, 1)
 
     def forward(self, u):
-        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log variance."""
+        """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
+        variance."""
         mean, log_variance = self.encode(u)
         z = mean + torch.randn_like(mean) * torch.exp(0.5 * log_variance) if self.training else mean
         return self.decode(z), mean, log_variance

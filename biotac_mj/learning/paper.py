@@ -1,4 +1,5 @@
-"""The paper's way (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes, PointNet++ beside them."""
+"""The paper's way (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes,
+PointNet++ beside them."""
 
 import numpy as np
 import torch
@@ -46,10 +47,19 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
     device, geometry = arrays.device, arrays.geometry
     unit = 1e-3 / config.mesh_scale
     mesh_rows, mesh_check = arrays.rows(train), arrays.rows(validation)
-    mesh_check = mesh_check[torch.linspace(0, len(mesh_check) - 1, min(256, len(mesh_check))).long().to(device)]
+    mesh_check = mesh_check[
+        torch.linspace(0, len(mesh_check) - 1, min(256, len(mesh_check))).long().to(device)
+    ]
     levels = build_hierarchy(geometry.vert, geometry.tets, config.mesh_factors)
-    vae = MeshVAE(levels, config.mesh_first, config.mesh_channels, config.mesh_last, config.mesh_hidden, config.mesh_latent,
-                  config.mesh_order).to(device)  # fmt: skip
+    vae = MeshVAE(
+        levels,
+        config.mesh_first,
+        config.mesh_channels,
+        config.mesh_last,
+        config.mesh_hidden,
+        config.mesh_latent,
+        config.mesh_order,
+    ).to(device)
 
     def field(rows):
         return unit * arrays.field[rows].float()
@@ -61,8 +71,20 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
     def mesh_validate():
         return sum(float((vae(field(r))[0] - field(r)).square().sum()) for r in mesh_check.split(64))
 
-    cycle(vae, mesh_loss, mesh_rows, config.mesh_batch, config.mesh_steps, config.learning_rate, mesh_validate, checks=4,
-          decay=config.decay, seed=seed, graph=False, progress=progress)  # fmt: skip
+    cycle(
+        vae,
+        mesh_loss,
+        mesh_rows,
+        config.mesh_batch,
+        config.mesh_steps,
+        config.learning_rate,
+        mesh_validate,
+        checks=4,
+        decay=config.decay,
+        seed=seed,
+        graph=False,
+        progress=progress,
+    )
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     y = torch.zeros_like(arrays.counts)
@@ -105,7 +127,13 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
         a, b = codes_of(r)
         return root_mean_square(model.to_mesh(b) - a)
 
-    kind = dict(batch=config.batch, steps=config.paper_steps, learning_rate=config.learning_rate, decay=config.decay, seed=seed)
+    kind = dict(
+        batch=config.batch,
+        steps=config.paper_steps,
+        learning_rate=config.learning_rate,
+        decay=config.decay,
+        seed=seed,
+    )
     kind |= dict(graph=config.graphs, progress=progress)
     cycle(model.to_electrode, forward_loss, rows, validate=lambda: forward_loss(check), **kind)
     cycle(model.to_mesh, inverse_loss, rows, validate=lambda: inverse_loss(check), **kind)
@@ -114,7 +142,8 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
 
 @fast_products()
 def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> PointNet:
-    """Trains the baseline on labelled interactions alone; input displacements / mesh_scale, output tared counts / 2048."""
+    """Trains the baseline on labelled interactions alone; input displacements / mesh_scale, output tared
+    counts / 2048."""
     torch.manual_seed(seed)
     geometry, unit = arrays.geometry, 1e-3 / config.mesh_scale
     free = np.setdiff1d(np.arange(geometry.nvert), geometry.fixed)
@@ -127,8 +156,19 @@ def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> 
     def validate():
         return sum(float(loss(r)) * len(r) for r in check.split(1024)) / len(check)
 
-    cycle(net, loss, rows, config.batch, config.paper_steps, config.learning_rate, validate, decay=config.decay, seed=seed,
-          graph=False, progress=progress)  # fmt: skip
+    cycle(
+        net,
+        loss,
+        rows,
+        config.batch,
+        config.paper_steps,
+        config.learning_rate,
+        validate,
+        decay=config.decay,
+        seed=seed,
+        graph=False,
+        progress=progress,
+    )
     return net
 
 

@@ -1,4 +1,5 @@
-"""`biotac contact-patch`: deformation and contact patch of a BioTac from its electrodes, drawn from below as in the paper's figure."""
+"""`biotac contact-patch`: deformation and contact patch of a BioTac from its electrodes, drawn from below as
+in the paper's figure."""
 
 import json
 import pathlib
@@ -20,7 +21,8 @@ def estimate(counts, tare, geometry, weights=None):
     """Displacements and contact force of raw counts.
 
     Args:
-      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin of the weights. weights: file; None takes the package's.
+      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin of the weights. weights: file;
+        None takes the package's.
 
     Returns:
       displacement (n, nvert, 3) [m] and force (n, nouter) [N] on the nodes of the outer surface, sorted.
@@ -39,7 +41,8 @@ def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", wei
     """Estimates every row of a recording, draws one; writes contact.png and contact.json into `out`.
 
     Args:
-      source: text of 19 columns, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor at rest.
+      source: text of 19 columns, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor
+        at rest.
       row: which row is drawn and returned.
 
     Raises:
@@ -48,7 +51,9 @@ def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", wei
     """
     counts = read_columns(source, CHANNELS[:19])
     if not 1 <= tare < len(counts):
-        raise ValueError(f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at")
+        raise ValueError(
+            f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at"
+        )
     if not -len(counts) <= row < len(counts):
         raise ValueError(f"--row {row}: the recording has {len(counts)} rows")
     geometry = load_skin(skin)
@@ -60,18 +65,34 @@ def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", wei
     patch = force > PATCH * force.max(1, keepdims=True)
     centre = contact_centre(force, place)
     table = {
-        "schema": "biotac_mj.learning.contact_patch/1", "weights": "trained on synthetic data", "source": str(source),
+        "schema": "biotac_mj.learning.contact_patch/1",
+        "weights": "trained on synthetic data",
+        "source": str(source),
         "centre_mm": [None if np.isnan(c).any() else (1e3 * c).tolist() for c in centre],
-        "force_N": force.sum(1).tolist(), "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
+        "force_N": force.sum(1).tolist(),
+        "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
         "deepest_mm": (1e3 * np.linalg.norm(field[:, outer], axis=2).max(1)).tolist(),
-    }  # fmt: skip
+    }
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     with replacing(out / "contact.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(table))
-    one = {"row": row} | {k: table[name][row] for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))}
+    one = {"row": row} | {
+        k: table[name][row]
+        for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))
+    }
     one["centre_mm"] = table["centre_mm"][row] or [float("nan")] * 3
-    _figure(geometry, outer, field[row], force[row], centre[row], counts[row], counts[:tare].mean(0), one, out / "contact.png")
+    _figure(
+        geometry,
+        outer,
+        field[row],
+        force[row],
+        centre[row],
+        counts[row],
+        counts[:tare].mean(0),
+        one,
+        out / "contact.png",
+    )
     return one
 
 
@@ -83,7 +104,8 @@ def _node_area(geometry, outer):
 
 
 def draw_skin(axis, vert, face, value, limit, title, cmap="viridis"):
-    """Draws a surface seen from the pad's side (along +y): faces coloured by the mean of nodal values, shaded, far ones first.
+    """Draws a surface seen from the pad's side (along +y): faces coloured by the mean of nodal values,
+    shaded, far ones first.
 
     Args:
       axis: of matplotlib. vert: (n, 3) [m]; face: (m, 3); value: (n,); limit: of the colours.
@@ -102,7 +124,11 @@ def draw_skin(axis, vert, face, value, limit, title, cmap="viridis"):
     colour = matplotlib.colormaps[cmap](np.clip(value[face[order]].mean(1) / limit, 0, 1))
     light = 0.35 + 0.65 * np.clip(normal[order] @ (np.array([-0.35, -0.85, 0.4]) / 1.003), 0, 1)
     colour[:, :3] *= light[:, None]
-    axis.add_collection(PolyCollection(1e3 * corner[order][:, :, [0, 2]], facecolors=colour, edgecolors=colour, linewidths=0.3))
+    axis.add_collection(
+        PolyCollection(
+            1e3 * corner[order][:, :, [0, 2]], facecolors=colour, edgecolors=colour, linewidths=0.3
+        )
+    )
     axis.set_xlim(-23, 3), axis.set_ylim(-8.5, 8.5)
     axis.set_aspect("equal")
     axis.set_title(title, fontsize=10)
@@ -117,11 +143,26 @@ def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
     left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1, 0.8])
     shape = geometry.vert + field
     depth = 1e3 * np.linalg.norm(field, axis=1)
-    bar = draw_skin(left, shape, geometry.outer_face, depth, max(depth[outer].max(), 1e-3), "displacement from electrodes [mm]")
+    bar = draw_skin(
+        left,
+        shape,
+        geometry.outer_face,
+        depth,
+        max(depth[outer].max(), 1e-3),
+        "displacement from electrodes [mm]",
+    )
     figure.colorbar(bar, ax=left, shrink=0.8)
     nodal = np.zeros(geometry.nvert)
     nodal[outer] = force / _node_area(geometry, outer) * 1e-3
-    bar = draw_skin(middle, shape, geometry.outer_face, nodal, max(nodal.max(), 1e-6), "contact pressure from electrodes [kPa]", "inferno")
+    bar = draw_skin(
+        middle,
+        shape,
+        geometry.outer_face,
+        nodal,
+        max(nodal.max(), 1e-6),
+        "contact pressure from electrodes [kPa]",
+        "inferno",
+    )
     figure.colorbar(bar, ax=middle, shrink=0.8)
     if np.isfinite(centre).all():
         middle.plot(1e3 * centre[0], 1e3 * centre[2], "+", color="c", ms=12, mew=2)

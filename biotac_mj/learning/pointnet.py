@@ -1,8 +1,7 @@
 """PointNet++ on 128 nodes of the skin: the fully supervised baseline of Narang et al. (ICRA 2021).
 
-The points keep their neighbours (the skin bends by a few millimetres, no more), so sampling and grouping are done once on the rest shape
-(Qi et al., 2017, choose them for every cloud).
-"""
+The points keep their neighbours (the skin bends by a few millimetres, no more), so sampling and grouping are
+done once on the rest shape (Qi et al., 2017, choose them for every cloud)."""
 
 import numpy as np
 import torch
@@ -36,12 +35,16 @@ class PointNet(nn.Module):
         super().__init__()
         vert, free = np.asarray(vert, float), np.asarray(free)
         if len(free) < points[0]:
-            raise ValueError(f"the skin has {len(free)} free nodes: {points[0]} points cannot be sampled from them")
+            raise ValueError(
+                f"the skin has {len(free)} free nodes: {points[0]} points cannot be sampled from them"
+            )
         sample = free[farthest_points(vert[free], points[0])]
         self.register_buffer("sample", torch.as_tensor(sample), persistent=False)
         place = vert[sample]
         size = np.abs(place - place.mean(0)).max()
-        self.register_buffer("rest", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False)
+        self.register_buffer(
+            "rest", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False
+        )
         self.stages = nn.ModuleList()
         width = 3
         for i, (count, out) in enumerate(zip(points[1:], (64, 128))):
@@ -50,10 +53,14 @@ class PointNet(nn.Module):
             group = cKDTree(place).query(place[centre], k)[1]
             relative = (place[group] - place[centre][:, None]) / size
             self.register_buffer(f"group{i}", torch.as_tensor(group), persistent=False)
-            self.register_buffer(f"relative{i}", torch.as_tensor(relative, dtype=torch.float32), persistent=False)
+            self.register_buffer(
+                f"relative{i}", torch.as_tensor(relative, dtype=torch.float32), persistent=False
+            )
             self.stages.append(nn.Sequential(mlp([width + 3, out, out, out]), nn.ELU()))
             place, width = place[centre], out
-        self.register_buffer("place", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False)
+        self.register_buffer(
+            "place", torch.as_tensor((place - place.mean(0)) / size, dtype=torch.float32), persistent=False
+        )
         self.whole = nn.Sequential(mlp([width + 3, 256, 256]), nn.ELU())
         self.head = mlp([256, 256, 128, outputs], dropout)
 

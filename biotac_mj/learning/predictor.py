@@ -28,7 +28,11 @@ class ForwardModel(nn.Module):
         self.pod = Pod(geometry.nvert, modes)
         self.film = FilmFeatures(geometry) if self.local else None
         width = FilmFeatures.count * (1 + len(self.window))
-        make = (lambda: LocalHead(width, modes, meta["width"])) if self.local else (lambda: PodHead(modes, meta["width"]))
+        make = (
+            (lambda: LocalHead(width, modes, meta["width"]))
+            if self.local
+            else (lambda: PodHead(modes, meta["width"]))
+        )
         self.members = nn.ModuleList(make() for _ in range(meta["members"]))
 
     @property
@@ -42,7 +46,8 @@ class ForwardModel(nn.Module):
 
         Args:
           displacement: (n, nvert, 3) tensor [mm].
-          average: (n, *memory) causal averages before this step, or None: a skin that has been as it is for long.
+          average: (n, *memory) causal averages before this step, or None: a skin that has been as it is for
+            long.
           dt: since the last call [s].
 
         Returns:
@@ -52,9 +57,14 @@ class ForwardModel(nn.Module):
           ValueError: wrong number of nodes, or displacements that are not finite.
         """
         if displacement.shape[1:] != (self.nvert, 3):
-            raise ValueError(f"displacement has shape {tuple(displacement.shape)}: this model reads (n, {self.nvert}, 3)")
+            raise ValueError(
+                f"displacement has shape {tuple(displacement.shape)}: this model reads (n, {self.nvert}, 3)"
+            )
         if not torch.isfinite(displacement).all():
-            raise ValueError("displacement holds values that are not finite: the skin's step did not converge; keep the last good state")
+            raise ValueError(
+                "displacement holds values that are not finite: the skin's step did not converge; keep the "
+                "last good state"
+            )
         pod, local = self.pod(displacement), None
         if self.local:
             now = self.film(displacement)
@@ -69,6 +79,7 @@ class ForwardModel(nn.Module):
         return torch.stack([m(local, pod) for m in self.members]).mean(0), average
 
     def counts(self, displacement, tare):
-        """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or (n, 19)."""
+        """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
+        (n, 19)."""
         tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
         return counts_change(self.log_change(displacement)[0], tare) + tare

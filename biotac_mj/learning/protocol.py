@@ -1,4 +1,5 @@
-"""How models are judged: errors per interaction, coverage, paired tests, intervals. In raw counts; the paper's unit is counts / 2048."""
+"""How models are judged: errors per interaction, coverage, paired tests, intervals. In raw counts; the
+paper's unit is counts / 2048."""
 
 import numpy as np
 from scipy.stats import wilcoxon
@@ -20,11 +21,17 @@ def interaction_errors(predicted, truth, owner):
     """
     predicted, truth, owner = np.asarray(predicted, float), np.asarray(truth, float), np.asarray(owner)
     if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 19 or len(owner) != len(truth):
-        raise ValueError(f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: (n, 19), (n, 19) and (n,) are needed")
+        raise ValueError(
+            f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: (n, 19), (n, 19) and "
+            "(n,) are needed"
+        )
     if not len(truth):
         raise ValueError("there are no rows to judge: the test part of the split is empty")
     if not (np.isfinite(predicted).all() and np.isfinite(truth).all()):
-        raise ValueError("predicted or truth holds values that are not finite: look for NaN in the data set's measured_counts")
+        raise ValueError(
+            "predicted or truth holds values that are not finite: look for NaN in the data set's "
+            "measured_counts"
+        )
     rms = np.sqrt(((predicted - truth) ** 2).mean(1))
     which, index = np.unique(owner, return_inverse=True)
     return which, np.bincount(index, rms) / np.bincount(index)
@@ -37,7 +44,8 @@ def quartiles(values):
 
 
 def coverage_curve(predicted, truth, levels):
-    """(len(levels),) share of all (row, electrode) pairs whose absolute error is at most each level [counts]."""
+    """(len(levels),) share of all (row, electrode) pairs whose absolute error is at most each level
+    [counts]."""
     error = np.sort(np.abs(np.asarray(predicted, float) - truth).ravel())
     return np.searchsorted(error, levels, side="right") / len(error)
 
@@ -50,17 +58,26 @@ def paired_test(a, b) -> dict:
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     if a.shape != b.shape or a.ndim != 1 or len(a) < 5:
-        raise ValueError(f"paired test of {a.shape} and {b.shape} errors: the same interactions, at least five, are needed")
+        raise ValueError(
+            f"paired test of {a.shape} and {b.shape} errors: the same interactions, at least five, are needed"
+        )
     difference = a - b
     p = 1.0 if not difference.any() else float(wilcoxon(a, b).pvalue)
-    return {"n": len(a), "median_difference": float(np.median(difference)), "better": float((difference < 0).mean()), "p": p}
+    return {
+        "n": len(a),
+        "median_difference": float(np.median(difference)),
+        "better": float((difference < 0).mean()),
+        "p": p,
+    }
 
 
 def conformal_width(error, owner, alpha=0.1):
-    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with probability 1 - alpha on average.
+    """Half widths (19,) [counts] of intervals that cover a new interaction's rows with probability 1 - alpha
+    on average.
 
-    Rows of one interaction are alike, so interactions are what is exchangeable: the distribution functions of their absolute errors are
-    averaged, with one more interaction of infinite error (pooling of distribution functions, Dunn, Wasserman and Ramdas, 2022).
+    Rows of one interaction are alike, so interactions are what is exchangeable: the distribution functions of
+    their absolute errors are averaged, with one more interaction of infinite error (pooling of distribution
+    functions, Dunn, Wasserman and Ramdas, 2022).
 
     Args:
       error: (n, 19) predicted - truth on the validation interactions. owner: (n,).

@@ -1,4 +1,5 @@
-"""`biotac evaluate --electrodes`: reconstruction and force on a real recording, first 70 % of the time against the last 30 %."""
+"""`biotac evaluate --electrodes`: reconstruction and force on a real recording, first 70 % of the time
+against the last 30 %."""
 
 import json
 import pathlib
@@ -15,11 +16,18 @@ __all__ = ["evaluate_recording"]
 
 _BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # steps: at least, at most
 _KL = 1e-4
-_GAIN = 0.05  # of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
+# of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
+_GAIN = 0.05
 
 
 def evaluate_recording(
-    electrodes, force=None, out="out/evaluate/recording.json", fraction=0.7, seed=0, network=True, progress=True
+    electrodes,
+    force=None,
+    out="out/evaluate/recording.json",
+    fraction=0.7,
+    seed=0,
+    network=True,
+    progress=True,
 ) -> dict:
     """Evaluates one recording; writes `out` (JSON, described in docs/learning.md) and a plot beside it.
 
@@ -46,7 +54,10 @@ def evaluate_recording(
         if share > 0.001
     ]
     with tqdm(
-        total=(3 if network else 1) + (78 if recording.force is not None else 0), disable=not progress, desc="evaluate", leave=False
+        total=(3 if network else 1) + (78 if recording.force is not None else 0),
+        disable=not progress,
+        desc="evaluate",
+        leave=False,
     ) as bar:
         reconstruction, traces = _reconstruction(recording.counts, ntrain, seed, network, bar)
         result = {
@@ -97,12 +108,24 @@ def _reconstruction(counts, ntrain, seed, network, bar):
         for name, linear in (("electrode_vae", None), ("electrode_vae_linear_start", axes)):
             rows[name] = np.clip(_vae(counts, mean, ntrain, linear, seed), 0, FULL_SCALE)
             bar.update()
-    table = {name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])} for name, y in rows.items()}
-    # White noise of a channel shows in differences of neighbouring rows; slow rows of a moving press make this an upper bound.
+    table = {
+        name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])}
+        for name, y in rows.items()
+    }
+    # White noise of a channel shows in differences of neighbouring rows; slow rows of a moving press make
+    # this an upper bound.
     noise = np.diff(counts[ntrain:], axis=0)
     noise = 1.4826 * np.median(np.abs(noise - np.median(noise, axis=0)), axis=0) / np.sqrt(2)
-    best = min((name for name in table if name != "predict_mean"), key=lambda name: table[name]["test"]["rms"])
-    return {"unit": "counts", "code": 8, "models": table, "best": best, "noise_rms": float(np.sqrt((noise**2).mean()))}, rows[best]
+    best = min(
+        (name for name in table if name != "predict_mean"), key=lambda name: table[name]["test"]["rms"]
+    )
+    return {
+        "unit": "counts",
+        "code": 8,
+        "models": table,
+        "best": best,
+        "noise_rms": float(np.sqrt((noise**2).mean())),
+    }, rows[best]
 
 
 def _vae(counts, mean, ntrain, linear, seed):
@@ -146,8 +169,15 @@ def _force(recording, ntrain, seed, network, bar):
     table = {}
     for name, y in rows.items():
         error = y[ntrain:] - truth
-        table[name] = {"rmse": np.sqrt((error**2).mean(0)).tolist(), "r2": (1 - (error**2).mean(0) / spread).tolist()}
-    details = {"features": dict(zip("xyz", model.chosen)), "network_kept": model.network, "walk_forward": model.trials}
+        table[name] = {
+            "rmse": np.sqrt((error**2).mean(0)).tolist(),
+            "r2": (1 - (error**2).mean(0) / spread).tolist(),
+        }
+    details = {
+        "features": dict(zip("xyz", model.chosen)),
+        "network_kept": model.network,
+        "walk_forward": model.trials,
+    }
     return {
         "unit": "N",
         "components": ["Fx", "Fy", "Fz"],
@@ -176,13 +206,16 @@ def _plot(recording, ntrain, reconstructed, predicted, result, path):
         axis.plot(t, reconstructed[:, k], lw=0.6, color="C0", label=f"{best}, code of 8")
         axis.set_ylabel(f"E{k + 1} [counts]")
     axes[0].set_title(
-        f"last {len(t) - ntrain} rows unseen; reconstruction {result['reconstruction']['models'][best]['test']['rms']:.1f} counts RMS"
+        f"last {len(t) - ntrain} rows unseen; reconstruction "
+        f"{result['reconstruction']['models'][best]['test']['rms']:.1f} counts RMS"
     )
     if predicted is not None:
         error = result["force_regression"]["models"]["drift_aware"]["rmse"]
         for axis, k in zip(axes[2:], range(3)):
             axis.plot(t, recording.force[:, k], lw=0.8, color="0.6", label="measured")
-            axis.plot(t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, RMSE {error[k]:.3f} N unseen")
+            axis.plot(
+                t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, RMSE {error[k]:.3f} N unseen"
+            )
             axis.set_ylabel(f"F{'xyz'[k]} [N]")
     for axis in axes:
         axis.axvspan(ntrain, len(t), color="C2", alpha=0.08, lw=0)

@@ -36,23 +36,28 @@ def load_recording(electrodes, force=None) -> Recording:
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: wrong number of columns, text that is no number, NaN, counts that are not 12 bit, lengths that differ, or a log too short.
+      ValueError: wrong number of columns, text that is no number, NaN, counts that are not 12 bit, lengths
+        that differ, or a log too short.
     """
     counts = read_columns(electrodes, CHANNELS[:19])
     low, high = counts.min(0), counts.max(0)
     if (low < 0).any() or (high > FULL_SCALE).any():
         bad = [f"e{i + 1} ({low[i]:g}..{high[i]:g})" for i in np.flatnonzero((low < 0) | (high > FULL_SCALE))]
         raise ValueError(
-            f"{electrodes}: counts of {', '.join(bad)} are outside 0..4095: raw 12-bit counts are needed, not tared or scaled ones"
+            f"{electrodes}: counts of {', '.join(bad)} are outside 0..4095: raw 12-bit counts are needed, "
+            "not tared or scaled ones"
         )
     if not (low < high).any():
         raise ValueError(f"{electrodes}: no channel changes: this is not a recording of a touch")
     if len(counts) < _SHORTEST:
-        raise ValueError(f"{electrodes} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time")
+        raise ValueError(
+            f"{electrodes} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time"
+        )
     if force is not None:
         force = read_columns(force, ("Fx", "Fy", "Fz"))
         if len(force) != len(counts):
             raise ValueError(
-                f"{electrodes} has {len(counts)} rows and the force file {len(force)}: they must be samples of the same instants"
+                f"{electrodes} has {len(counts)} rows and the force file {len(force)}: they must be samples "
+                "of the same instants"
             )
     return Recording(counts, force, ((counts <= 0) | (counts >= FULL_SCALE)).mean(0))

@@ -1,4 +1,5 @@
-"""`biotac evaluate FOLDER`: what `biotac train` predicted, over all seeds, beside the paper's numbers; JSON, a table and figures."""
+"""`biotac evaluate FOLDER`: what `biotac train` predicted, over all seeds, beside the paper's numbers; JSON,
+a table and figures."""
 
 import json
 import pathlib
@@ -12,7 +13,10 @@ from .protocol import conformal_width, coverage_curve, interaction_errors, paire
 __all__ = ["PAPER", "evaluate_models", "table"]
 
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
-PAPER = {"trajectory": {"latent_projection": 0.010, "pointnet": 0.012}, "object": {"latent_projection": 0.015, "pointnet": 0.016}}
+PAPER = {
+    "trajectory": {"latent_projection": 0.010, "pointnet": 0.012},
+    "object": {"latent_projection": 0.015, "pointnet": 0.016},
+}
 UNIT = 2048.0
 # rows to compare with, nothing that is served; a window cannot be: see experiment.train_split
 _REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae", "local_window")
@@ -20,16 +24,20 @@ _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
 def evaluate_models(folder, out=None) -> dict:
-    """Reads a folder of `biotac train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures beside it.
+    """Reads a folder of `biotac train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures
+    beside it.
 
-    Errors of an interaction are averaged over the seeds whose test part has it; medians and tests are over interactions.
+    Errors of an interaction are averaged over the seeds whose test part has it; medians and tests are over
+    interactions.
 
     Raises:
       FileNotFoundError: no predictions in the folder.
       ValueError: seeds that were trained on different sets.
     """
     folder = pathlib.Path(folder)
-    reports = [json.loads(p.read_text()) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
+    reports = [
+        json.loads(p.read_text()) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()
+    ]
     if not reports:
         raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
@@ -43,7 +51,9 @@ def evaluate_models(folder, out=None) -> dict:
         result["splits"][split], drawn[split] = _split(folder, split, mine)
     ours = [n for n in next(iter(result["splits"].values()))["models"] if n not in _REFERENCES]
     unseen = [s for s in result["splits"] if s != "trajectory"] or list(result["splits"])
-    result["default"] = min(ours, key=lambda n: np.mean([result["splits"][s]["models"][n]["median"] for s in unseen]))
+    result["default"] = min(
+        ours, key=lambda n: np.mean([result["splits"][s]["models"][n]["median"] for s in unseen])
+    )
     for split, found in result["splits"].items():
         found["tests"] = _tests(drawn[split]["errors"], result["default"])
     out = pathlib.Path(out or folder / "evaluation.json")
@@ -61,29 +71,45 @@ def table(result) -> str:
         kind = "trajectory" if split == "trajectory" else "object"
         where = kind if kind == split else f"{kind}: {split}"
         seeds = " ".join(map(str, found["seeds"]))
-        lines.append(f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; RMS per interaction, counts")
-        lines.append(f"  {'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}{'+-':>8}{'paper':>8}")
+        lines.append(
+            f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; RMS "
+            "per interaction, counts"
+        )
+        lines.append(
+            "  "
+            f"{'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}{'+-':>8}{'paper':>8}"
+        )
         for name, row in sorted(found["models"].items(), key=lambda item: item[1]["median"]):
             low, high = row["quartiles"]
             least, most = min(row["seed_medians"]), max(row["seed_medians"])
             spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
             lines.append(
-                f"  {name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}{row['interval_coverage']:>9.2f}"
+                "  "
+                f"{name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}{row['interval_coverage']:>9.2f}"
                 f"{'-' if row['interval_half_width'] is None else round(row['interval_half_width'], 1):>8}{PAPER[kind].get(name, ''):>8}"
             )
         lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")
         for name, test in found["tests"].items():
             better, middle = 100 * test["better"], test["median_difference"]
-            lines.append(f"  {name}: better on {better:.0f} % of {test['n']}, median of differences {middle:+.2f}, p = {test['p']:.2g}")
+            lines.append(
+                f"  {name}: better on {better:.0f} % of {test['n']}, median of differences {middle:+.2f}, p "
+                f"= {test['p']:.2g}"
+            )
         for name, error in found["mesh_mm"].items():
             lines.append(
-                f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, {error['all']['moved']:.4f} mm where it moves more than 0.05"
+                f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, {error['all']['moved']:.4f} mm where "
+                "it moves more than 0.05"
             )
         lines += _objects(found["mesh_mm"])
         for name, error in found["inverse_mm"].items():
             centre = f", patch centre {error['centre_median']:.2f} mm" if "centre_median" in error else ""
-            lines.append(f"  inverse, {name}: {error['mean']:.4f} mm mean, {error['moved']:.4f} mm where it moves{centre}")
-    lines.append(f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}")
+            lines.append(
+                f"  inverse, {name}: {error['mean']:.4f} mm mean, {error['moved']:.4f} mm where it "
+                f"moves{centre}"
+            )
+    lines.append(
+        f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}"
+    )
     return "\n".join(lines)
 
 
@@ -95,7 +121,9 @@ def _objects(codes):
     lines = [f"  {'mean node error [mm]':<24}" + "".join(f"{code:>12}" for code in codes)]
     for name in names:
         values = (error["objects"].get(name, {}).get("mean") for error in codes.values())
-        lines.append(f"  {name:<24}" + "".join(f"{'' if v is None else format(v, '.4f'):>12}" for v in values))
+        lines.append(
+            f"  {name:<24}" + "".join(f"{'' if v is None else format(v, '.4f'):>12}" for v in values)
+        )
     return lines
 
 
@@ -142,13 +170,20 @@ def _split(folder, split, reports):
             "coverage_area": float(np.mean(np.mean(coverage[name], axis=0))),
         }  # fmt: skip
     found = {
-        "seeds": [r["seed"] for r in reports], "interactions": len(next(iter(errors.values()))["each"]), "models": models,
+        "seeds": [r["seed"] for r in reports],
+        "interactions": len(next(iter(errors.values()))["each"]),
+        "models": models,
         "noise_floor": float(np.median(np.concatenate(noise))),
-        "mesh_mm": _average([r["mesh"] for r in reports]), "inverse_mm": _average([r["inverse"] for r in reports]),
-        "ensemble_of": [r.get("ensemble_of") for r in reports], "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
+        "mesh_mm": _average([r["mesh"] for r in reports]),
+        "inverse_mm": _average([r["inverse"] for r in reports]),
+        "ensemble_of": [r.get("ensemble_of") for r in reports],
+        "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
         "device": reports[0]["device"],
-    }  # fmt: skip
-    drawn = {"errors": {n: e["each"] for n, e in errors.items()}, "coverage": {n: np.mean(c, axis=0) for n, c in coverage.items()}}
+    }
+    drawn = {
+        "errors": {n: e["each"] for n, e in errors.items()},
+        "coverage": {n: np.mean(c, axis=0) for n, c in coverage.items()},
+    }
     return found, drawn | {"example": example}
 
 
@@ -162,7 +197,9 @@ def _tests(errors, default):
         if a in errors and b in errors and a != b:
             keys = sorted(set(errors[a]) & set(errors[b]))
             if len(keys) >= 5:
-                out[f"{a} against {b}"] = paired_test([np.mean(errors[a][k]) for k in keys], [np.mean(errors[b][k]) for k in keys])
+                out[f"{a} against {b}"] = paired_test(
+                    [np.mean(errors[a][k]) for k in keys], [np.mean(errors[b][k]) for k in keys]
+                )
     return out
 
 
@@ -179,7 +216,10 @@ def _figures(result, drawn, out):
     from matplotlib.figure import Figure
 
     splits = list(result["splits"])
-    names = sorted(result["splits"][splits[0]]["models"], key=lambda n: result["splits"][splits[-1]]["models"][n]["median"])
+    names = sorted(
+        result["splits"][splits[0]]["models"],
+        key=lambda n: result["splits"][splits[-1]]["models"][n]["median"],
+    )
     figure = Figure(figsize=(6.2 * len(splits), 9.5), layout="constrained")
     top, bottom = figure.subplots(2, len(splits), squeeze=False)
     for axis, below, split in zip(top, bottom, splits):
@@ -187,16 +227,33 @@ def _figures(result, drawn, out):
         axis.boxplot(each, orientation="horizontal", tick_labels=names, showfliers=False, whis=(5, 95))
         axis.axvline(result["splits"][split]["noise_floor"], color="C2", lw=1, label="noise of the sensor")
         for name, value in PAPER["trajectory" if split == "trajectory" else "object"].items():
-            axis.axvline(value * UNIT, color="C3" if name == "pointnet" else "C0", ls=":", lw=1, label=f"paper's {name} (real data)")
-        axis.set_xlim(0, 1.05 * max(np.percentile(e, 90) for n, e in zip(names, each) if n not in ("tare", "physics")))
+            axis.axvline(
+                value * UNIT,
+                color="C3" if name == "pointnet" else "C0",
+                ls=":",
+                lw=1,
+                label=f"paper's {name} (real data)",
+            )
+        axis.set_xlim(
+            0, 1.05 * max(np.percentile(e, 90) for n, e in zip(names, each) if n not in ("tare", "physics"))
+        )
         axis.invert_yaxis()
         axis.set_xlabel("RMS error per interaction [counts]")
-        axis.set_title(f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor")
+        axis.set_title(
+            f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor"
+        )
         axis.legend(fontsize=7, loc="upper right")
         for k, name in enumerate(names):
             heavy = name in ("latent_projection", "pointnet", "tare", result["default"])
-            below.plot(_LEVELS, drawn[split]["coverage"][name], lw=1.8 if heavy else 0.7, label=name, alpha=1 if heavy else 0.7,
-                       color=matplotlib.colormaps["tab20"](k % 20), ls="--" if name == "tare" else "-")  # fmt: skip
+            below.plot(
+                _LEVELS,
+                drawn[split]["coverage"][name],
+                lw=1.8 if heavy else 0.7,
+                label=name,
+                alpha=1 if heavy else 0.7,
+                color=matplotlib.colormaps["tab20"](k % 20),
+                ls="--" if name == "tare" else "-",
+            )
         below.set_xlabel("absolute error at most [counts]")
         below.set_ylabel("share of all readings")
         below.legend(fontsize=7)
@@ -211,7 +268,11 @@ def _traces(result, drawn, splits, path):
 
     figure = Figure(figsize=(12, 3.4 * len(splits)), layout="constrained")
     axes = figure.subplots(len(splits), 2, squeeze=False)
-    shown = [n for n in (result["default"], "latent_projection", "pointnet") if f"predicted_{n}" in drawn[splits[0]]["example"]]
+    shown = [
+        n
+        for n in (result["default"], "latent_projection", "pointnet")
+        if f"predicted_{n}" in drawn[splits[0]]["example"]
+    ]
     for row, split in zip(axes, splits):
         data = drawn[split]["example"]
         size = {k: np.abs(data["truth"][data["owner"] == k]).max() for k in np.unique(data["owner"])}

@@ -1,4 +1,5 @@
-"""The network in the film's place: what a step of MuJoCo, of dm-control or of a batch asks for the electrodes."""
+"""The network in the film's place: what a step of MuJoCo, of dm-control or of a batch asks for the
+electrodes."""
 
 import functools
 
@@ -13,18 +14,30 @@ __all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkReadings"]
 
 
 class NetworkReadings:
-    """Counts of all channels: electrodes from a network, the rest as `sensor.readings.PhysicsReadings` has it. The state is the caller's.
+    """Counts of all channels: electrodes from a network, the rest as `sensor.readings.PhysicsReadings` has
+    it. The state is the caller's.
 
     Args:
       geometry: the skin that the weights were trained on.
       weights: file; None takes those of the package (trained on synthetic data).
-      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; `sensor` gives the rest counts that d ln Z is added to.
+      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; `sensor` gives the rest
+        counts that d ln Z is added to.
 
     Attributes:
-      nstate: length of the state: the acquisition's, the time of the last film, and what the network's window remembers.
+      nstate: length of the state: the acquisition's, the time of the last film, and what the network's window
+        remembers.
     """
 
-    def __init__(self, geometry, weights=None, seed=0, noise=True, sensor="1", film_every_step=False, temperature=REST_TEMPERATURE):
+    def __init__(
+        self,
+        geometry,
+        weights=None,
+        seed=0,
+        noise=True,
+        sensor="1",
+        film_every_step=False,
+        temperature=REST_TEMPERATURE,
+    ):
         if sensor not in REST_COUNTS:
             raise ValueError(f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
         self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
@@ -55,9 +68,15 @@ class NetworkReadings:
         if self.acquisition.needs_impedance(acquisition, time, dt):
             vert_xpos = np.asarray(vert_xpos, float)
             if vert_xpos.shape != self._geometry.vert.shape:
-                raise ValueError(f"vert_xpos has shape {vert_xpos.shape}: this network reads {self._geometry.vert.shape}")
+                raise ValueError(
+                    f"vert_xpos has shape {vert_xpos.shape}: this network reads {self._geometry.vert.shape}"
+                )
             u = torch.as_tensor(1e3 * (vert_xpos - self._geometry.vert), dtype=torch.float32)[None]
-            before = torch.as_tensor(memory.reshape(1, *self._memory), dtype=torch.float32) if memory.size else None
+            before = (
+                torch.as_tensor(memory.reshape(1, *self._memory), dtype=torch.float32)
+                if memory.size
+                else None
+            )
             change, after = self.model.log_change(u, before, time + dt - last[0])
             impedance = self._rest * np.exp(change[0].double().numpy())
         self.acquisition.advance(acquisition, time, dt, impedance, pressure, self.temperature)
@@ -72,10 +91,13 @@ class NetworkReadings:
 
 
 class LearnedReadings:
-    """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to it."""
+    """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to
+    it."""
 
     def __init__(self, config, geometry):
-        self._network = NetworkReadings(geometry, seed=config.seed, **dict(config.options.get("readings", {})))
+        self._network = NetworkReadings(
+            geometry, seed=config.seed, **dict(config.options.get("readings", {}))
+        )
         self.nstate = self._network.nstate
 
     @functools.cached_property
@@ -95,10 +117,12 @@ class LearnedReadings:
 class LearnedBatchFilm:
     """Stands where `sensor.batch_film.BatchFilm` stands: impedances of `nworld` skins, on their device.
 
-    All worlds are computed whenever one may be due, in single precision. Do not capture it in a CUDA graph: torch launches are not Warp's.
+    All worlds are computed whenever one may be due, in single precision. Do not capture it in a CUDA graph:
+    torch launches are not Warp's.
 
     Args:
-      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: between two solves, for the window [s].
+      geometry, weights, sensor: as for `NetworkReadings`. nworld: worlds. device: Warp device. dt: between
+        two solves, for the window [s].
 
     Attributes:
       impedance: (nworld, 19) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (19,); nbytes.
@@ -116,27 +140,41 @@ class LearnedBatchFilm:
             self.valid = wp.ones(nworld, dtype=int)
         self._rest = torch.as_tensor(self.rest, device=torch_device)
         self._vert = torch.as_tensor(geometry.vert, device=torch_device)
-        self._average = torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
+        self._average = (
+            torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
+        )
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
 
     @torch.no_grad()
     def solve(self, x, due):
-        """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,) wp.array of int."""
+        """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,)
+        wp.array of int."""
         import contextlib
 
         import warp as wp
 
         cuda = self.device.is_cuda
         # on Warp's stream: what it has launched before must be done, and what it launches next must wait
-        with torch.cuda.stream(wp.stream_to_torch(wp.get_stream(self.device))) if cuda else contextlib.nullcontext():
+        with (
+            torch.cuda.stream(wp.stream_to_torch(wp.get_stream(self.device)))
+            if cuda
+            else contextlib.nullcontext()
+        ):
             wanted = wp.to_torch(due) != 0
             if bool(wanted.any()):
-                self._solve(wp.to_torch(x).view(*x.shape, 3), wanted, wp.to_torch(self.impedance), wp.to_torch(self.valid))
+                self._solve(
+                    wp.to_torch(x).view(*x.shape, 3),
+                    wanted,
+                    wp.to_torch(self.impedance),
+                    wp.to_torch(self.valid),
+                )
 
     def _solve(self, x, wanted, impedance, valid):
         u = (1e3 * (x.transpose(0, 1) - self._vert)).float()
         finite = torch.isfinite(u).all(dim=2).all(dim=1)
-        change, average = self.model.log_change(torch.where(finite[:, None, None], u, 0), self._average, self._dt)
+        change, average = self.model.log_change(
+            torch.where(finite[:, None, None], u, 0), self._average, self._dt
+        )
         now = wanted & finite
         if self._average is not None:
             self._average = torch.where(now[:, None, None, None], average, self._average)

@@ -29,7 +29,10 @@ def ship(folder, result, target) -> list[pathlib.Path]:
             raise FileNotFoundError(f"no {path}: train seed 0 of the split trajectory")
     size = sum(path.stat().st_size for path in sources.values())
     if size > _MOST:
-        raise ValueError(f"the weights are {size / 2**20:.1f} MB: 16 MB at most are shipped; take fewer members or components")
+        raise ValueError(
+            f"the weights are {size / 2**20:.1f} MB: 16 MB at most are shipped; take fewer members or "
+            "components"
+        )
     target.mkdir(parents=True, exist_ok=True)
     written = []
     for name, source in sources.items():
@@ -45,27 +48,47 @@ def _card(name, meta, size, result):
     lines = [
         f"# Weights `{name}.safetensors`",
         "",
-        "Trained on **synthetic** data: touches of the simulated skin, counts of a synthetic sensor with another mesh, material and",
+        "Trained on **synthetic** data: touches of the simulated skin, counts of a synthetic sensor with "
+        "another mesh, material and",
         "conduction (`docs/data.md`). No real sensor was involved; expect more error on one.",
         "",
         "| | |",
         "|---|---|",
-        f"| direction | {'deformed skin -> electrodes' if name == 'forward' else 'electrodes -> deformed skin and contact force'} |",
+        "| direction | "
+        f"{'deformed skin -> electrodes' if name == 'forward' else 'electrodes -> deformed skin and contact force'} |",
         f"| skin | `{meta['skin']}`, {meta['nvert']} nodes, fingerprint {meta['mesh']} |",
         f"| channels | {meta['channels'][0]}..{meta['channels'][-1]} |",
         f"| size | {size / 2**20:.2f} MB |",
-        f"| set | {result['interactions']} interactions, {result['labelled']} labelled; seed 0, 72 % of them |",
+        f"| set | {result['interactions']} interactions, {result['labelled']} labelled; seed 0, 72 % of "
+        "them |",
     ]
     if name == "forward":
-        lines.append(f"| model | {meta['model']}, mean of {meta['members']} networks; {json.dumps(meta['kind'], sort_keys=True)} |")
+        lines.append(
+            f"| model | {meta['model']}, mean of {meta['members']} networks; "
+            f"{json.dumps(meta['kind'], sort_keys=True)} |"
+        )
     lines += ["", "Errors on interactions that training did not see (synthetic sensor):", ""]
     for split, found in result["splits"].items():
         if name == "forward":
-            rows = {k: found["models"][k] for k in ("ensemble", "latent_projection", "pointnet", "linear", "tare") if k in found["models"]}
-            text = ", ".join(f"{k} {row['median']:.1f} ({row['median'] / UNIT:.4f})" for k, row in rows.items())
-            lines.append(f"- unseen {split}: median RMS per interaction in counts (/ 2048): {text}; noise {found['noise_floor']:.1f}")
+            rows = {
+                k: found["models"][k]
+                for k in ("ensemble", "latent_projection", "pointnet", "linear", "tare")
+                if k in found["models"]
+            }
+            text = ", ".join(
+                f"{k} {row['median']:.1f} ({row['median'] / UNIT:.4f})" for k, row in rows.items()
+            )
+            lines.append(
+                f"- unseen {split}: median RMS per interaction in counts (/ 2048): {text}; noise "
+                f"{found['noise_floor']:.1f}"
+            )
         else:
             row = found["inverse_mm"][meta.get("model", "pod_inverse")]
-            centre = f", patch centre {row['centre_median']:.2f} mm (median)" if "centre_median" in row else ""
-            lines.append(f"- unseen {split}: nodes {row['mean']:.4f} mm, where the skin moves {row['moved']:.4f} mm{centre}")
+            centre = (
+                f", patch centre {row['centre_median']:.2f} mm (median)" if "centre_median" in row else ""
+            )
+            lines.append(
+                f"- unseen {split}: nodes {row['mean']:.4f} mm, where the skin moves {row['moved']:.4f} "
+                f"mm{centre}"
+            )
     return "\n".join(lines) + "\n"

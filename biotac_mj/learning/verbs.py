@@ -1,4 +1,5 @@
-"""The verbs `biotac train`, `biotac evaluate` and `biotac contact-patch`: their arguments here, their work beside it."""
+"""The verbs `biotac train`, `biotac evaluate` and `biotac contact-patch`: their arguments here, their work
+beside it."""
 
 import argparse
 
@@ -13,15 +14,32 @@ def add_verbs(verbs, verb):
 
 
 def _add_train(verbs, verb):
-    v = verb(verbs, "train", _train, "Train and test all models on a data set; goes on where it was interrupted.")
-    v.add_argument("set", metavar="SET", help="data set with labelled interactions, made by `biotac generate`")
-    v.add_argument("--out", default="out/train", metavar="DIR", help="folder of predictions, errors and weights")
-    v.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of divisions, weights and batches")
-    v.add_argument("--splits", nargs="+", default=["trajectory", "ring_7mm"], metavar="NAME",
-                   help="trajectory (72/18/10 %% of interactions), or the object that training never sees, several with +")  # fmt: skip
+    v = verb(
+        verbs, "train", _train, "Train and test all models on a data set; goes on where it was interrupted."
+    )
+    v.add_argument(
+        "set", metavar="SET", help="data set with labelled interactions, made by `biotac generate`"
+    )
+    v.add_argument(
+        "--out", default="out/train", metavar="DIR", help="folder of predictions, errors and weights"
+    )
+    v.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of divisions, weights and batches"
+    )
+    v.add_argument(
+        "--splits",
+        nargs="+",
+        default=["trajectory", "ring_7mm"],
+        metavar="NAME",
+        help="trajectory (72/18/10 %% of interactions), or the object that training never sees, "
+        "several with +",
+    )
     v.add_argument("--only", nargs="+", metavar="NAME", help="of our models (default: all)")
     v.add_argument(
-        "--paper", action=argparse.BooleanOptionalAction, default=True, help="latent projection and PointNet++; slow without a GPU"
+        "--paper",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="latent projection and PointNet++; slow without a GPU",
     )
     v.add_argument("--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/learning.md)")
     v.add_argument("--steps", type=int, help="of each training (default: the config's)")
@@ -41,11 +59,23 @@ def _train(args):
     settings = json.loads(pathlib.Path(args.config).read_text()) if args.config else {}
     unknown = set(settings) - {f.name for f in dataclasses.fields(LearningConfig)}
     if unknown:
-        raise ValueError(f"{args.config} sets {', '.join(sorted(unknown))}: LearningConfig has no such settings")
+        raise ValueError(
+            f"{args.config} sets {', '.join(sorted(unknown))}: LearningConfig has no such settings"
+        )
     if args.steps:
         settings |= {"steps": args.steps, "paper_steps": 4 * args.steps, "mesh_steps": 4 * args.steps}
-    train_all(args.set, args.out, args.seeds, args.splits, LearningConfig(**settings), args.device, args.paper, args.only, args.limit,
-              progress=not args.quiet)  # fmt: skip
+    train_all(
+        args.set,
+        args.out,
+        args.seeds,
+        args.splits,
+        LearningConfig(**settings),
+        args.device,
+        args.paper,
+        args.only,
+        args.limit,
+        progress=not args.quiet,
+    )
     print(f"written: {args.out}; judge it with `biotac evaluate {args.out}`")
 
 
@@ -54,19 +84,34 @@ def _add_evaluate(verbs, verb):
         verbs,
         "evaluate",
         _evaluate,
-        "Judge learned models: trained ones on a data set, or electrode code and force regression on a recording of a real sensor.",
+        "Judge learned models: trained ones on a data set, or electrode code and force regression on a "
+        "recording of a real sensor.",
     )
     v.add_argument("folder", nargs="?", metavar="DIR", help="what `biotac train` wrote")
-    v.add_argument("--electrodes", metavar="FILE", help="a recording: text, 19 columns of raw counts e1..e19; reconstruction is judged")
-    v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N]; force from electrodes is judged too")
     v.add_argument(
-        "--new-sensor", metavar="SET", help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights"
+        "--electrodes",
+        metavar="FILE",
+        help="a recording: text, 19 columns of raw counts e1..e19; reconstruction is judged",
     )
-    v.add_argument("--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)")
+    v.add_argument(
+        "--force",
+        metavar="FILE",
+        help="beside it: text, 3 columns of force [N]; force from electrodes is judged too",
+    )
+    v.add_argument(
+        "--new-sensor",
+        metavar="SET",
+        help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights",
+    )
+    v.add_argument(
+        "--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)"
+    )
     v.add_argument("--ship", metavar="FOLDER", help="copy the trained weights there, each with a card")
     v.add_argument("--fraction", type=float, default=0.7, help="of the recording's rows, in time, that train")
     v.add_argument("--seed", type=int, default=0, help="of the recording's networks")
-    v.add_argument("--json", metavar="FILE", help="where the numbers go, a plot beside them (default: out/evaluate/...)")
+    v.add_argument(
+        "--json", metavar="FILE", help="where the numbers go, a plot beside them (default: out/evaluate/...)"
+    )
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -77,7 +122,9 @@ def _evaluate(args):
         from .few_shot import evaluate_new_sensor
         from .weights import shipped
 
-        one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json or "out/evaluate/new_sensor.json")
+        one = evaluate_new_sensor(
+            args.new_sensor, args.weights or shipped("forward"), args.json or "out/evaluate/new_sensor.json"
+        )
         same = one["as_it_is_on_the_same_touches"]
         for name, value in one["median_rms_counts_after_touches"].items():
             text = "predict the tare" if name == "tare" else f"{name} touches"
@@ -86,7 +133,10 @@ def _evaluate(args):
     elif args.folder:
         _evaluate_models(args)
     else:
-        raise ValueError("nothing to evaluate: give a folder that `biotac train` wrote, or --electrodes FILE (and --force FILE)")
+        raise ValueError(
+            "nothing to evaluate: give a folder that `biotac train` wrote, or --electrodes FILE (and "
+            "--force FILE)"
+        )
 
 
 def _evaluate_models(args):
@@ -101,15 +151,28 @@ def _evaluate_models(args):
 
 
 def _add_contact_patch(verbs, verb):
-    v = verb(verbs, "contact-patch", _contact_patch, "Estimate how the skin is deformed and where it is touched, from electrode counts.")
-    v.add_argument("source", metavar="FILE", help="text of 19 columns of raw counts e1..e19, or readings.csv of `biotac press`")
+    v = verb(
+        verbs,
+        "contact-patch",
+        _contact_patch,
+        "Estimate how the skin is deformed and where it is touched, from electrode counts.",
+    )
+    v.add_argument(
+        "source",
+        metavar="FILE",
+        help="text of 19 columns of raw counts e1..e19, or readings.csv of `biotac press`",
+    )
     v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
     v.add_argument("--row", type=int, default=-1, help="which row to draw")
     v.add_argument("--skin", default="default", help="mesh that the weights were trained on")
     v.add_argument(
-        "--weights", metavar="FILE", help="inverse weights (default: those that come with the package, trained on synthetic data)"
+        "--weights",
+        metavar="FILE",
+        help="inverse weights (default: those that come with the package, trained on synthetic data)",
     )
-    v.add_argument("--out", default="out/contact", metavar="DIR", help="folder of contact.png and contact.json")
+    v.add_argument(
+        "--out", default="out/contact", metavar="DIR", help="folder of contact.png and contact.json"
+    )
 
 
 def _contact_patch(args):
@@ -117,7 +180,10 @@ def _contact_patch(args):
 
     one = contact_patch(args.source, args.out, args.tare, args.row, args.skin, args.weights)
     x, y, z = one["centre_mm"]
-    print(f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, force about {one['force']:.2f} N")
+    print(
+        f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, force about "
+        f"{one['force']:.2f} N"
+    )
     print(f"deepest {one['deepest_mm']:.2f} mm; written: {args.out}/contact.png, contact.json (all rows)")
 
 
@@ -125,13 +191,24 @@ def _evaluate_recording(args):
     from .real import evaluate_recording
 
     result = evaluate_recording(
-        args.electrodes, args.force, args.json or "out/evaluate/recording.json", args.fraction, args.seed, progress=not args.quiet
+        args.electrodes,
+        args.force,
+        args.json or "out/evaluate/recording.json",
+        args.fraction,
+        args.seed,
+        progress=not args.quiet,
     )
     table = result["reconstruction"]
-    print(f"reconstruction through a code of 8, counts ({result['train_rows']} rows train, {result['rows'] - result['train_rows']} unseen)")
+    print(
+        f"reconstruction through a code of 8, counts ({result['train_rows']} rows train, "
+        f"{result['rows'] - result['train_rows']} unseen)"
+    )
     print(f"  {'':<28}{'train RMS':>10}{'test RMS':>10}{'median row':>12}")
     for name, row in table["models"].items():
-        print(f"  {name:<28}{row['train']['rms']:>10.2f}{row['test']['rms']:>10.2f}{row['test']['median_row']:>12.2f}")
+        print(
+            "  "
+            f"{name:<28}{row['train']['rms']:>10.2f}{row['test']['rms']:>10.2f}{row['test']['median_row']:>12.2f}"
+        )
     print(f"  noise of the sensor, at most {table['noise_rms']:.2f}")
     if "force_regression" in result:
         print("force from electrodes, RMSE on the unseen rows, N")

@@ -10,7 +10,16 @@ import torch
 from ..press_record import replacing
 from ..sensor.channels import CHANNELS
 
-__all__ = ["describe", "load_forward", "load_inverse", "mesh_key", "save_forward", "save_inverse", "shipped", "window_of"]
+__all__ = [
+    "describe",
+    "load_forward",
+    "load_inverse",
+    "mesh_key",
+    "save_forward",
+    "save_inverse",
+    "shipped",
+    "window_of",
+]
 
 _FORMAT = "biotac_mj.learning.weights/1"
 
@@ -28,27 +37,41 @@ def shipped(name="forward") -> pathlib.Path:
     """
     import importlib.resources
 
-    path = pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))) / "weights" / f"{name}.safetensors"
+    path = (
+        pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))) / "weights" / f"{name}.safetensors"
+    )
     if not path.is_file():
         raise FileNotFoundError(f"no weights {path}: train some with `biotac train` and pass their file")
     return path
 
 
 def save_forward(path, members, pod, config, kind, geometry, about):
-    """Writes an ensemble of `local.train_head`'s results (half precision; buffers that follow from the mesh are not in it)."""
+    """Writes an ensemble of `local.train_head`'s results (half precision; buffers that follow from the mesh
+    are not in it)."""
     tensors = {"pod.basis": pod.basis, "pod.scale": pod.scale}
     for k, member in enumerate(members):
         tensors |= {f"member{k}.{name}": value for name, value in member.head.state_dict().items()}
     if kind["kind"] == "local":  # the residual sees the first components only
         tensors["pod.basis"], tensors["pod.scale"] = pod.basis[:, :32], pod.scale[:32]
-    meta = about | {"direction": "forward", "kind": kind, "members": len(members), "window": config.window if kind["window"] else (),
-                    "width": config.width, "scale": config.scale}  # fmt: skip
+    meta = about | {
+        "direction": "forward",
+        "kind": kind,
+        "members": len(members),
+        "window": config.window if kind["window"] else (),
+        "width": config.width,
+        "scale": config.scale,
+    }
     _save(path, tensors, geometry, meta)
 
 
 def save_inverse(path, head, geometry, about):
     """Writes an `inverse.InverseHead`."""
-    _save(path, dict(head.state_dict()), geometry, about | {"direction": "inverse", "nouter": head.force_basis.shape[0]})
+    _save(
+        path,
+        dict(head.state_dict()),
+        geometry,
+        about | {"direction": "inverse", "nouter": head.force_basis.shape[0]},
+    )
 
 
 def _save(path, tensors, geometry, meta):
@@ -56,7 +79,12 @@ def _save(path, tensors, geometry, meta):
 
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
     tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()}
-    meta = meta | {"format": _FORMAT, "mesh": mesh_key(geometry), "skin": geometry.name, "channels": list(CHANNELS[:19])}
+    meta = meta | {
+        "format": _FORMAT,
+        "mesh": mesh_key(geometry),
+        "skin": geometry.name,
+        "channels": list(CHANNELS[:19]),
+    }
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
@@ -74,24 +102,36 @@ def _read(path, names=None):
 
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"no weights {path}: give a file that `biotac train` wrote, forward-SPLIT or inverse-SPLIT.safetensors")
+        raise FileNotFoundError(
+            f"no weights {path}: give a file that `biotac train` wrote, forward-SPLIT or "
+            "inverse-SPLIT.safetensors"
+        )
     try:
         with safe_open(str(path), framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
             return meta, {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}
     except Exception as error:
-        raise ValueError(f"{path} is not a readable safetensors file ({error}): train again, or copy it again") from error
+        raise ValueError(
+            f"{path} is not a readable safetensors file ({error}): train again, or copy it again"
+        ) from error
 
 
 def _load(path, geometry, direction):
     meta, tensors = _read(path)
     if meta.get("format") != _FORMAT or meta.get("direction") != direction:
-        raise ValueError(f"{path} holds no {direction} model of {_FORMAT}: it says {meta.get('format')}, {meta.get('direction')}")
+        raise ValueError(
+            f"{path} holds no {direction} model of {_FORMAT}: it says {meta.get('format')}, "
+            f"{meta.get('direction')}"
+        )
     if meta["channels"] != list(CHANNELS[:19]):
-        raise ValueError(f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(CHANNELS[:19])} is needed")
+        raise ValueError(
+            f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(CHANNELS[:19])} is "
+            "needed"
+        )
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(
-            f"{path} was trained on skin {meta['skin']!r} with {meta['nvert']} nodes and cannot read skin {geometry.name!r} with "
+            f"{path} was trained on skin {meta['skin']!r} with {meta['nvert']} nodes and cannot read skin "
+            f"{geometry.name!r} with "
             f"{geometry.nvert}: take that skin, or train on this one"
         )
     return meta, tensors
@@ -108,12 +148,17 @@ def load_forward(path, geometry):
 
     meta, tensors = _load(path, geometry, "forward")
     model = ForwardModel(geometry, meta, tensors["pod.scale"].numel())
-    _fill(model, {k.replace("member", "members.", 1) if k.startswith("member") else k: v for k, v in tensors.items()}, path)
+    _fill(
+        model,
+        {k.replace("member", "members.", 1) if k.startswith("member") else k: v for k, v in tensors.items()},
+        path,
+    )
     return model.eval()
 
 
 def window_of(path) -> tuple:
-    """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has none."""
+    """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has
+    none."""
     from .features import FilmFeatures
 
     meta = describe(path)
@@ -126,7 +171,9 @@ def load_inverse(path, geometry):
     from .inverse import InverseHead
 
     meta, tensors = _load(path, geometry, "inverse")
-    head = InverseHead(Pod(geometry.nvert, tensors["pod.scale"].numel()), tensors["force_scale"].numel(), meta["nouter"])
+    head = InverseHead(
+        Pod(geometry.nvert, tensors["pod.scale"].numel()), tensors["force_scale"].numel(), meta["nouter"]
+    )
     _fill(head, tensors, path)
     return head.eval()
 
@@ -135,4 +182,6 @@ def _fill(module, tensors, path):
     try:
         module.load_state_dict({k: v.to(torch.float32) for k, v in tensors.items()})
     except RuntimeError as error:
-        raise ValueError(f"{path} does not fit its own description ({str(error).splitlines()[-1].strip()}): it is damaged") from error
+        raise ValueError(
+            f"{path} does not fit its own description ({str(error).splitlines()[-1].strip()}): it is damaged"
+        ) from error

@@ -1,8 +1,8 @@
-"""`Acquisition` for many worlds on one device: slots, filters, noise and converter of `acquisition.py` in one Warp kernel.
+"""`Acquisition` for many worlds on one device: slots, filters, noise and converter of `acquisition.py` in one
+Warp kernel.
 
-Each world has the same 69 numbers of state, its own clock and its own seed. Noise is numpy's Philox 4x64 with one counter block per slot,
-so it is that of the single sensor with the same seed.
-"""
+Each world has the same 69 numbers of state, its own clock and its own seed. Noise is numpy's Philox 4x64 with
+one counter block per slot, so it is that of the single sensor with the same seed."""
 
 import numpy as np
 import warp as wp
@@ -25,8 +25,16 @@ def _constant(value):
 _RATE, _FULL = _constant(acquisition.SLOT_RATE), _constant(channels.FULL_SCALE)
 _LOW, _HIGH, _TAC = (_constant(w) for w in acquisition._CORNER)
 _BAND = _constant(acquisition._BAND)
-_DIVIDER, _MIDDLE, _OTHER_NOISE = _constant(channels._DIVIDER), _constant(channels._MIDDLE), _constant(channels.OTHER_NOISE)
-_PDC_REST, _PDC_GAIN, _PAC_GAIN = _constant(channels._PDC_REST), _constant(channels._PDC_GAIN), _constant(channels._PAC_GAIN)
+_DIVIDER, _MIDDLE, _OTHER_NOISE = (
+    _constant(channels._DIVIDER),
+    _constant(channels._MIDDLE),
+    _constant(channels.OTHER_NOISE),
+)
+_PDC_REST, _PDC_GAIN, _PAC_GAIN = (
+    _constant(channels._PDC_REST),
+    _constant(channels._PDC_GAIN),
+    _constant(channels._PAC_GAIN),
+)
 _NOISE_SLOPE, _NOISE_LEVEL = _constant(channels._NOISE_SLOPE), _constant(channels._NOISE_LEVEL)
 _STEADY = _constant(channels._heating(channels._MIDDLE))  # what the manual's formula gives where TAC rests
 _FRAME = wp.constant(wp.int64(acquisition.SLOTS_PER_FRAME))
@@ -81,7 +89,8 @@ def _high_product(a: wp.uint64, b: wp.uint64):
 
 @wp.func
 def philox(counter: wp.uint64, key: wp.uint64):
-    """Block `counter` of Philox 4x64-10 (Salmon et al., SC 2011) with this key; the upper words of counter and key are zero."""
+    """Block `counter` of Philox 4x64-10 (Salmon et al., SC 2011) with this key; the upper words of counter
+    and key are zero."""
     c0 = counter
     c1 = wp.uint64(0)
     c2 = wp.uint64(0)
@@ -166,7 +175,10 @@ def sample_slots(
         position = int(slot % _FRAME)
         channel = position / 2
         address = _PAC + channel
-        value = _MIDDLE + _BAND * (_ramp(old, rise, low, _LOW, since) - _ramp(old, rise, high, _HIGH, since)) / _PAC_GAIN
+        value = (
+            _MIDDLE
+            + _BAND * (_ramp(old, rise, low, _LOW, since) - _ramp(old, rise, high, _HIGH, since)) / _PAC_GAIN
+        )
         deviation = _OTHER_NOISE
         if position % 2 == 1:
             address = _HELD + channel
@@ -179,7 +191,9 @@ def sample_slots(
             elif channel == 19:
                 value = _PDC_REST + _ramp(old, rise, low, _LOW, since) / _PDC_GAIN
             elif channel == 20:
-                value = _thermistor(real(-41.07) / wp.min(_ramp(heating, real(0.0), tac, _TAC, since) + _STEADY, real(-0.1)))
+                value = _thermistor(
+                    real(-41.07) / wp.min(_ramp(heating, real(0.0), tac, _TAC, since) + _STEADY, real(-0.1))
+                )
             else:
                 value = _thermistor(real(4025.0) / (warm + heating * since + real(273.15)))
         if noise == 1:
@@ -198,7 +212,12 @@ def sample_slots(
 
 
 @wp.kernel
-def reset_states(mask: wp.array(dtype=bool), rest: wp.array(dtype=real), time_out: wp.array(dtype=real), state_out: wp.array2d(dtype=real)):
+def reset_states(
+    mask: wp.array(dtype=bool),
+    rest: wp.array(dtype=real),
+    time_out: wp.array(dtype=real),
+    state_out: wp.array2d(dtype=real),
+):
     w, i = wp.tid()
     if mask[w]:
         state_out[w, i] = rest[i]
@@ -229,14 +248,24 @@ class BatchAcquisition:
     """
 
     def __init__(
-        self, rest, nworld, seed=0, noise=True, film_every_step=False, temperature=channels.REST_TEMPERATURE, device="cpu"
-    ):  # fmt: skip
+        self,
+        rest,
+        nworld,
+        seed=0,
+        noise=True,
+        film_every_step=False,
+        temperature=channels.REST_TEMPERATURE,
+        device="cpu",
+    ):
         single = Acquisition(noise=noise, film_every_step=film_every_step)
         state = np.zeros(single.nstate)
         single.reset(state, rest, temperature=temperature)
         seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
         if len(seeds) != nworld:
-            raise ValueError(f"{len(seeds)} seeds for {nworld} worlds: pass one for each, or a single one from which they count on")
+            raise ValueError(
+                f"{len(seeds)} seeds for {nworld} worlds: pass one for each, or a single one from which "
+                "they count on"
+            )
         for s in (min(seeds), max(seeds)):
             Acquisition(seed=s)  # refuses what is out of range
         self.nworld, self.device = nworld, wp.get_device(device)
@@ -251,7 +280,9 @@ class BatchAcquisition:
 
     def reset(self, mask):
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
-        wp.launch(reset_states, self.state.shape, [mask, self._rest], [self.time, self.state], device=self.device)
+        wp.launch(
+            reset_states, self.state.shape, [mask, self._rest], [self.time, self.state], device=self.device
+        )
 
     def find_due(self, dt):
         """Writes which worlds want a new impedance for the step of dt [s] from now; returns `due`."""
@@ -263,9 +294,21 @@ class BatchAcquisition:
 
         Args:
           dt: length of the step [s].
-          impedance: (nworld, 19) wp.array float64 at the end of the step [ohm], looked at in the worlds that are `due` and `valid`.
+          impedance: (nworld, 19) wp.array float64 at the end of the step [ohm], looked at in the worlds that
+            are `due` and `valid`.
           valid: (nworld,) wp.array int.
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
         """
-        inputs = [dt, self._noise, self.seed, self.due, valid, impedance, pressure, self.temperature, self.time, self.state]
+        inputs = [
+            dt,
+            self._noise,
+            self.seed,
+            self.due,
+            valid,
+            impedance,
+            pressure,
+            self.temperature,
+            self.time,
+            self.state,
+        ]
         wp.launch(sample_slots, self.nworld, inputs, device=self.device)

@@ -1,6 +1,7 @@
 """Channels and the data sheet's formulas between counts and physical units.
 
-Source of the formulas and gains: SynTouch BioTac SP product manual (same electronics as the BioTac). Counts are 12 bit, 0..4095, and may
+Source of the formulas and gains: SynTouch BioTac SP product manual (same electronics as the BioTac). Counts
+  are 12 bit, 0..4095, and may
 be fractional here: rounding and clipping are the acquisition's job.
 """
 
@@ -33,22 +34,92 @@ REST_TEMPERATURE = 31.0  # [C] of the heated core
 
 _DIVIDER = 10e3  # [ohm]
 _PDC_GAIN = 36.5  # [Pa] per count
-_PDC_REST = 2000.0  # CHOSEN: the manual gives no offset. Leaves 76 kPa above rest; the offset of a real sensor depends on its filling
+# CHOSEN: the manual gives no offset. Leaves 76 kPa above rest; the offset of a real sensor depends on its
+# filling
+_PDC_REST = 2000.0
 _PAC_GAIN = 0.37  # [Pa] per count
 _MIDDLE = FULL_SCALE / 2
 OTHER_NOISE = 1.0  # [counts] of pdc, pac, tdc, tac: CHOSEN, none was measured
 _NOISE_SLOPE, _NOISE_LEVEL = 15.8, 6.6  # [counts]
 
-# Published rest counts of three sensors, e1..e19. They are data, not parameters: nothing is derived from them but the cell constants.
+# Published rest counts of three sensors, e1..e19. They are data, not parameters: nothing is derived from them
+# but the cell constants.
 REST_COUNTS = {
-    "1": np.array([2075, 3105, 3146, 2865, 3136, 2830, 2451, 2601, 2634, 2773, 2334, 3131, 3177, 2916, 3158, 2832, 3019, 3182, 3224.0]),
-    "2": np.array([2668, 3224, 3239, 3003, 3165, 2849, 2798, 2873, 2912, 3017, 2605, 3202, 3221, 3025, 3164, 2874, 3158, 3203, 3026.0]),
-    "3": np.array([2990, 3442, 3404, 3199, 3333, 3049, 3146, 3234, 3238, 3299, 3021, 3461, 3426, 3217, 3334, 3014, 3399, 3357, 3092.0]),
+    "1": np.array(
+        [
+            2075,
+            3105,
+            3146,
+            2865,
+            3136,
+            2830,
+            2451,
+            2601,
+            2634,
+            2773,
+            2334,
+            3131,
+            3177,
+            2916,
+            3158,
+            2832,
+            3019,
+            3182,
+            3224.0,
+        ]
+    ),
+    "2": np.array(
+        [
+            2668,
+            3224,
+            3239,
+            3003,
+            3165,
+            2849,
+            2798,
+            2873,
+            2912,
+            3017,
+            2605,
+            3202,
+            3221,
+            3025,
+            3164,
+            2874,
+            3158,
+            3203,
+            3026.0,
+        ]
+    ),
+    "3": np.array(
+        [
+            2990,
+            3442,
+            3404,
+            3199,
+            3333,
+            3049,
+            3146,
+            3234,
+            3238,
+            3299,
+            3021,
+            3461,
+            3426,
+            3217,
+            3334,
+            3014,
+            3399,
+            3357,
+            3092.0,
+        ]
+    ),
 }
 
 
 def counts_from_impedance(impedance):
-    """Electrode counts E = 4095 / (Z / 10 kohm + 1). impedance [ohm], any shape; more liquid, lower Z, higher E."""
+    """Electrode counts E = 4095 / (Z / 10 kohm + 1). impedance [ohm], any shape; more liquid, lower Z, higher
+    E."""
     return FULL_SCALE / (np.asarray(impedance, dtype=float) / _DIVIDER + 1)
 
 
@@ -59,12 +130,14 @@ def impedance_from_counts(counts):
 
 
 def log_impedance(counts):
-    """ln(Z / 10 kohm) = ln(4095 / E - 1) of counts, any shape; 0 and 4095 are taken as half a count away, so that it stays finite."""
+    """ln(Z / 10 kohm) = ln(4095 / E - 1) of counts, any shape; 0 and 4095 are taken as half a count away, so
+    that it stays finite."""
     return np.log(FULL_SCALE / np.clip(counts, 0.5, FULL_SCALE - 0.5) - 1)
 
 
 def counts_from_log_impedance(log_z):
-    """Counts (fractional) of ln(Z / 10 kohm), any shape: the inverse of `log_impedance`, held where 12 bits end."""
+    """Counts (fractional) of ln(Z / 10 kohm), any shape: the inverse of `log_impedance`, held where 12 bits
+    end."""
     return FULL_SCALE / (1 + np.exp(np.clip(log_z, -9.1, 9.1)))
 
 
@@ -101,15 +174,15 @@ def counts_from_temperature(temperature):
 def heating_from_counts(counts):
     """dT/dt [C/s] of TAC counts, above the value at mid-scale.
 
-    The manual's -41.07 / ln((155183 - 46555 r) / r), r = TAC / 4095, is never zero, so it cannot be an absolute rate. The difference from
-    its value at mid-scale, where TAC rests, is zero in the steady state and spans a plausible range (about -0.25 to +0.8 C/s); cooling
-    raises TAC.
-    """
+    The manual's -41.07 / ln((155183 - 46555 r) / r), r = TAC / 4095, is never zero, so it cannot be an
+    absolute rate. The difference from its value at mid-scale, where TAC rests, is zero in the steady state
+    and spans a plausible range (about -0.25 to +0.8 C/s); cooling raises TAC."""
     return _heating(counts) - _heating(_MIDDLE)
 
 
 def counts_from_heating(rate):
-    """TAC counts of dT/dt [C/s], the inverse of `heating_from_counts`; 0 where the core heats faster than the formula can say."""
+    """TAC counts of dT/dt [C/s], the inverse of `heating_from_counts`; 0 where the core heats faster than the
+    formula can say."""
     total = np.asarray(rate, dtype=float) + _heating(_MIDDLE)
     # As the total nears zero from below the counts vanish; beyond that the circuit is saturated.
     log = -41.07 / np.minimum(total, -0.1)
@@ -119,11 +192,13 @@ def counts_from_heating(rate):
 def electrode_noise(counts):
     """Standard deviation [counts] of an unloaded electrode that reads `counts`.
 
-    min(15.8 (1 - E / 4095), 6.6): in proportion to the voltage over the liquid, then level. Fitted to 22508 rows of an unloaded sensor
-    (EPFL flat press, high-passed at about 1 Hz), RMS error 0.34 counts over its 19 electrodes, E 2120-3250; below that nothing was
-    measured. Rows that differ in time and electrodes are uncorrelated there (below 0.02), so the noise is drawn white and independent.
-    """
-    return np.minimum(np.maximum(_NOISE_SLOPE * (1 - np.asarray(counts, dtype=float) / FULL_SCALE), 0), _NOISE_LEVEL)
+    min(15.8 (1 - E / 4095), 6.6): in proportion to the voltage over the liquid, then level. Fitted to 22508
+    rows of an unloaded sensor (EPFL flat press, high-passed at about 1 Hz), RMS error 0.34 counts over its 19
+    electrodes, E 2120-3250; below that nothing was measured. Rows that differ in time and electrodes are
+    uncorrelated there (below 0.02), so the noise is drawn white and independent."""
+    return np.minimum(
+        np.maximum(_NOISE_SLOPE * (1 - np.asarray(counts, dtype=float) / FULL_SCALE), 0), _NOISE_LEVEL
+    )
 
 
 def _thermistor_log(counts):

@@ -5,15 +5,16 @@ from scipy.spatial import cKDTree
 
 __all__ = ["CoreSurface"]
 
-_CANDIDATES = (
-    6  # sample points per query: exact to 1e-8 mm against all 6052 triangles at 1586 nodes of the real skin; with 4 the worst is 9 um off
-)
+# sample points per query: exact to 1e-8 mm against all 6052 triangles at 1586 nodes of the real skin; with 4
+# the worst is 9 um off
+_CANDIDATES = 6
 
 
 class CoreSurface:
     """Exact distance to a closed triangulated surface, fast for some thousand points near it.
 
-    A k-d tree over sample points of the triangles proposes a few triangles per query; the closest point is then exact on those.
+    A k-d tree over sample points of the triangles proposes a few triangles per query; the closest point is
+    then exact on those.
     Works in metres: the triangles' own scale is used, no tolerance is built in.
 
     Args:
@@ -48,7 +49,9 @@ class CoreSurface:
         packed = self._packed[triangle]
         edge1, edge2 = packed[..., 3:6], packed[..., 6:9]
         offset = point[:, None] - packed[..., :3]
-        s, t = _closest_on_triangle(packed[..., 9:], np.einsum("nki,nki->nk", offset, edge1), np.einsum("nki,nki->nk", offset, edge2))
+        s, t = _closest_on_triangle(
+            packed[..., 9:], np.einsum("nki,nki->nk", offset, edge1), np.einsum("nki,nki->nk", offset, edge2)
+        )
         gap = offset - s[..., None] * edge1 - t[..., None] * edge2
         best = np.arange(len(point)), np.argmin(np.einsum("nki,nki->nk", gap, gap), axis=1)
         gap, triangle = gap[best], triangle[best]
@@ -57,7 +60,8 @@ class CoreSurface:
 
 
 def _sample(corner, spacing):
-    """Points at most about `spacing` apart on every triangle, in rows along its longest edge: points (k, 3), owner (k,)."""
+    """Points at most about `spacing` apart on every triangle, in rows along its longest edge: points (k, 3),
+    owner (k,)."""
     length2 = ((corner - np.roll(corner, -1, axis=1)) ** 2).sum(-1)
     turn = (length2.argmax(1)[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(corner, turn[..., None], axis=1), 1, 0)
@@ -67,9 +71,16 @@ def _sample(corner, spacing):
     points, owner = [], []
     for nalong, nrow in np.unique(shape, axis=0):
         which = np.flatnonzero((shape == (nalong, nrow)).all(axis=1))
-        row, along = (k.ravel() for k in np.meshgrid((np.arange(nrow) + 1 / 3) / nrow, (np.arange(nalong) + 0.5) / nalong, indexing="ij"))
+        row, along = (
+            k.ravel()
+            for k in np.meshgrid(
+                (np.arange(nrow) + 1 / 3) / nrow, (np.arange(nalong) + 0.5) / nalong, indexing="ij"
+            )
+        )
         weight = np.stack([(1 - row) * (1 - along), (1 - row) * along, row], axis=1)
-        points.append(np.einsum("qk,kfd->fqd", weight, np.stack([a[which], b[which], c[which]])).reshape(-1, 3))
+        points.append(
+            np.einsum("qk,kfd->fqd", weight, np.stack([a[which], b[which], c[which]])).reshape(-1, 3)
+        )
         owner.append(np.repeat(which, len(weight)))
     return np.concatenate(points), np.concatenate(owner)
 

@@ -1,15 +1,16 @@
-"""Impedance of the 19 electrodes: quasi-static conduction in the thin liquid film between the rigid core and the skin.
+"""Impedance of the 19 electrodes: quasi-static conduction in the thin liquid film between the rigid core and
+the skin.
 
-The film is a sheet of conductance sigma h, h the gap from the deformed skin to the core. It is triangulated by the inner surface of the
-skin, laid halfway between skin and core, and its P1 finite-element Laplacian L gives the potential of any current pattern. The four
-excitation electrodes are short-circuited and grounded, one sensing electrode injects the current, the others float (19 patterns, one
-factorisation).
+The film is a sheet of conductance sigma h, h the gap from the deformed skin to the core. It is triangulated
+by the inner surface of the skin, laid halfway between skin and core, and its P1 finite-element Laplacian L
+gives the potential of any current pattern. The four excitation electrodes are short-circuited and grounded,
+one sensing electrode injects the current, the others float (19 patterns, one factorisation).
 
-Electrodes are discs with uniform current density, so the result does not depend on how nodes fall under them. Two parts of the field near
-a disc are closed forms with the film's local thickness h: the mesh carries the current in over a disc of radius b that it resolves, and
-ln(b / a) / (2 pi sigma h) is the sheet between that and the electrode's radius a; and a sheet is exact only where it is thinner than the
-disc is wide, so what a slab of thickness h adds is `spreading_resistance`.
-"""
+Electrodes are discs with uniform current density, so the result does not depend on how nodes fall under them.
+Two parts of the field near a disc are closed forms with the film's local thickness h: the mesh carries the
+current in over a disc of radius b that it resolves, and ln(b / a) / (2 pi sigma h) is the sheet between that
+and the electrode's radius a; and a sheet is exact only where it is thinner than the disc is wide, so what a
+slab of thickness h adds is `spreading_resistance`."""
 
 import numpy as np
 from scipy.linalg import lapack
@@ -23,28 +24,36 @@ from biotac_mj.sensor.core_surface import CoreSurface
 
 __all__ = ["CONDUCTIVITY", "EXCITATION", "FilmConduction", "sheet_laplacian", "spreading_resistance"]
 
-# X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for this sensor; the two pairs,
-# symmetric about z = 0, that best explain the published rest counts (scripts/fit_excitation.py on the paper's mesh: ln Z correlates
-# 0.978, RMS 0.054).
+# X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for
+# this sensor; the two pairs, symmetric about z = 0, that best explain the published rest counts
+# (scripts/fit_excitation.py on the paper's mesh: ln Z correlates 0.978, RMS 0.054).
 EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 1.299))
-CONDUCTIVITY = 0.367  # [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at 25 C
-_CORE_RADIUS = 5.325e-3  # [m], published cylinder about the x axis; only says where to look for the core's surface
+# [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at 25
+# C
+CONDUCTIVITY = 0.367
+_CORE_RADIUS = (
+    5.325e-3  # [m], published cylinder about the x axis; only says where to look for the core's surface
+)
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
-_SLACK = 2.0e-3  # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
+_SLACK = (
+    2.0e-3  # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
+)
 
 
 class FilmConduction:
-    """Impedances of the 19 sensing electrodes from the deformed skin. Constant after construction, holds no state.
+    """Impedances of the 19 sensing electrodes from the deformed skin. Constant after construction, holds no
+    state.
 
     Args:
       geometry: the skin, its core and its electrodes.
       conductivity: of the liquid [S/m].
-      residual_film: thickness left where the skin lies on the core, held off by the asperities of its inner face [m] (chosen; catalogue
-        range 20-100 um).
+      residual_film: thickness left where the skin lies on the core, held off by the asperities of its inner
+        face [m] (chosen; catalogue range 20-100 um).
       electrode_radius: of all discs [m] (chosen: not published).
-      excitation: (4, 2), position x [m] and angle about the x axis from the pad's midline, positive to +z [rad], of X1..X4.
-      sensor: "1" | "2" | "3" calibrates one constant factor per electrode so that the skin at rest gives that sensor's published rest
-        counts; None leaves the factors at one: physics alone.
+      excitation: (4, 2), position x [m] and angle about the x axis from the pad's midline, positive to +z
+        [rad], of X1..X4.
+      sensor: "1" | "2" | "3" calibrates one constant factor per electrode so that the skin at rest gives that
+        sensor's published rest counts; None leaves the factors at one: physics alone.
 
     Attributes:
       cell_constant: (19,), what the film's impedance is multiplied with.
@@ -63,15 +72,23 @@ class FilmConduction:
         excitation=EXCITATION,
         sensor="1",
     ):
-        for name, value in (("conductivity", conductivity), ("residual_film", residual_film), ("electrode_radius", electrode_radius)):
+        for name, value in (
+            ("conductivity", conductivity),
+            ("residual_film", residual_film),
+            ("electrode_radius", electrode_radius),
+        ):
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: pass a positive number in SI units")
         if sensor is not None and sensor not in REST_COUNTS:
-            raise ValueError(f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no calibration")
+            raise ValueError(
+                f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
+                "calibration"
+            )
         excitation = np.asarray(excitation, dtype=float)
         if excitation.ndim != 2 or excitation.shape[1] != 2 or not np.all(np.isfinite(excitation)):
             raise ValueError(
-                f"excitation has shape {excitation.shape}: pass (n, 2) finite numbers, position x [m] and angle [rad] of each electrode"
+                f"excitation has shape {excitation.shape}: pass (n, 2) finite numbers, position x [m] and "
+                "angle [rad] of each electrode"
             )
 
         self.geometry, self.conductivity, self.residual_film, self.electrode_radius = (
@@ -103,16 +120,22 @@ class FilmConduction:
           (19,) or (nworld, 19) [ohm].
 
         Raises:
-          ValueError: wrong shape, a position that is not finite, or a skin so far off that it leaves an electrode uncovered.
+          ValueError: wrong shape, a position that is not finite, or a skin so far off that it leaves an
+            electrode uncovered.
         """
         vert_xpos = np.asarray(vert_xpos, dtype=float)
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
             raise ValueError(
-                f"vert_xpos has shape {vert_xpos.shape}: the skin '{self.geometry.name}' needs ({self.geometry.nvert}, 3), "
+                f"vert_xpos has shape {vert_xpos.shape}: the skin '{self.geometry.name}' needs "
+                f"({self.geometry.nvert}, 3), "
                 f"or (nworld, {self.geometry.nvert}, 3)"
             )
         if vert_xpos.ndim == 3:
-            return np.stack([self.impedance(world) for world in vert_xpos]) if len(vert_xpos) else np.empty((0, 19))
+            return (
+                np.stack([self.impedance(world) for world in vert_xpos])
+                if len(vert_xpos)
+                else np.empty((0, 19))
+            )
         middle, thickness = self.film(vert_xpos)
         weight = self._disc_weights(middle)
         resistance = self._resistances(middle, thickness, weight)
@@ -128,8 +151,8 @@ class FilmConduction:
           vert_xpos: (nvert, 3) [m].
 
         Returns:
-          middle (nnode, 3), the surface halfway between skin and core, and thickness (nnode,), at least `residual_film` [m], at the nodes
-          `self.node`.
+          middle (nnode, 3), the surface halfway between skin and core, and thickness (nnode,), at least
+          `residual_film` [m], at the nodes `self.node`.
         """
         point = vert_xpos[self.node]
         if not np.all(np.isfinite(point)):
@@ -142,12 +165,16 @@ class FilmConduction:
         return 0.5 * (point + foot), np.maximum(distance, self.residual_film)
 
     def _set_mesh(self):
-        """Film nodes in an order of small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed) carry no liquid."""
+        """Film nodes in an order of small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)
+        carry no liquid."""
         fixed = np.zeros(self.geometry.nvert, dtype=bool)
         fixed[self.geometry.fixed] = True
         face = self.geometry.inner_face[~fixed[self.geometry.inner_face].all(axis=1)]
         if not len(face):
-            raise ValueError(f"the skin '{self.geometry.name}' has no free inner face: no liquid film; check inner_face and fixed")
+            raise ValueError(
+                f"the skin '{self.geometry.name}' has no free inner face: no liquid film; check inner_face "
+                "and fixed"
+            )
         graph = _face_graph(face, self.geometry.nvert)
         label = connected_components(graph, directed=False)[1]
         largest = np.argmax(np.bincount(label[face[:, 0]]))
@@ -160,17 +187,21 @@ class FilmConduction:
         self.face = index[face]
         i, j = _edges(self.face)
         low, high = np.minimum(i, j), np.maximum(i, j)
-        # LAPACK's lower band storage, column-major: entry (row, column) lies at column * (bandwidth + 1) + row - column.
+        # LAPACK's lower band storage, column-major: entry (row, column) lies at column * (bandwidth + 1) +
+        # row - column.
         self._band = int((high - low).max()) + 1
         diagonal = self._band * np.arange(len(node))
         self._slot = np.concatenate([diagonal[low] + high - low, diagonal[low], diagonal[high]])
 
     def _set_discs(self):
-        """Points that stand for equal parts of a disc, and the faces that may come to lie over each electrode."""
+        """Points that stand for equal parts of a disc, and the faces that may come to lie over each
+        electrode."""
         self._footprint = max(self.electrode_radius, _FOOTPRINT)
         radius = np.sqrt((np.arange(3) + 0.5) / 3)
         angle = 2 * np.pi * (np.arange(8)[None] + np.array([0, 0.5, 0])[:, None]) / 8
-        self._disc = self._footprint * np.stack([radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1).reshape(-1, 2)
+        self._disc = self._footprint * np.stack(
+            [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1
+        ).reshape(-1, 2)
         helper = np.where(np.abs(self._normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
         tangent = np.cross(self._normal, helper)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -181,7 +212,8 @@ class FilmConduction:
         offset = centre[None] - self._pos[:, None]
         tangential = np.linalg.norm(np.einsum("efk,eak->efa", offset, self._tangent), axis=2)
         height = np.einsum("efk,ek->ef", offset, self._normal)
-        # A face on the far side of the finger projects onto the disc too: it lies several millimetres under it.
+        # A face on the far side of the finger projects onto the disc too: it lies several millimetres under
+        # it.
         self._pair = np.nonzero((tangential < reach) & (np.abs(height) < _SLACK))
 
     def _disc_weights(self, middle):
@@ -200,12 +232,15 @@ class FilmConduction:
             pair, sample = np.nonzero((s >= 0) & (t >= 0) & (s + t <= 1))
         s, t, electrode = s[pair, sample], t[pair, sample], electrode[pair]
         key = electrode * len(self._disc) + sample
-        hits = np.bincount(key, minlength=len(self._pos) * len(self._disc))  # a sample on an edge or under a fold is shared
+        hits = np.bincount(
+            key, minlength=len(self._pos) * len(self._disc)
+        )  # a sample on an edge or under a fold is shared
         covered = (hits.reshape(len(self._pos), -1) > 0).sum(1)
         if not covered.all():
             missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in np.flatnonzero(covered == 0)]
             raise ValueError(
-                f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than {_SLACK * 1e3:g} mm, "
+                f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than "
+                f"{_SLACK * 1e3:g} mm, "
                 "or is bonded there"
             )
         share = 1.0 / (hits[key] * covered[electrode])
@@ -216,14 +251,25 @@ class FilmConduction:
         return weight
 
     def _resistances(self, middle, thickness, weight):
-        """(23, 23) [ohm]: mean potential of disc i for a unit current into disc j, up to a constant that balanced currents cancel."""
-        conductance = self.conductivity * thickness[self.face].mean(1)  # of a linear thickness: its mean is exact
+        """(23, 23) [ohm]: mean potential of disc i for a unit current into disc j, up to a constant that
+        balanced currents cancel."""
+        conductance = self.conductivity * thickness[self.face].mean(
+            1
+        )  # of a linear thickness: its mean is exact
         off = _cotangent_weights(middle, self.face, conductance).ravel()
-        band = np.bincount(self._slot, np.concatenate([-off, off, off]), minlength=self._band * len(self.node)).reshape(-1, self._band)
-        band[0, 0] += band[:, 0].mean()  # holds the free constant; no current flows through it, so the impedances do not depend on it
+        band = np.bincount(
+            self._slot, np.concatenate([-off, off, off]), minlength=self._band * len(self.node)
+        ).reshape(-1, self._band)
+        band[0, 0] += band[
+            :, 0
+            # holds the free constant; no current flows through it, so the impedances do not depend on it
+        ].mean()
         factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
         if info:
-            raise ValueError("the film's conductance is not positive definite: the inner surface is folded; keep the last good state")
+            raise ValueError(
+                "the film's conductance is not positive definite: the inner surface is folded; keep the "
+                "last good state"
+            )
         half, _ = lapack.dtbtrs(factor, weight, uplo="L")
         return half.T @ half
 
@@ -241,15 +287,20 @@ def sheet_laplacian(point, face, conductance):
     off = _cotangent_weights(point, face, np.asarray(conductance)).ravel()
     n = len(point)
     return coo_matrix(
-        (np.concatenate([-off, -off, off, off]), (np.concatenate([i, j, i, j]), np.concatenate([j, i, i, j]))), shape=(n, n)
+        (
+            np.concatenate([-off, -off, off, off]),
+            (np.concatenate([i, j, i, j]), np.concatenate([j, i, i, j])),
+        ),
+        shape=(n, n),
     ).tocsr()
 
 
 def spreading_resistance(ratio, npoint=20000):
     """Resistance near a disc that a thin sheet leaves out, times sigma a.
 
-    A disc of radius a injects uniformly into a slab of thickness h between insulating planes. Its mean potential is a Hankel integral
-    over coth(k h); the sheet keeps the part 1 / (k h) of it, the rest is F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x)
+    A disc of radius a injects uniformly into a slab of thickness h between insulating planes. Its mean
+    potential is a Hankel integral over coth(k h); the sheet keeps the part 1 / (k h) of it, the rest is
+    F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x)
     - 1/(r x)) dx: F -> r / (3 pi) for thin films.
 
     Args:
@@ -263,8 +314,12 @@ def spreading_resistance(ratio, npoint=20000):
     x = (np.arange(npoint) + 0.5) * width
     weight = 2 / np.pi * width * (j1(x) / x) ** 2
     y = ratio[..., None] * x
-    tail = 1 / (np.pi**2 * 60.0**2)  # J1^2 averages 1 / (pi x) and coth - 1/y is about one beyond the last point
-    return (weight * (1 / np.tanh(y) - 1 / y)).sum(-1) + tail * np.where(ratio > 0.05, 1 - 1 / np.maximum(40 * ratio, 1), 0)
+    tail = 1 / (
+        np.pi**2 * 60.0**2
+    )  # J1^2 averages 1 / (pi x) and coth - 1/y is about one beyond the last point
+    return (weight * (1 / np.tanh(y) - 1 / y)).sum(-1) + tail * np.where(
+        ratio > 0.05, 1 - 1 / np.maximum(40 * ratio, 1), 0
+    )
 
 
 def _spreading_table():
@@ -276,7 +331,8 @@ def _spreading_table():
 
 
 def _driving_point(resistance, nsense):
-    """Impedance of each sensing disc against the excitation discs, which share one potential and together sink the current."""
+    """Impedance of each sensing disc against the excitation discs, which share one potential and together
+    sink the current."""
     sense, ground = slice(0, nsense), slice(nsense, None)
     nground = len(resistance) - nsense
     bordered = np.ones((nground + 1, nground + 1))
@@ -292,7 +348,9 @@ def _cotangent_weights(point, face, conductance):
     corner = point[face]
     edge = np.roll(corner, -2, axis=1) - np.roll(corner, -1, axis=1)  # edge k is opposite corner k
     double_area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
-    double_area = np.maximum(double_area, 1e-6 * (edge**2).sum((1, 2)))  # a face squeezed to a line stays finite
+    double_area = np.maximum(
+        double_area, 1e-6 * (edge**2).sum((1, 2))
+    )  # a face squeezed to a line stays finite
     dot = -(np.roll(edge, -1, axis=1) * np.roll(edge, -2, axis=1)).sum(2)
     return 0.5 * conductance[:, None] * dot / double_area[:, None]
 
@@ -304,4 +362,6 @@ def _edges(face):
 
 def _face_graph(face, nnode):
     i, j = _edges(face)
-    return coo_matrix((np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(nnode, nnode)).tocsr()
+    return coo_matrix(
+        (np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(nnode, nnode)
+    ).tocsr()

@@ -1,4 +1,5 @@
-"""Kernels of `batch_film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item, world] unless they are tiles."""
+"""Kernels of `batch_film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item,
+world] unless they are tiles."""
 
 import warp as wp
 
@@ -32,9 +33,12 @@ def _double(p: wp.vec3):
 
 @wp.func
 def nearest_on_core(mesh: wp.uint64, p: vec3):
-    """Gap vector (foot to p) and its signed length [m]: nearest triangle of the core's mesh (in mm), exact on that one."""
+    """Gap vector (foot to p) and its signed length [m]: nearest triangle of the core's mesh (in mm), exact on
+    that one."""
     mm = real(1.0e3) * p
-    query = wp.mesh_query_point_no_sign(mesh, wp.vec3(wp.float32(mm[0]), wp.float32(mm[1]), wp.float32(mm[2])), wp.float32(_MAX_GAP))
+    query = wp.mesh_query_point_no_sign(
+        mesh, wp.vec3(wp.float32(mm[0]), wp.float32(mm[1]), wp.float32(mm[2])), wp.float32(_MAX_GAP)
+    )
     if not query.result:
         return wp.vec4d(real(0.0), real(0.0), real(0.0), real(wp.nan))
     a = _double(wp.mesh_get_point(mesh, 3 * query.face))
@@ -144,7 +148,9 @@ def assemble(
     if start[e] == start[e + 1]:
         value = real(1.0)
     if e == 0:
-        value = real(2.0) * value  # holds the free constant; no current flows through it, so the impedances do not depend on it
+        value = (
+            real(2.0) * value
+        )  # holds the free constant; no current flows through it, so the impedances do not depend on it
     band_out[w, entry[e][0], entry[e][1]] = value
 
 
@@ -170,7 +176,8 @@ def cover_discs(
     rhs_out: wp.array3d(dtype=real),
     local_out: wp.array2d(dtype=real),
 ):
-    """Mean over each disc as weights of nodal values (columns of the right-hand side), and the mean thickness [disc, world]."""
+    """Mean over each disc as weights of nodal values (columns of the right-hand side), and the mean thickness
+    [disc, world]."""
     e, w = wp.tid()
     if due[w] == 0:
         return
@@ -203,12 +210,18 @@ def cover_discs(
                             rhs_out[w, t[0], e] = rhs_out[w, t[0], e] + (real(1.0) - u - v) * share
                             rhs_out[w, t[1], e] = rhs_out[w, t[1], e] + u * share
                             rhs_out[w, t[2], e] = rhs_out[w, t[2], e] + v * share
-                            mean = (real(1.0) - u - v) * thickness[t[0], w] + u * thickness[t[1], w] + v * thickness[t[2], w]
+                            mean = (
+                                (real(1.0) - u - v) * thickness[t[0], w]
+                                + u * thickness[t[1], w]
+                                + v * thickness[t[2], w]
+                            )
                             local += share * mean
     local_out[e, w] = local  # zero where no film is left over the disc
 
 
-@wp.kernel(module="unique", enable_backward=False)  # launched with blocks of its own size: else all kernels here were compiled for both
+@wp.kernel(
+    module="unique", enable_backward=False
+)  # launched with blocks of its own size: else all kernels here were compiled for both
 def solve_band(
     # In:
     due: wp.array(dtype=int),
@@ -220,7 +233,8 @@ def solve_band(
     # Out:
     resistance_out: wp.array3d(dtype=real),
 ):
-    """W' A^-1 W of the discs W by Cholesky's factor, a thread block for each world; A has `reach` tiles beside the diagonal."""
+    """W' A^-1 W of the discs W by Cholesky's factor, a thread block for each world; A has `reach` tiles
+    beside the diagonal."""
     w = wp.tid()
     if due[w] == 0:
         return
@@ -240,7 +254,9 @@ def solve_band(
             wp.tile_matmul(wp.tile_transpose(z), y, below, alpha=-1.0)
             wp.tile_store(rhs[w], below, offset=((k + i) * TILE, 0))
             for j in range(1, i + 1):
-                other = wp.tile_load(band[w], shape=(TILE, TILE), offset=(first + j * TILE, 0), storage="shared")
+                other = wp.tile_load(
+                    band[w], shape=(TILE, TILE), offset=(first + j * TILE, 0), storage="shared"
+                )
                 row = ((k + j) * (reach + 1) + i - j) * TILE
                 rest = wp.tile_load(band[w], shape=(TILE, TILE), offset=(row, 0), storage="shared")
                 wp.tile_matmul(wp.tile_transpose(other), z, rest, alpha=-1.0)
@@ -264,7 +280,8 @@ def driving_point(
     impedance_out: wp.array2d(dtype=real),
     valid_out: wp.array(dtype=int),
 ):
-    """Impedance of each sensing disc against the grounded ones, [world, electrode]; a film that cannot be solved keeps the last ones."""
+    """Impedance of each sensing disc against the grounded ones, [world, electrode]; a film that cannot be
+    solved keeps the last ones."""
     w = wp.tid()
     if due[w] == 0:
         return
@@ -274,11 +291,15 @@ def driving_point(
             a[i, j] = resistance[w, 19 + i, 19 + j]
         a[i, 4] = real(1.0)
         a[4, i] = real(1.0)
-        a[i, i] = a[i, i] + _near(local[19 + i, w], spreading, spreading_step, radius, footprint, conductivity)
+        a[i, i] = a[i, i] + _near(
+            local[19 + i, w], spreading, spreading_step, radius, footprint, conductivity
+        )
     inverse = _inverse5(a)
     for sweep in range(2):  # check all, then write
         for e in range(19):
-            z = resistance[w, e, e] + _near(local[e, w], spreading, spreading_step, radius, footprint, conductivity)
+            z = resistance[w, e, e] + _near(
+                local[e, w], spreading, spreading_step, radius, footprint, conductivity
+            )
             for i in range(5):
                 current = real(0.0)
                 for j in range(5):
@@ -295,8 +316,16 @@ def driving_point(
 
 
 @wp.func
-def _near(thickness: real, spreading: wp.array(dtype=real), step: real, radius: real, footprint: real, conductivity: real):
-    """Resistance [ohm] near a disc that the mesh does not see: the logarithm within the footprint, and what the slab adds to the sheet."""
+def _near(
+    thickness: real,
+    spreading: wp.array(dtype=real),
+    step: real,
+    radius: real,
+    footprint: real,
+    conductivity: real,
+):
+    """Resistance [ohm] near a disc that the mesh does not see: the logarithm within the footprint, and what
+    the slab adds to the sheet."""
     ratio = thickness / radius
     s = ratio / (real(1.0) + ratio) / step
     i = wp.min(int(s), spreading.shape[0] - 2)

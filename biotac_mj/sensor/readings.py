@@ -1,4 +1,5 @@
-"""What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for stored motions."""
+"""What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for
+stored motions."""
 
 import numpy as np
 
@@ -11,7 +12,8 @@ __all__ = ["PhysicsReadings", "record"]
 
 
 class PhysicsReadings:
-    """Counts of all channels from the deformed skin and the liquid's pressure. Constant: the state belongs to the caller.
+    """Counts of all channels from the deformed skin and the liquid's pressure. Constant: the state belongs to
+    the caller.
 
     Args:
       geometry: the skin.
@@ -44,7 +46,8 @@ class PhysicsReadings:
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(self, state, vert_xpos=None, pressure=0.0, time=0.0):
-        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state (nstate,)."""
+        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state
+        (nstate,)."""
         impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         self.acquisition.reset(state, impedance, pressure, self.temperature, time)
 
@@ -61,8 +64,12 @@ class PhysicsReadings:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
         impedance = None
-        if self.acquisition.needs_impedance(state, time, dt):  # a skin that nothing touches need not be solved again
-            impedance = self._rest if np.array_equal(vert_xpos, self._rest_vert) else self.film.impedance(vert_xpos)
+        if self.acquisition.needs_impedance(
+            state, time, dt
+        ):  # a skin that nothing touches need not be solved again
+            impedance = (
+                self._rest if np.array_equal(vert_xpos, self._rest_vert) else self.film.impedance(vert_xpos)
+            )
         self.acquisition.advance(state, time, dt, impedance, pressure, self.temperature)
 
     def readings(self, state):
@@ -78,7 +85,8 @@ def record(readings, time, vert_xpos, pressure):
       time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
 
     Returns:
-      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, 19), pdc (nt,), pac (nt, 22), tac (nt,), tdc (nt,).
+      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, 19), pdc (nt,), pac (nt, 22),
+        tac (nt,), tdc (nt,).
 
     Raises:
       ValueError: lengths that differ, or time that does not increase.
@@ -86,11 +94,13 @@ def record(readings, time, vert_xpos, pressure):
     time, pressure = np.asarray(time, dtype=float), np.asarray(pressure, dtype=float)
     if time.ndim != 1 or not len(time) or len(vert_xpos) != len(time) or pressure.shape != time.shape:
         raise ValueError(
-            f"time has shape {time.shape}, vert_xpos {len(vert_xpos)} samples, pressure {pressure.shape}: pass one of each per sample"
+            f"time has shape {time.shape}, vert_xpos {len(vert_xpos)} samples, pressure {pressure.shape}: "
+            "pass one of each per sample"
         )
     if not np.all(np.diff(time) > 0):
         raise ValueError(
-            f"time does not increase after sample {int(np.argmax(~(np.diff(time) > 0)))}: sort the samples and drop repeated ones"
+            f"time does not increase after sample {int(np.argmax(~(np.diff(time) > 0)))}: sort the samples "
+            "and drop repeated ones"
         )
     state = np.zeros(readings.nstate)
     readings.reset(state, vert_xpos[0], pressure[0], time[0])

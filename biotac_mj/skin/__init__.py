@@ -8,4 +8,15 @@ from .model import SkinModel, SkinOptions
 from .shapes import bake_distance_grid
 from .solver import step
 
-__all__ = ["PRESETS", "ContactLaw", "GeomSet", "Material", "SkinData", "SkinModel", "SkinOptions", "bake_distance_grid", "material", "step"]
+__all__ = [
+    "PRESETS",
+    "ContactLaw",
+    "GeomSet",
+    "Material",
+    "SkinData",
+    "SkinModel",
+    "SkinOptions",
+    "bake_distance_grid",
+    "material",
+    "step",
+]

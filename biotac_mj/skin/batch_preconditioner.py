@@ -1,4 +1,5 @@
-"""The preconditioner of `preconditioner.py` for all worlds at once on a CUDA device, in torch's batched linear algebra."""
+"""The preconditioner of `preconditioner.py` for all worlds at once on a CUDA device, in torch's batched
+linear algebra."""
 
 import numpy as np
 import torch
@@ -46,7 +47,8 @@ def scatter_blocks(
 
 
 class BatchPreconditioner:
-    """(A0 + U D U^T)^-1 by Woodbury's identity, one small system for each world, all of the size of the largest."""
+    """(A0 + U D U^T)^-1 by Woodbury's identity, one small system for each world, all of the size of the
+    largest."""
 
     def __init__(self, model, scale):
         self.factor = model.factor
@@ -54,7 +56,9 @@ class BatchPreconditioner:
         self.scale = torch.as_tensor(scale, device=self.device)
         self.nvert = model.nvert
         index = torch.full((model.nvert + 1,), -1, device=self.device)
-        index[torch.as_tensor(model.free, device=self.device)] = torch.arange(len(model.free), device=self.device)
+        index[torch.as_tensor(model.free, device=self.device)] = torch.arange(
+            len(model.free), device=self.device
+        )
         self.free_index = index
         self._inverse = self.factor.inverse.view(self.factor.padded // 3, 3, self.factor.padded // 3, 3)
         self._faces = {}
@@ -65,9 +69,14 @@ class BatchPreconditioner:
 
     def update(self, states, residual, gradient, kappa):
         """See `Preconditioner.update`; on the device."""
-        # the liquid's direction is scaled so that its stiffness is like that of contact: single precision then suffices
+        # the liquid's direction is scaled so that its stiffness is like that of contact: single precision
+        # then suffices
         self.kappa = _STIFF
-        self.gradient = None if gradient is None else gradient * torch.as_tensor((kappa / _STIFF) ** 0.5, device=self.device)[:, None]
+        self.gradient = (
+            None
+            if gradient is None
+            else gradient * torch.as_tensor((kappa / _STIFF) ** 0.5, device=self.device)[:, None]
+        )
         gradient = self.gradient
         nworld = len(self.scale)
         faces = [self._face(s.surface.face_np) for s in states]
@@ -81,7 +90,9 @@ class BatchPreconditioner:
         m = -(-count // _PAD) * _PAD
         slot = torch.where(touched, slot, m)  # slot m catches what is not touched
         nodes = torch.full((m + 1, nworld), self.nvert, device=self.device)
-        nodes.scatter_(0, slot.long(), torch.arange(self.nvert, device=self.device)[:, None].expand(-1, nworld))
+        nodes.scatter_(
+            0, slot.long(), torch.arange(self.nvert, device=self.device)[:, None].expand(-1, nworld)
+        )
         self.nodes = nodes[:m].T.contiguous()  # (nworld, m), nvert where unused
         self.size = 3 * m + (gradient is not None)
         if not self.size:
@@ -122,7 +133,9 @@ class BatchPreconditioner:
         if m:
             local = self.free_index[self.nodes].clamp_min(0)
             block = self._inverse[local[:, :, None], :, local[:, None, :], :]  # (nworld, m, m, 3, 3)
-            W[:, : 3 * m, : 3 * m] = block.transpose(2, 3).reshape(nworld, 3 * m, 3 * m).float() * self.factor.scale
+            W[:, : 3 * m, : 3 * m] = (
+                block.transpose(2, 3).reshape(nworld, 3 * m, 3 * m).float() * self.factor.scale
+            )
             W[:, : 3 * m, : 3 * m] *= self.used[:, :, None] * self.used[:, None, :]
         if self.gradient is not None:
             along = self.factor.solve(self.gradient)
@@ -143,7 +156,12 @@ class BatchPreconditioner:
         keep = np.concatenate([np.repeat(used, 3), np.ones(self.size - 3 * len(used), bool)])
         D, W = (a[w].double().cpu().numpy()[keep][:, keep] for a in (self.D, self.W))
         return body_tangent(
-            self.nodes[w].cpu().numpy()[used], W, lambda u: np.linalg.solve(np.eye(len(D)) + D @ W, D @ u), blocks, x, self.nvert
+            self.nodes[w].cpu().numpy()[used],
+            W,
+            lambda u: np.linalg.solve(np.eye(len(D)) + D @ W, D @ u),
+            blocks,
+            x,
+            self.nvert,
         )
 
     def apply(self, r):

@@ -58,7 +58,8 @@ def depth_in_core(
     # Out:
     depth_out: wp.array2d(dtype=real),
 ):
-    """How deep each geom reaches into the rigid core, by the core's vertices inside the geom [geom, world]."""
+    """How deep each geom reaches into the rigid core, by the core's vertices inside the geom [geom,
+    world]."""
     g, w = wp.tid()
     R = geoms.mat[g, w]
     deepest = real(0.0)

@@ -1,10 +1,12 @@
 """The real-time tier: a skin that is linear but for its contact, solved over the nodes that touch.
 
-Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f the contact forces of outer nodes (Coulomb friction) and of
-inner nodes against the core (normal only), p the liquid's pressure above that at rest, g the gradient of its volume at rest, s >= 1 and
-c <= 1 corrections. The liquid's pressure follows in closed form from p = -K (g.u + q) / V0, with q what the exact volume of the deformed
-cavity adds to its linear part. What is left is the contact law f = F(u) over the candidates, tens of coordinates, solved by Newton's method
-with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin, `contact.touch_face`).
+Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f the contact forces of outer
+nodes (Coulomb friction) and of inner nodes against the core (normal only), p the liquid's pressure above that
+at rest, g the gradient of its volume at rest, s >= 1 and c <= 1 corrections. The liquid's pressure follows in
+closed form from p = -K (g.u + q) / V0, with q what the exact volume of the deformed cavity adds to its linear
+part. What is left is the contact law f = F(u) over the candidates, tens of coordinates, solved by Newton's
+method with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin,
+`contact.touch_face`).
 
 What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed_correction`).
 """
@@ -46,10 +48,11 @@ def _strain(
     # Out:
     strain_out: wp.array(dtype=real),
 ):
-    """Largest displacement of the count[0] numbered outer nodes, mean square spread of their forces, share by which the wall is thinned.
+    """Largest displacement of the count[0] numbered outer nodes, mean square spread of their forces, share by
+    which the wall is thinned.
 
-    Means are weighted with the squares of the forces, so that a node that begins to touch changes nothing at once.
-    """
+    Means are weighted with the squares of the forces, so that a node that begins to touch changes nothing at
+    once."""
     total = real(0.0)
     mean = vec3()
     for k in range(count[0]):
@@ -88,7 +91,13 @@ def _compliance(model, outer, inner, direction, cache):
 
 
 def _key(memory):
-    return memory.coordinate.tobytes(), memory.force.tobytes(), memory.pressure, memory.softening, memory.swelling
+    return (
+        memory.coordinate.tobytes(),
+        memory.force.tobytes(),
+        memory.pressure,
+        memory.softening,
+        memory.swelling,
+    )
 
 
 class CondensedSkin:
@@ -100,24 +109,34 @@ class CondensedSkin:
       cache: whether to keep the compliance on disk (see `surface_compliance`).
 
     Raises:
-      ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the unstressed skin holds.
+      ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the
+        unstressed skin holds.
     """
 
     def __init__(self, model, geoms: GeomSet, cache: bool = True):
         if model.device.is_cuda:
-            raise ValueError("the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA")
+            raise ValueError(
+                "the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA"
+            )
         if model.options.dynamics != "quasistatic":
-            raise ValueError("the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier")
+            raise ValueError(
+                "the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier"
+            )
         if model.extensions:
             raise ValueError(
-                f"the condensed tier is elastic, the same everywhere: leave {' and '.join(model.extensions)} out, or choose the full tier"
+                "the condensed tier is elastic, the same everywhere: leave "
+                f"{' and '.join(model.extensions)} out, or choose the full tier"
             )
         if model.options.contact_law is not None:
-            raise ValueError("the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, or choose the full tier")
+            raise ValueError(
+                "the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, or "
+                "choose the full tier"
+            )
         filled = model.has_liquid and (model.options.fill_volume or model.options.rest_pressure)
         if filled and (model.options.fill_volume < 0 or model.options.rest_pressure < 0):
             raise ValueError(
-                "the condensed tier needs a skin clear of its core at rest: take fill_volume and rest_pressure >= 0, or the full tier"
+                "the condensed tier needs a skin clear of its core at rest: take fill_volume and "
+                "rest_pressure >= 0, or the full tier"
             )
         self.model, self.geoms = model, geoms
         self.correction = correction(model.material.law)
@@ -143,7 +162,7 @@ class CondensedSkin:
         self._away32 = self._away.astype(np.float32)
         self._prepare_strain()
 
-    # --- preparation -------------------------------------------------------------------------------------------------------------
+    # --- preparation  ---
 
     def _prepare_positions(self):
         m = self.model
@@ -158,22 +177,38 @@ class CondensedSkin:
         self._x[:, 0] = self._last[:, 0] = self.rest
 
     def _record(self, kernel, inputs, outputs, dim=1):
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+        return wp.launch(
+            kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
+        ).launch
 
     def _prepare_strain(self):
         """What `strain` needs: each outer node's nearest across the wall."""
         g = self.model.geometry
         inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(self.model.fixed, g.outer_face)
         opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
-        count, number = wp.zeros(1, dtype=int, device="cpu"), wp.zeros(3 * len(self._outer), dtype=int, device="cpu")
-        force, out = wp.zeros(3 * len(self._outer), dtype=real, device="cpu"), wp.zeros(3, dtype=real, device="cpu")
+        count, number = (
+            wp.zeros(1, dtype=int, device="cpu"),
+            wp.zeros(3 * len(self._outer), dtype=int, device="cpu"),
+        )
+        force, out = (
+            wp.zeros(3 * len(self._outer), dtype=real, device="cpu"),
+            wp.zeros(3, dtype=real, device="cpu"),
+        )
         outer, opposite = (wp.array(a, dtype=int, device="cpu") for a in (self._outer, opposite))
         rest = wp.array(self.rest[:, None], dtype=vec3, device="cpu")
-        self._touched, self._touched_force, self._touched_count, self._strains = number.numpy(), force.numpy(), count.numpy(), out.numpy()
-        self._measure_strain = self._record(_strain, [count, number, force, outer, opposite, rest, self._x_wp], [out])
+        self._touched, self._touched_force, self._touched_count, self._strains = (
+            number.numpy(),
+            force.numpy(),
+            count.numpy(),
+            out.numpy(),
+        )
+        self._measure_strain = self._record(
+            _strain, [count, number, force, outer, opposite, rest, self._x_wp], [out]
+        )
 
     def strain(self, number, force):
-        """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces (n,), as the skin is now."""
+        """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces
+        (n,), as the skin is now."""
         n = len(number)
         if not n:
             return 0.0, 0.0, 0.0
@@ -195,29 +230,41 @@ class CondensedSkin:
         if not m.has_liquid:
             return
         corner = wp.zeros((3 * len(m.inner.face), 1), dtype=vec3, device="cpu")
-        wp.launch(liquid.volume_gradient, dim=share.shape, inputs=[m.inner.face, self._x_wp], outputs=[corner], device="cpu")
+        wp.launch(
+            liquid.volume_gradient,
+            dim=share.shape,
+            inputs=[m.inner.face, self._x_wp],
+            outputs=[corner],
+            device="cpu",
+        )
         np.add.at(self._gradient, m.inner.face.numpy().ravel(), corner.numpy()[:, 0])
         self._gradient[m.fixed] = 0
         self._give = self.compliance.vector(self._gradient)
         self._liquid_give = float(self._gradient[m.free].ravel() @ self._give)
         give = np.zeros((m.nvert, 3))
         give[m.free] = self._give.reshape(-1, 3)
-        self._give_at = np.concatenate([give[self._outer].ravel(), np.einsum("ij,ij->i", give[self._inner], self._away)])
+        self._give_at = np.concatenate(
+            [give[self._outer].ravel(), np.einsum("ij,ij->i", give[self._inner], self._away)]
+        )
 
     def _measure_volume(self):
         if self.model.inner is not None:
             self._volume()
 
-    # --- a step ------------------------------------------------------------------------------------------------------------------
+    # --- a step  ---
 
     def solve(self, memory: Memory, geom_pos, geom_mat) -> Outcome:
-        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments alone.
+        """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
+        alone.
 
         Raises:
           ValueError: NaN in a pose, or a geom deep inside the core.
         """
         if not (math.isfinite(np.sum(geom_pos)) and math.isfinite(np.sum(geom_mat))):
-            raise ValueError("geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was never set")
+            raise ValueError(
+                "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
+                "never set"
+            )
         struct = self.geoms.struct
         last = (memory.geom_pos, memory.geom_mat) if memory.started else (geom_pos, geom_mat)
         if self.geoms.count:
@@ -245,7 +292,12 @@ class CondensedSkin:
 
     def _at_rest(self, pos, mat, motion):
         memory = Memory.rest(self.geoms.count)
-        memory.started, memory.geom_pos, memory.geom_mat, memory.motion = True, np.array(pos), np.array(mat), motion
+        memory.started, memory.geom_pos, memory.geom_mat, memory.motion = (
+            True,
+            np.array(pos),
+            np.array(mat),
+            motion,
+        )
         n = self.geoms.ngroup
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0)
@@ -254,7 +306,12 @@ class CondensedSkin:
         """(nvert, 3) of a memory [m]."""
         key = _key(memory)
         if key not in self._fields:
-            self._keep(memory, self._recover(memory.coordinate, memory.force, memory.pressure, memory.softening, memory.swelling))
+            self._keep(
+                memory,
+                self._recover(
+                    memory.coordinate, memory.force, memory.pressure, memory.softening, memory.swelling
+                ),
+            )
         return self._fields[key]
 
     def _keep(self, memory, u):
@@ -274,17 +331,21 @@ class CondensedSkin:
         return out
 
     def _system(self, outer, inner):
-        """Coordinates and compliance (n, n) float32 over candidate outer nodes and inner nodes (numbers in self._inner), times E."""
+        """Coordinates and compliance (n, n) float32 over candidate outer nodes and inner nodes (numbers in
+        self._inner), times E."""
         key = (outer.tobytes(), inner.tobytes())
         if key not in self._systems:
             if len(self._systems) > 64:
                 self._systems.clear()
-            c = np.concatenate([(3 * self._number[outer][:, None] + np.arange(3)).ravel(), 3 * len(self._outer) + inner])
+            c = np.concatenate(
+                [(3 * self._number[outer][:, None] + np.arange(3)).ravel(), 3 * len(self._outer) + inner]
+            )
             self._systems[key] = c, self._restricted(c, outer, inner)
         return self._systems[key]
 
     def _restricted(self, c, outer, inner):
-        """Compliance over the coordinates c: entries that the last system had are copied, each is the same whenever it is computed."""
+        """Compliance over the coordinates c: entries that the last system had are copied, each is the same
+        whenever it is computed."""
         W = np.empty((len(c), len(c)), np.float32)
         known, old = np.zeros(len(c), bool), None
         if self._last_system is not None:
@@ -305,7 +366,8 @@ class CondensedSkin:
         return W
 
     def _entries(self, force, motion):
-        """Motion along contact coordinates (k,) per unit force at contact coordinates (n,), times E: (n, k) float32."""
+        """Motion along contact coordinates (k,) per unit force at contact coordinates (n,), times E: (n, k)
+        float32."""
         first = 3 * len(self._outer)
         outer, inner = motion < first, motion[motion >= first] - first
         node = self.compliance.position(self._inner[inner])

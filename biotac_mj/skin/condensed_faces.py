@@ -1,8 +1,8 @@
-"""The faces that a geom may touch in a step of the condensed skin: contact forces at their nodes, stiffness, wrenches.
+"""The faces that a geom may touch in a step of the condensed skin: contact forces at their nodes, stiffness,
+wrenches.
 
-Few faces are at stake, so what counts is the number of launches: each kernel is one thread that does all of them, which also fixes the
-order of sums.
-"""
+Few faces are at stake, so what counts is the number of launches: each kernel is one thread that does all of
+them, which also fixes the order of sums."""
 
 import numpy as np
 import warp as wp
@@ -41,7 +41,8 @@ def _touch(
     lumped_out: wp.array(dtype=mat33),
     touched_out: wp.array(dtype=int),
 ):
-    """Forces, lumped stiffness (rows summed) and whether it is touched of the count[1] nodes of the first count[0] faces."""
+    """Forces, lumped stiffness (rows summed) and whether it is touched of the count[1] nodes of the first
+    count[0] faces."""
     for i in range(count[1]):
         force_out[i] = vec3()
         lumped_out[i] = mat33()
@@ -165,7 +166,8 @@ def _loads(
     load_out: wp.array2d(dtype=real),
     share_out: wp.array2d(dtype=real),
 ):
-    """Force and moment of each group of geoms on the skin (ngroup, 6), and how much each group touches each node (ngroup, nnode)."""
+    """Force and moment of each group of geoms on the skin (ngroup, 6), and how much each group touches each
+    node (ngroup, nnode)."""
     for g in range(ngroup):
         for k in range(6):
             load_out[g, k] = real(0.0)
@@ -195,15 +197,23 @@ class CandidateFaces:
 
     Args:
       model: SkinModel. geoms: GeomSet of one world.
-      x, x_last, slot: present positions of all nodes, those at the start of the step, a node's number among the candidates' nodes (-1: it
-        is held), as Warp arrays.
+      x, x_last, slot: present positions of all nodes, those at the start of the step, a node's number among
+        the candidates' nodes (-1: it is held), as Warp arrays.
 
     Attributes:
-      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (nnode,). geom, trial: of the samples; all of the last `evaluate`.
+      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (nnode,). geom, trial: of the samples; all
+        of the last `evaluate`.
     """
 
     def __init__(self, model, geoms, x, x_last, slot):
-        self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = model, geoms, x, x_last, slot, slot.numpy()
+        self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = (
+            model,
+            geoms,
+            x,
+            x_last,
+            slot,
+            slot.numpy(),
+        )
         self._nsample = len(model.sample)
         self._limit = 0, 0
         self._allocate(64, 100)
@@ -238,21 +248,34 @@ class CandidateFaces:
         faces, springs = [count, face, self._slot_wp], [touching, block]
         self.evaluate = self._record(
             _touch,
-            [*faces, area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, self._x, self._last, anchor_geom, anchor],
+            [
+                *faces,
+                area,
+                m.sample,
+                m.contact_stiffness,
+                m.options.stick_ratio,
+                geoms.struct,
+                self._x,
+                self._last,
+                anchor_geom,
+                anchor,
+            ],
             [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
-        )  # fmt: skip
+        )
         self._multiply = self._record(_product, [*faces, *springs, p], [product])
         self._loads = self._record(
             _loads,
-            [*faces, m.sample, geoms.struct, geoms.ngroup, self._x, touching, geom, sample_force], [load, share],
-        )  # fmt: skip
+            [*faces, m.sample, geoms.struct, geoms.ngroup, self._x, touching, geom, sample_force],
+            [load, share],
+        )
         self._matrix_inputs, self._dense = [*faces, *springs, place], None
 
     def _record(self, kernel, inputs, outputs):
         return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
 
     def choose(self, number, face, area, nnode, contacts):
-        """Takes faces (n,), their nodes and areas (n, 3), (n,) and the sticking contacts of the last step (k, 5) that are theirs."""
+        """Takes faces (n,), their nodes and areas (n, 3), (n,) and the sticking contacts of the last step (k,
+        5) that are theirs."""
         n, nsample = len(number), self._nsample
         if n > self._limit[0] or nnode > self._limit[1]:
             self._allocate(max(self._limit[0], 2 * n), max(self._limit[1], 2 * nnode))
@@ -315,7 +338,8 @@ class CandidateFaces:
         return self._sample_force[:n, 0][self._geom[:n, 0] >= 0]
 
     def loads(self):
-        """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in the contact of each node."""
+        """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in
+        the contact of each node."""
         self._loads()
         share = self._share[:, : self.count[1]]
         if len(share) > 1:

@@ -1,9 +1,10 @@
-"""The linearised contact of a condensed step: (1 + D W) df = r, with W the compliance and D the stiffness of what touches.
+"""The linearised contact of a condensed step: (1 + D W) df = r, with W the compliance and D the stiffness of
+what touches.
 
-Few coordinates are solved directly. Many are solved by conjugate gradients in the inner product of W, in which 1 + D W is
-self-adjoint; contact is up to 1e4 times stiffer than the skin, so they are preconditioned by the same matrix with the springs lumped at
-the nodes, P = 1 + D' W, of which (1/D' + W) is one Cholesky factor in single precision: three or four iterations do.
-"""
+Few coordinates are solved directly. Many are solved by conjugate gradients in the inner product of W, in
+which 1 + D W is self-adjoint; contact is up to 1e4 times stiffer than the skin, so they are preconditioned by
+the same matrix with the springs lumped at the nodes, P = 1 + D' W, of which (1/D' + W) is one Cholesky factor
+in single precision: three or four iterations do."""
 
 import numpy as np
 from scipy.linalg.blas import sgemv
@@ -15,7 +16,8 @@ _ROUNDING = 3e-4  # of entries of W, which come in half precision
 _SLIP = 1e-6  # of a node's stiffness, along the direction in which it slips: Coulomb friction has none there
 _DIRECT = 120  # so many coordinates are solved directly
 _MAX_CG, _CG_TOLERANCE = 40, 0.1
-_ALIKE = 0.02  # of the stiffest node, by which the lumped springs of an old factor may differ where a tangent is asked for
+# of the stiffest node, by which the lumped springs of an old factor may differ where a tangent is asked for
+_ALIKE = 0.02
 _STALE = 8  # a factor with which conjugate gradients took more iterations is made anew
 
 
@@ -71,7 +73,8 @@ class Springs:
         return self._faces.lumped[self._node], self._inner[self._pressed] if self._core else _NONE
 
     def add_inverse_lumped(self, matrix):
-        """Adds the inverse of the stiffness, lumped at the nodes, to a matrix (k, k) over the coordinates `on`."""
+        """Adds the inverse of the stiffness, lumped at the nodes, to a matrix (k, k) over the coordinates
+        `on`."""
         block, inner = self.lumped()
         block += (_SLIP * np.einsum("kii->k", block))[:, None, None] * _EYE
         n = len(block)
@@ -98,7 +101,9 @@ class Compliance:
 
     def __matmul__(self, p):
         """W p of p (n,)."""
-        out = sgemv(self._scale, self._rest.T, p).astype(float)  # in single precision: half the memory, and rest is no better than that
+        out = sgemv(self._scale, self._rest.T, p).astype(
+            float
+        )  # in single precision: half the memory, and rest is no better than that
         if self._a is not None:
             out -= (self._share * float(self._a @ p)) * self._a
         return out
@@ -114,7 +119,8 @@ class Compliance:
 
 
 class Lumped:
-    """(1/D' + W) over the coordinates `on` of springs, D' their stiffness lumped at the nodes; one Cholesky factor.
+    """(1/D' + W) over the coordinates `on` of springs, D' their stiffness lumped at the nodes; one Cholesky
+    factor.
 
     Raises:
       np.linalg.LinAlgError: W is not positive definite.
@@ -133,14 +139,18 @@ class Lumped:
         """Whether the same is touched and the stiffness of the nodes is nearly that of these springs."""
         if len(self.on) != len(springs.on) or not (self.on == springs.on).all():
             return False
-        return all(np.abs(new - old).max(initial=0.0) < _ALIKE * old.max(initial=0.0) for new, old in zip(springs.lumped(), self._blocks))
+        return all(
+            np.abs(new - old).max(initial=0.0) < _ALIKE * old.max(initial=0.0)
+            for new, old in zip(springs.lumped(), self._blocks)
+        )
 
     def solve(self, b):
         """(1/D' + W) x = b for b (k,) or (k, m)."""
         return spotrs(self._factor, b, lower=1)[0]
 
     def stiffness(self, rigid):
-        """G' (1/D' + W)^-1 G for G (n, m): stiffness against motions of what touches; symmetric, positive semi-definite."""
+        """G' (1/D' + W)^-1 G for G (n, m): stiffness against motions of what touches; symmetric, positive
+        semi-definite."""
         G = rigid[self.on]
         return G.T @ self.solve(G)
 

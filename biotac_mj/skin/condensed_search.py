@@ -1,8 +1,8 @@
 """Which faces of the condensed skin a geom may touch, and whether one is inside the core.
 
-Only a region around the geoms is searched, wider than what they and the skin can have moved since it was chosen. A few regions are kept:
-BioTacs of one model share a skin. Which one is used changes nothing but the time.
-"""
+Only a region around the geoms is searched, wider than what they and the skin can have moved since it was
+chosen. A few regions are kept: BioTacs of one model share a skin. Which one is used changes nothing but the
+time."""
 
 import dataclasses
 
@@ -34,7 +34,8 @@ def _near(
     # Out:
     near_out: wp.array(dtype=int),
 ):
-    """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach; count[1] of them."""
+    """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach;
+    count[1] of them."""
     found = int(0)
     for i in range(count[0]):
         f = number[i]
@@ -43,19 +44,25 @@ def _near(
         x1 = x[t[1], 0]
         x2 = x[t[2], 0]
         center = (x0 + x1 + x2) / real(3.0)
-        radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+        radius = wp.sqrt(
+            wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+        )
         near = int(0)
         for g in range(geoms.count):
             if near == 0:
                 R = wp.transpose(geoms.mat[g, 0])
                 y = R * (center - geoms.pos[g, 0])
-                bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                bound = distance_bound(
+                    geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
+                )
                 if bound < radius + reach[0]:
                     for s in range(sample.shape[0]):
                         if near == 0:
                             b = sample[s]
                             y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
-                            bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                            bound = distance_bound(
+                                geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
+                            )
                             if bound < reach[0]:
                                 near = 1
         if near == 1:
@@ -78,13 +85,17 @@ def _core_clearance(
     R = wp.transpose(geoms.mat[g, 0])
     for i in range(core_vert.shape[0]):
         y = R * (core_vert[i] - geoms.pos[g, 0])
-        least = wp.min(least, distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y))
+        least = wp.min(
+            least,
+            distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y),
+        )
     clearance_out[g] = least
 
 
 @dataclasses.dataclass(frozen=True)
 class _Region:
-    """Faces (n,) of the resting skin nearer than `width` to the geoms; the geoms' clearance from the core [m]."""
+    """Faces (n,) of the resting skin nearer than `width` to the geoms; the geoms' clearance from the core
+    [m]."""
 
     faces: np.ndarray
     width: float
@@ -112,19 +123,30 @@ class NearSearch:
         count, self._count = zeros(2, int)
         reach, self._reach = zeros(1, real)
         clearance, self._clearance = zeros(max(geoms.count, 1), real)
-        self._detect = self._record(_near, 1, [count, number, model.outer.face, model.sample, geoms.struct, x_wp, reach], [near])
+        self._detect = self._record(
+            _near, 1, [count, number, model.outer.face, model.sample, geoms.struct, x_wp, reach], [near]
+        )
         if model.has_core and geoms.count:
-            self._clearances = self._record(_core_clearance, geoms.count, [model.core_vert, geoms.struct], [clearance])
+            self._clearances = self._record(
+                _core_clearance, geoms.count, [model.core_vert, geoms.struct], [clearance]
+            )
         g = geoms.count
         self._regions, self._loaded, self._next = [], None, 0
-        self._pos, self._mat, self._lever = np.zeros((_REGIONS, g, 3)), np.zeros((_REGIONS, g, 9)), np.zeros((_REGIONS, g))
+        self._pos, self._mat, self._lever = (
+            np.zeros((_REGIONS, g, 3)),
+            np.zeros((_REGIONS, g, 9)),
+            np.zeros((_REGIONS, g)),
+        )
 
     @staticmethod
     def _record(kernel, dim, inputs, outputs):
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+        return wp.launch(
+            kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
+        ).launch
 
     def faces(self, reach, moved, pos, mat) -> np.ndarray:
-        """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest [m]."""
+        """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest
+        [m]."""
         if not self._geoms.count:
             return np.zeros(0, int)
         region = self._region(moved + reach, pos, mat)
@@ -157,7 +179,8 @@ class NearSearch:
         if -self._clearance.min() > limit:
             g = int(self._clearance.argmin())
             raise ValueError(
-                f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid core: "
+                f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid "
+                "core: "
                 "no skin fits between them; move it out, press less deep or take smaller steps"
             )
 

@@ -23,10 +23,12 @@ class Memory:
       started: whether a step was made.
       coordinate: (n,) contact coordinates with a force, ascending.
       force, change: (n,) forces and by how much they changed in the last step [N].
-      pressure: of the liquid above that at rest [Pa]. bulge: the nonlinear part q of the cavity's volume [m^3], growth: by how much it
-        grew in the last step.
-      softening, swelling: s and c. after: (2,) what they are where the step left the skin, drift: (2,) by how much that grew in it.
-      geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how far they moved in it [m].
+      pressure: of the liquid above that at rest [Pa]. bulge: the nonlinear part q of the cavity's volume
+        [m^3], growth: by how much it grew in the last step.
+      softening, swelling: s and c. after: (2,) what they are where the step left the skin, drift: (2,) by how
+        much that grew in it.
+      geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how
+        far they moved in it [m].
       contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
     """
 
@@ -50,13 +52,29 @@ class Memory:
     def rest(cls, ngeom):
         none = np.zeros(0)
         pos, mat = np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3))
-        return cls(False, none.astype(int), none, none, 0.0, 0.0, 0.0, 1.0, 1.0, np.ones(2), np.zeros(2), pos, mat, pos, np.zeros((0, 5)))
+        return cls(
+            False,
+            none.astype(int),
+            none,
+            none,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+            1.0,
+            np.ones(2),
+            np.zeros(2),
+            pos,
+            mat,
+            pos,
+            np.zeros((0, 5)),
+        )
 
 
 @dataclasses.dataclass
 class Outcome:
-    """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6, 6), nodes
-    (nvert, 3), volume of the liquid, whether the error of such a step has been measured."""
+    """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6,
+    6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured."""
 
     memory: Memory
     wrench: np.ndarray
@@ -83,7 +101,10 @@ class Step:
         self.meeting = None
         # how much of the geoms' last motion this one repeats: so much of the last changes is expected again
         last = memory.motion.ravel()
-        self.motion, self.repeat = motion, min(max(float(motion.ravel() @ last) / max(float(last @ last), 1e-20), 0.0), 2.0)
+        self.motion, self.repeat = (
+            motion,
+            min(max(float(motion.ravel() @ last) / max(float(last @ last), 1e-20), 0.0), 2.0),
+        )
         self.bulge, self.pressure = memory.bulge + self.repeat * memory.growth, memory.pressure
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
@@ -127,7 +148,8 @@ class Step:
         self.a = s._give_at[self.c] if s.model.has_liquid else None
 
     def _scaled(self):
-        """Softened compliance with the liquid, and the displacement that q alone makes: u = W f + shift; p = -share (a.f + q)."""
+        """Softened compliance with the liquid, and the displacement that q alone makes: u = W f + shift; p =
+        -share (a.f + q)."""
         s = self.skin
         scale = self.softening / s.model.material.youngs_modulus
         if self.a is None:
@@ -135,7 +157,9 @@ class Step:
         swell = self.swelling / s.model.material.youngs_modulus
         self.share = 1 / (s.model.rest.natural_volume / s.model.options.bulk_modulus + swell * s._liquid_give)
         self.along = scale * self.a
-        return Compliance(self.rest_W, scale, self.share * swell / scale, self.along), -self.share * self.bulge * swell * self.a
+        return Compliance(
+            self.rest_W, scale, self.share * swell / scale, self.along
+        ), -self.share * self.bulge * swell * self.a
 
     def _evaluate(self, u):
         """Contact forces (n,) at displacements u (n,) of the contact coordinates."""
@@ -230,7 +254,8 @@ class Step:
         return f
 
     def _search(self, f, u, df, du, slope):
-        """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi where the step overshoots)."""
+        """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi
+        where the step overshoots)."""
         low, high, at_low, at_high = 0.0, None, slope, None
         alpha = 1.0
         for _ in range(10):
@@ -249,7 +274,7 @@ class Step:
             alpha = min(max(alpha, low + 0.05 * (high - low)), high - 0.05 * (high - low))
         return new_f, new_u, g
 
-    # --- results -----------------------------------------------------------------------------------------------------------------
+    # --- results  ---
 
     def outcome(self) -> Outcome:
         s = self.skin
@@ -259,7 +284,8 @@ class Step:
             contacts = s.faces.contacts()
         if len(contacts):
             load, share = s.faces.loads()
-            # what Newton's last step changed, to first order; the samples' forces are those of the stiff law after it
+            # what Newton's last step changed, to first order; the samples' forces are those of the stiff law
+            # after it
             x, n = s._x[self.outer, 0], len(self.outer)
             rest = self.last[: 3 * n].reshape(n, 3) - s.faces.force
             wrench = -load - share @ np.concatenate([rest, np.cross(x, rest)], axis=1)
@@ -284,7 +310,17 @@ class Step:
         memory = Memory(True, *now)
         volume = float(s._share.sum()) - s._cavity + s.model.rest.volume if s.model.inner is not None else 0.0
         measured = s.correction.measured(s.model.material.poissons_ratio, self.squeezed, self.spread)
-        return Outcome(memory, wrench, tangent, s.rest + self.u, volume, measured, self.converged, self.iterations, self.error)
+        return Outcome(
+            memory,
+            wrench,
+            tangent,
+            s.rest + self.u,
+            volume,
+            measured,
+            self.converged,
+            self.iterations,
+            self.error,
+        )
 
     def _change(self):
         """Of the forces since the step began."""
@@ -295,7 +331,8 @@ class Step:
         return self.force - np.where(memory.coordinate[place] == self.coordinate, memory.force[place], 0)
 
     def _tangents(self, out, share, x):
-        """Stiffness (ngroup, 6, 6) against rigid motions of each group of geoms about the origin, springs lumped at the nodes."""
+        """Stiffness (ngroup, 6, 6) against rigid motions of each group of geoms about the origin, springs
+        lumped at the nodes."""
         springs = self._springs()
         if not len(springs.outer):  # only held nodes are touched
             return

@@ -1,9 +1,10 @@
-"""Contact of a skin surface with geoms: linear pressure-overclosure sampled inside the faces, Coulomb friction with stick and slip.
+"""Contact of a skin surface with geoms: linear pressure-overclosure sampled inside the faces, Coulomb
+friction with stick and slip.
 
-Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too (as
-surface-to-surface contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an elastic stick of
-k * stick_ratio about an anchor that stays put on the geom, returned radially to mu times the normal force where it slips.
-"""
+Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too
+(as surface-to-surface contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an
+elastic stick of k * stick_ratio about an anchor that stays put on the geom, returned radially to mu times the
+normal force where it slips."""
 
 import numpy as np
 import warp as wp
@@ -29,7 +30,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Geoms:
-    """Touching geoms in the BioTac frame, at the end and at the start of the step; arrays over worlds are [geom, world]."""
+    """Touching geoms in the BioTac frame, at the end and at the start of the step; arrays over worlds are
+    [geom, world]."""
 
     count: int
     kind: wp.array(dtype=int)
@@ -46,7 +48,8 @@ class Geoms:
 
 
 def face_samples(order: int) -> np.ndarray:
-    """Barycentric coordinates (order^2, 3) of the centroids of the order^2 equal triangles that subdivide a face."""
+    """Barycentric coordinates (order^2, 3) of the centroids of the order^2 equal triangles that subdivide a
+    face."""
     points = []
     for i in range(order):
         for j in range(order - i):
@@ -59,7 +62,8 @@ def face_samples(order: int) -> np.ndarray:
 
 @wp.func
 def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
-    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`: force, its tangent, anchor."""
+    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`:
+    force, its tangent, anchor."""
     slip = local - stick
     slip = slip - wp.dot(slip, normal) * normal
     length = wp.length(slip)
@@ -91,7 +95,8 @@ def touch_sample(
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
 ):
-    """Contact of sample i at b of a face: geom (-1: none), least distance [m], force [N], its tangent [N/m], anchor."""
+    """Contact of sample i at b of a face: geom (-1: none), least distance [m], force [N], its tangent [N/m],
+    anchor."""
     p = b[0] * x0 + b[1] * x1 + b[2] * x2
     touched = int(-1)
     clearance = real(1.0)
@@ -120,7 +125,8 @@ def touch_sample(
             if anchor_geom[i, w] == touched:
                 stick = anchor[i, w]
             else:
-                # touched within this step: slip counts from where the sample was on the geom when the step began
+                # touched within this step: slip counts from where the sample was on the geom when the step
+                # began
                 last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
                 stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
             ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
@@ -134,7 +140,8 @@ def touch_sample(
 
 @wp.struct
 class FaceSum:
-    """Force on the corners of a face, and the six blocks of its tangent between them, of the samples so far."""
+    """Force on the corners of a face, and the six blocks of its tangent between them, of the samples so
+    far."""
 
     f0: vec3
     f1: vec3
@@ -215,7 +222,9 @@ def touch_face(
     x1 = x[t[1], w]
     x2 = x[t[2], w]
     center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
     near = int(0)
     clearance = real(1.0)
     # most faces are far from every geom: one distance each tells
@@ -237,7 +246,9 @@ def touch_face(
         geom_out[i, w] = -1
         if near == 1:
             b = sample[s]
-            touched, gap, force, K, stick = touch_sample(i, w, b, t, x0, x1, x2, k, kt, geoms, x_last, anchor_geom, anchor)
+            touched, gap, force, K, stick = touch_sample(
+                i, w, b, t, x0, x1, x2, k, kt, geoms, x_last, anchor_geom, anchor
+            )
             clearance = wp.min(clearance, gap)
             if touched >= 0:
                 touching = 1
@@ -301,7 +312,8 @@ def core_contact_force(
     anchor_out: wp.array2d(dtype=vec3),
     force_out: wp.array2d(dtype=vec3),
 ):
-    """The same against geoms that never move: a face that has moved less than its clearance, since that was last seen, cannot touch."""
+    """The same against geoms that never move: a face that has moved less than its clearance, since that was
+    last seen, cannot touch."""
     f, w = wp.tid()
     t = face[f]
     moved = real(0.0)
@@ -314,7 +326,9 @@ def core_contact_force(
         anchor, corner_out, block_out, touching_out, geom_out, anchor_out, force_out,
     )  # fmt: skip
     known = wp.isfinite(wp.length_sq(x[t[0], w]) + wp.length_sq(x[t[1], w]) + wp.length_sq(x[t[2], w]))
-    clearance[f, w] = wp.where(known, free, real(-1.0))  # nothing is known of a face without a place: looked at again, wherever it goes
+    clearance[f, w] = wp.where(
+        known, free, real(-1.0)
+    )  # nothing is known of a face without a place: looked at again, wherever it goes
     for c in range(3):
         seen[3 * f + c, w] = x[t[c], w]
 

@@ -1,8 +1,8 @@
-"""Contact of the inner surface with the rigid core for the condensed tier: without friction, along directions fixed at rest.
+"""Contact of the inner surface with the rigid core for the condensed tier: without friction, along directions
+fixed at rest.
 
-The law is that of the full skin, sampled inside the faces; what differs is that a node moves the samples along its own direction away
-from the core, and that the distance is trilinear in the core's grid.
-"""
+The law is that of the full skin, sampled inside the faces; what differs is that a node moves the samples
+along its own direction away from the core, and that the distance is trilinear in the core's grid."""
 
 import dataclasses
 
@@ -17,7 +17,10 @@ __all__ = ["CoreContact", "Meeting"]
 
 wp.set_module_options({"enable_backward": False})
 
-CONCAVE, SLACK = wp.constant(100.0), wp.constant(1e-4)  # hollows of the core are wider than 5 mm [1/m]; gradients are averages [m]
+CONCAVE, SLACK = (
+    wp.constant(100.0),
+    wp.constant(1e-4),
+)  # hollows of the core are wider than 5 mm [1/m]; gradients are averages [m]
 _PROBE = 2e-4  # half a step of the differences that give the directions, half a cell of the core's grid [m]
 
 
@@ -46,9 +49,13 @@ def _measure_face(
 
 @wp.func
 def _may_be_near(t: wp.vec3i, core: Geoms, x: wp.array2d(dtype=vec3), reach: real):
-    """Whether a face can be nearer to the core than the reach, from one distance (which may change a little faster than its place does)."""
+    """Whether a face can be nearer to the core than the reach, from one distance (which may change a little
+    faster than its place does)."""
     center = (x[t[0], 0] + x[t[1], 0] + x[t[2], 0]) / real(3.0)
-    radius = wp.max(wp.length_sq(x[t[0], 0] - center), wp.max(wp.length_sq(x[t[1], 0] - center), wp.length_sq(x[t[2], 0] - center)))
+    radius = wp.max(
+        wp.length_sq(x[t[0], 0] - center),
+        wp.max(wp.length_sq(x[t[1], 0] - center), wp.length_sq(x[t[2], 0] - center)),
+    )
     far = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], center)
     return far < reach + real(1.2) * wp.sqrt(radius)
 
@@ -91,9 +98,9 @@ def _meet(
 ):
     """Marks with 2 the faces that are nearer to the core than a share of their displacement.
 
-    What has moved by m and gets nearer by a share of m cannot touch if it began further away than both; nor if it went along the core:
-    the distance to a convex body is convex, so it is at least what its gradient at rest says, and little less where the core is hollow.
-    """
+    What has moved by m and gets nearer by a share of m cannot touch if it began further away than both; nor
+    if it went along the core: the distance to a convex body is convex, so it is at least what its gradient at
+    rest says, and little less where the core is hollow."""
     most = real(1.0) + share[0]
     for i in range(node.shape[0]):
         n = node[i]
@@ -183,12 +190,21 @@ class CoreContact:
         # the grid rounds edges of the core by micrometres: what starts outside stays outside
         self._offset = np.minimum(self._gap, 0)
         self._corner = self._number[self._face]
-        node_gap = np.full(len(self.node) + 1, np.inf)  # of the nearest face of each node; held corners, -1, are the last
+        node_gap = np.full(
+            len(self.node) + 1, np.inf
+        )  # of the nearest face of each node; held corners, -1, are the last
         np.minimum.at(node_gap, self._corner, rest_gap[:, None])
         order = np.argsort(self._corner.ravel(), kind="stable")
         order = order[self._corner.ravel()[order] >= 0]
         start = np.searchsorted(self._corner.ravel()[order], np.arange(len(self.node) + 1))
-        constants = [(self.node, int), (node_gap[:-1], real), (self.direction, vec3), (start, int), (order // 3, int), (rest_gap, real)]
+        constants = [
+            (self.node, int),
+            (node_gap[:-1], real),
+            (self.direction, vec3),
+            (start, int),
+            (order // 3, int),
+            (rest_gap, real),
+        ]
         constants = [wp.array(array, dtype=dtype, device="cpu") for array, dtype in constants]
         still = wp.array(rest[:, None], dtype=vec3, device="cpu")
         share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
@@ -205,7 +221,8 @@ class CoreContact:
         return self._gap[face]
 
     def meet(self, u, share, last: Meeting | None) -> Meeting:
-        """Faces with a sample nearer to the core than a share of their displacement, and those of the last meeting.
+        """Faces with a sample nearer to the core than a share of their displacement, and those of the last
+        meeting.
 
         Args:
           u: (nvert, 3) displacements at the present positions, which the Warp array holds [m].
@@ -230,7 +247,9 @@ class CoreContact:
         weight = np.zeros((len(face), nsample, len(node) + 1))
         column = place[corner]
         for c in range(3):
-            weight[np.arange(len(face))[:, None], np.arange(nsample), column[:, c : c + 1]] = self._sample[:, c]
+            weight[np.arange(len(face))[:, None], np.arange(nsample), column[:, c : c + 1]] = self._sample[
+                :, c
+            ]
         weight = weight[:, :, :-1].reshape(len(face) * nsample, len(node))
         at = np.einsum("ij,ij->i", u[self.node[node]], self.direction[node])
         return Meeting(face, node, gap.ravel(), at, weight, np.repeat(self._stiffness[face], nsample))

@@ -65,7 +65,11 @@ class _Scalar:
     def __get__(self, data, owner=None):
         if data is None:
             return self
-        return data.__dict__[self._field] if data.worlds is None else self._read(getattr(data.worlds, self._field).numpy())
+        return (
+            data.__dict__[self._field]
+            if data.worlds is None
+            else self._read(getattr(data.worlds, self._field).numpy())
+        )
 
     def __set__(self, data, value):
         if data.worlds is None:
@@ -81,46 +85,57 @@ class SkinData:
       model: the SkinModel.
       nworld: number of worlds.
       material: None, or one Material of the model's law for each world.
-      resident: whether all state lives on the device and `step` never looks back at the host (see `device_step`): on CUDA, always.
-        Attributes are then copied when they are read, and a world's contact beyond `contact_capacity` touching nodes slows its solves.
+      resident: whether all state lives on the device and `step` never looks back at the host (see
+        `device_step`): on CUDA, always. Attributes are then copied when they are read, and a world's contact
+        beyond `contact_capacity` touching nodes slows its solves.
 
     Attributes (all arrays lead with nworld, on the host):
       vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
       contact_force: (nworld, nvert, 3) nodal forces of the touching geoms on the skin [N].
       core_force: (nworld, nvert, 3) nodal forces of the core on the inner surface [N].
-      liquid_force: (nworld, nvert, 3) nodal forces of the liquid on the inner surface [N]; on the core it pushes the opposite way.
+      liquid_force: (nworld, nvert, 3) nodal forces of the liquid on the inner surface [N]; on the core it
+        pushes the opposite way.
       reaction: (nworld, 3) force of core, nail and clamp on the fixed nodes [N].
-      wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin [N, N m].
+      wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin
+        [N, N m].
       pressure: (nworld,) of the liquid above its rest value, which is `model.rest.pressure` [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
-      memory: StressMemory of skin with `prony`, `mullins`, `hysteresis` or `stiffening`, or None; `reset` forgets.
+      memory: StressMemory of skin with `prony`, `mullins`, `hysteresis` or `stiffening`, or None; `reset`
+        forgets.
     """
 
     converged = _Scalar("reason", lambda reason: reason == 0)
     nonconverged = _Scalar("nonconverged", lambda count: count.astype(int))
     iterations = _Scalar("iterations", lambda count: count.astype(int))
     error = _Scalar("error")
-    contact_capacity = None  # touching nodes in a world's small system; None: 63, all that a block of threads holds, but 127 on fine skins
+    # touching nodes in a world's small system; None: 63, all that a block of threads holds, but 127 on fine
+    # skins
+    contact_capacity = None
 
     def __init__(self, model: SkinModel, nworld: int = 1, material=None, resident: bool | None = None):
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
         if any(m.beyond_law != model.material.beyond_law for m in materials):
-            raise ValueError(f"{', '.join(model.material.beyond_law)} are the model's: give the worlds' materials the same")
+            raise ValueError(
+                f"{', '.join(model.material.beyond_law)} are the model's: give the worlds' materials the same"
+            )
         self.nworld, self.model = nworld, model
         self.resident = model.device.is_cuda if resident is None else resident
         if self.resident and model.extensions:
             raise ValueError(
-                f"skin with {' and '.join(model.extensions)} is solved on the CPU's full tier only: choose device='cpu' and "
+                f"skin with {' and '.join(model.extensions)} is solved on the CPU's full tier only: choose "
+                "device='cpu' and "
                 "resident=False, or leave this out"
             )
         if model.device.is_cuda and not self.resident:
-            raise ValueError("on CUDA the state is always resident: leave resident out, or make the model on the CPU")
+            raise ValueError(
+                "on CUDA the state is always resident: leave resident out, or make the model on the CPU"
+            )
         second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
         nsample = len(model.sample)
         with wp.ScopedDevice(model.device):
@@ -133,7 +148,9 @@ class SkinData:
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
             self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
             self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
-            self.core = ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
+            self.core = (
+                ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
+            )
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
         self.laws = world_laws(model, nworld, self.resident, self.outer)
         self.worlds, self.device_memory, self.device_steps = None, None, {}
@@ -179,11 +196,14 @@ class SkinData:
             self.worlds.mu, self.worlds.lam = self.mu, self.lam
             self.dt = wp.zeros(n, dtype=real)
             self.frame_pos, self.frame_pos_last = (wp.zeros(n, dtype=vec3) for _ in range(2))
-            self.frame_mat, self.frame_mat_last = (wp.array(np.tile(np.eye(3), (n, 1, 1)), dtype=mat33) for _ in range(2))
+            self.frame_mat, self.frame_mat_last = (
+                wp.array(np.tile(np.eye(3), (n, 1, 1)), dtype=mat33) for _ in range(2)
+            )
         self._of_geoms, self._of_groups, self._counts = {}, {}, (0, 0)
 
     def geom_memory(self, count: int, ngroup: int):
-        """What a resident state remembers of geoms: their last motion [geom, world], which of them touch, wrenches on groups."""
+        """What a resident state remembers of geoms: their last motion [geom, world], which of them touch,
+        wrenches on groups."""
         self._counts = (count, ngroup)
         with wp.ScopedDevice(self.model.device):
             if count not in self._of_geoms:
@@ -233,8 +253,13 @@ class SkinData:
             return
         force = np.asarray(force, float)
         if force.shape != (self.nworld, self.model.nvert, 3) or not np.isfinite(force).all():
-            raise ValueError(f"external forces have shape {force.shape}: pass finite numbers of shape {(self.nworld, self.model.nvert, 3)}")
-        self.external_device = wp.array(np.ascontiguousarray(np.swapaxes(force, 0, 1)), dtype=vec3, ndim=2, device=self.x.device)
+            raise ValueError(
+                f"external forces have shape {force.shape}: pass finite numbers of shape "
+                f"{(self.nworld, self.model.nvert, 3)}"
+            )
+        self.external_device = wp.array(
+            np.ascontiguousarray(np.swapaxes(force, 0, 1)), dtype=vec3, ndim=2, device=self.x.device
+        )
         self.external = view(self.external_device)
 
     def set_liquid(self, bulk_modulus=None, fill_volume=None):
@@ -242,7 +267,8 @@ class SkinData:
 
         Args:
           bulk_modulus: (nworld,) or a number [Pa]; 0: no liquid; math.inf keeps its volume.
-          fill_volume: (nworld,) or a number: liquid beyond what the model's options fill in [m^3]. The skin swells in the next step.
+          fill_volume: (nworld,) or a number: liquid beyond what the model's options fill in [m^3]. The skin
+            swells in the next step.
 
         Raises:
           ValueError: a model without liquid, NaN, a negative bulk modulus, or less than no liquid.
@@ -250,10 +276,21 @@ class SkinData:
         if not self.model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
         liquid, rest = self.liquid, self.model.rest
-        bulk = liquid.bulk_modulus if bulk_modulus is None else np.array(np.broadcast_to(np.asarray(bulk_modulus, float), self.nworld))
-        extra = liquid.extra if fill_volume is None else np.array(np.broadcast_to(np.asarray(fill_volume, float), self.nworld))
+        bulk = (
+            liquid.bulk_modulus
+            if bulk_modulus is None
+            else np.array(np.broadcast_to(np.asarray(bulk_modulus, float), self.nworld))
+        )
+        extra = (
+            liquid.extra
+            if fill_volume is None
+            else np.array(np.broadcast_to(np.asarray(fill_volume, float), self.nworld))
+        )
         if not (bulk >= 0).all() or not (np.isfinite(extra) & (rest.natural_volume + extra > 0)).all():
-            raise ValueError("bulk moduli must be numbers >= 0 (or math.inf), fill volumes finite and not less than minus what there is")
+            raise ValueError(
+                "bulk moduli must be numbers >= 0 (or math.inf), fill volumes finite and not less than "
+                "minus what there is"
+            )
         liquid.bulk_modulus, liquid.extra = bulk, extra
         liquid.fill(rest.natural_volume + extra)
         liquid.last_pressure = np.where(bulk == 0, 0.0, liquid.last_pressure)
@@ -282,7 +319,11 @@ class SkinData:
 
     @property
     def pressure(self):
-        return self.liquid.gauge_pressure - self.model.rest.pressure if self.model.has_liquid else np.zeros(self.nworld)
+        return (
+            self.liquid.gauge_pressure - self.model.rest.pressure
+            if self.model.has_liquid
+            else np.zeros(self.nworld)
+        )
 
     @property
     def volume(self):
@@ -316,7 +357,8 @@ class SkinData:
         Args:
           x, increment: (nvert, 3) positions and last increment [m].
           motion: (ngeom, 3) of the geoms in the last step [m].
-          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts` gives them.
+          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts`
+            gives them.
           pressure: of the liquid above the surroundings [Pa], `liquid.last_pressure`.
         """
         for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
@@ -334,10 +376,13 @@ class SkinData:
             touched = np.zeros((self._counts[0], 1), np.int32)
             touched[contacts[:, 1].astype(int)] = 1
             self.geom_memory(*self._counts)[1].assign(touched)
-            self.outer.kept.assign((geom.reshape(len(self.outer.kept), -1).max(1) >= 0).astype(np.int32)[:, None])
+            self.outer.kept.assign(
+                (geom.reshape(len(self.outer.kept), -1).max(1) >= 0).astype(np.int32)[:, None]
+            )
 
     def load_motion(self, velocity, core_pos, core_mat):
-        """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the core's pose."""
+        """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the
+        core's pose."""
         wp.copy(self.velocity, wp.array(velocity[:, None], dtype=vec3, ndim=2, device=self.x.device))
         self.core_pos, self.core_mat = np.array(core_pos)[None], np.array(core_mat)[None]
         if self.resident:
@@ -356,7 +401,8 @@ class SkinData:
         return np.array([_host((geom == g).any(0)) for g in range(ngeom)], bool).reshape(ngeom, self.nworld).T
 
     def tangent(self, geoms) -> np.ndarray:
-        """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac frame's origin, after a step."""
+        """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
+        frame's origin, after a step."""
         face = self.outer.surface.face_np
         geom = self.outer.trial_geom.numpy().reshape(len(face), -1, self.nworld)
         x = self.x.numpy()
@@ -381,7 +427,9 @@ class SkinData:
         made = Preconditioner(m, self.stiffness_scale)
         states = [self.outer] + ([self.core] if self.core else [])
         kappa = self.liquid.stiffness if m.has_liquid else np.zeros(self.nworld)
-        made.update(states, view(self.force) * mask, view(self.gradient) * mask if m.has_liquid else None, kappa)
+        made.update(
+            states, view(self.force) * mask, view(self.gradient) * mask if m.has_liquid else None, kappa
+        )
         return made
 
     def stress(self):
@@ -397,4 +445,6 @@ def _host(array):
 
 
 def _leading(array: wp.array) -> np.ndarray:
-    return np.swapaxes(array.numpy(), 0, 1).copy()  # never a view: the next step would change what the caller keeps
+    return np.swapaxes(
+        array.numpy(), 0, 1
+    ).copy()  # never a view: the next step would change what the caller keeps

@@ -1,4 +1,5 @@
-"""Contact of all worlds on the device: far faces are left out, near ones evaluated by the same law as on the host."""
+"""Contact of all worlds on the device: far faces are left out, near ones evaluated by the same law as on the
+host."""
 
 import warp as wp
 
@@ -53,8 +54,9 @@ def cull_faces(
     near_out: wp.array2d(dtype=int),
     geom_out: wp.array2d(dtype=int),
 ):
-    """Which faces may touch: by one distance of their centre. Where the geoms are still, a face that has moved less than its clearance,
-    since that was last seen, needs not even that; what was said of it holds."""
+    """Which faces may touch: by one distance of their centre. Where the geoms are still, a face that has
+    moved less than its clearance, since that was last seen, needs not even that; what was said of it
+    holds."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -70,7 +72,9 @@ def cull_faces(
             near_out[f, w] = 0
             return
     center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
     near = int(0)
     free = real(1.0)
     for g in range(geoms.count):
@@ -168,7 +172,19 @@ def sample_contact(
     t = face[f]
     k = stiffness * area[f] / real(sample.shape[0])
     touched, gap, force, K, stick = touch_sample(
-        i, w, sample[i % sample.shape[0]], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, geoms, x_last, anchor_geom, anchor
+        i,
+        w,
+        sample[i % sample.shape[0]],
+        t,
+        x[t[0], w],
+        x[t[1], w],
+        x[t[2], w],
+        k,
+        k * stick_ratio,
+        geoms,
+        x_last,
+        anchor_geom,
+        anchor,
     )
     geom_out[i, w] = touched
     gap_out[i, w] = gap
@@ -249,7 +265,8 @@ def partial_wrench(
     part_out: wp.array3d(dtype=vec3),
     touched_by: wp.array2d(dtype=int),
 ):
-    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world]; marks geoms that touch."""
+    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world]; marks
+    geoms that touch."""
     c, w = wp.tid()
     for k in range(part_out.shape[0]):
         part_out[k, c, w] = vec3()
@@ -293,7 +310,8 @@ def commit_contacts(
     geom_out: wp.array2d(dtype=int),
     anchor_out: wp.array2d(dtype=vec3),
 ):
-    """Anchors of the faces that touch, and that touched when the last step ended, become those that the next step starts from."""
+    """Anchors of the faces that touch, and that touched when the last step ended, become those that the next
+    step starts from."""
     f, w = wp.tid()
     if touching[f, w] == 0 and kept[f, w] == 0:
         return
@@ -317,7 +335,8 @@ def crushed_on_core(
     # Out:
     failed_out: wp.array(dtype=int),
 ):
-    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through, see `solver._possible`."""
+    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through,
+    see `solver._possible`."""
     f, w = wp.tid()
     if asked[w] == 0:
         return
@@ -343,5 +362,8 @@ def contact_inside_core(
     R = geoms.mat[g, w]
     for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0])):
         y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
-        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < -limit:
+        if (
+            distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            < -limit
+        ):
             deep_out[w] = 1

@@ -1,7 +1,9 @@
-"""Elements as the device step evaluates them: positions in double precision, forces of corners and tangents in single.
+"""Elements as the device step evaluates them: positions in double precision, forces of corners and tangents
+in single.
 
-A force keeps the strain's digits, not the position's: deformation gradients come from double-precision edges, and what is rounded to
-single precision is the force of one corner, to 6e-8 of itself. Tangents only steer Newton's method, so they are single throughout.
+A force keeps the strain's digits, not the position's: deformation gradients come from double-precision edges,
+and what is rounded to single precision is the force of one corner, to 6e-8 of itself. Tangents only steer
+Newton's method, so they are single throughout.
 Nothing is kept between `force` and `product`: reading back costs more than computing the rotation again.
 """
 
@@ -16,12 +18,15 @@ __all__ = ["Linear", "narrow", "polar_mixed", "polar_single", "widen"]
 
 wp.set_module_options({"enable_backward": False})
 
-_INVERTED = 0.02  # det F below which a step of the line search is refused where the law cannot recover from inversion
+_INVERTED = (
+    0.02  # det F below which a step of the line search is refused where the law cannot recover from inversion
+)
 
 
 @wp.func
 def turn_towards(F: wp.mat33):
-    """The rotation with the largest trace of R^T F, turned there step by step (Mueller et al. 2016): F may be inverted or flat.
+    """The rotation with the largest trace of R^T F, turned there step by step (Mueller et al. 2016): F may be
+    inverted or flat.
 
     As `material.polar_rotation`'s SVD, in fewer registers: the rare case must not slow the usual one.
     """
@@ -78,7 +83,8 @@ def narrow(A: mat33):
 
 @wp.func
 def polar_mixed(F: mat33):
-    """The same to double precision: the single-precision rotation, made orthogonal, then turned by what is left (error squared)."""
+    """The same to double precision: the single-precision rotation, made orthogonal, then turned by what is
+    left (error squared)."""
     R = widen(polar_single(narrow(F)))
     eye = wp.identity(n=3, dtype=real)
     R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
@@ -86,7 +92,9 @@ def polar_mixed(F: mat33):
     # what is left is 1e-7: single precision gives the rest of its digits
     s = narrow(S)
     a = axial(S)
-    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * wp.vec3(float(a[0]), float(a[1]), float(a[2]))
+    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * wp.vec3(
+        float(a[0]), float(a[1]), float(a[2])
+    )
     return R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
 
 
@@ -242,7 +250,8 @@ def flag_turned_inside_out(
 
 
 class Linear:
-    """Linear tetrahedra in an order in which neighbours in the list are neighbours in space, so that caches serve nodes to all of them."""
+    """Linear tetrahedra in an order in which neighbours in the list are neighbours in space, so that caches
+    serve nodes to all of them."""
 
     def __init__(self, elements: LinearTetrahedra, nworld):
         elem, inverse, volume = elements._elem, elements._inverse_edges, elements._volume
@@ -261,11 +270,21 @@ class Linear:
 
     def force(self, mu, lam, x, on, inverted):
         kernel = corotational_force if self.law == 0 else linear_force
-        wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, on], [self.corner, inverted], device=self.device)
+        wp.launch(
+            kernel,
+            self._dim,
+            [self.law, mu, lam, *self._mesh, x, on],
+            [self.corner, inverted],
+            device=self.device,
+        )
 
     def refuse_inverted(self, x, asked, failed):
-        wp.launch(flag_turned_inside_out, self._dim, [*self._mesh[:2], x, asked], [failed], device=self.device)
+        wp.launch(
+            flag_turned_inside_out, self._dim, [*self._mesh[:2], x, asked], [failed], device=self.device
+        )
 
     def product(self, mu, lam, x, p, on):
         kernel = corotational_product if self.law == 0 else linear_product
-        wp.launch(kernel, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device)
+        wp.launch(
+            kernel, self._dim, [self.law, mu, lam, *self._mesh, x, p, on], [self.corner], device=self.device
+        )

@@ -1,4 +1,5 @@
-"""Conjugate gradients and the line search for all worlds on the device: products with the tangent, steps, what they bring."""
+"""Conjugate gradients and the line search for all worlds on the device: products with the tangent, steps,
+what they bring."""
 
 from typing import Any
 
@@ -26,7 +27,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def face_product(s: int, w: int, face: wp.array(dtype=wp.vec3i), block: wp.array2d(dtype=mat33), p: wp.array2d(dtype=wp.vec3)):
+def face_product(
+    s: int,
+    w: int,
+    face: wp.array(dtype=wp.vec3i),
+    block: wp.array2d(dtype=mat33),
+    p: wp.array2d(dtype=wp.vec3),
+):
     f = s // 3
     a = s % 3
     total = vec3()
@@ -76,7 +83,8 @@ def assemble_product(
     # Out:
     q_out: wp.array2d(dtype=wp.vec3),
 ):
-    """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: density, damping by mass, by stiffness."""
+    """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: density, damping
+    by mass, by stiffness."""
     i, w = wp.tid()
     if st.running[w] == 0:
         return
@@ -162,7 +170,8 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
     first = st.iterations_cg[w] == 0
     st.iterations_cg[w] = st.iterations_cg[w] + 1
     if not (curvature > real(0.0)):
-        # the tangent is not positive definite there: what has been found so far is a descent direction; at once, it is the first one
+        # the tangent is not positive definite there: what has been found so far is a descent direction; at
+        # once, it is the first one
         st.running[w] = 0
         st.alpha[w] = real(0.0)
         if first:

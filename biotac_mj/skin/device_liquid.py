@@ -1,4 +1,5 @@
-"""The liquid of all worlds on the device: `liquid`'s equations, its kernels joined where one can do the work of two."""
+"""The liquid of all worlds on the device: `liquid`'s equations, its kernels joined where one can do the work
+of two."""
 
 import warp as wp
 
@@ -31,7 +32,8 @@ def wet_faces(
     wet_out: wp.array2d(dtype=vec3),
     corner_out: wp.array2d(dtype=vec3),
 ):
-    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient (see `liquid.wetting`)."""
+    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient
+    (see `liquid.wetting`)."""
     c, w = wp.tid()
     if on[w] == 0:
         return
@@ -82,7 +84,8 @@ def settle_pressure(
     volume_out: wp.array(dtype=real),
     pressure_out: wp.array(dtype=real),
 ):
-    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's volume."""
+    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's
+    volume."""
     w, t = wp.tid()
     if on[w] == 0:
         return

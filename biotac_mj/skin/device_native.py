@@ -9,9 +9,13 @@ __all__ = ["invert"]
 wp.set_module_options({"enable_backward": False})
 
 _THREADS = 512
-_ROWS, _COLUMNS = 16, 32  # a block's threads as a grid: thread (r, c) holds the entries (r + 16 i, c + 32 j) in its registers
+_ROWS, _COLUMNS = (
+    16,
+    32,
+)  # a block's threads as a grid: thread (r, c) holds the entries (r + 16 i, c + 32 j) in its registers
 
-# Gauss-Jordan exchange with row pivots, see `device_preconditioner.invert_serial`. NR x NC registers hold the matrix.
+# Gauss-Jordan exchange with row pivots, see `device_preconditioner.invert_serial`. NR x NC registers hold the
+# matrix.
 _EXCHANGE = """
     const int NR = %(nr)d, NC = %(nc)d;
     const int t = threadIdx.x, r = t / %(columns)d, c = t %% %(columns)d;
@@ -166,7 +170,13 @@ def _kernel(tiles):
     snippet = (_EXCHANGE if tiles else _EXCHANGE_LARGE) % names
 
     @wp.func_native(snippet)
-    def exchange(world: int, n_in: int, A: wp.array3d(dtype=float), P: wp.array2d(dtype=int), B: wp.array3d(dtype=float)): ...
+    def exchange(
+        world: int,
+        n_in: int,
+        A: wp.array3d(dtype=float),
+        P: wp.array2d(dtype=int),
+        B: wp.array3d(dtype=float),
+    ): ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=_THREADS)
     def invert_kernel(
@@ -187,7 +197,15 @@ def _kernel(tiles):
 
 
 def invert(extra, size, on, A, pivot, B):
-    """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may overwrite A."""
+    """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
+    overwrite A."""
     tiles = -(-A.shape[1] // _COLUMNS)
     kernel = _kernel(tiles if tiles <= 6 else 0)
-    wp.launch(kernel, dim=(A.shape[0], _THREADS), inputs=[extra, size, on, A, pivot], outputs=[B], device=A.device, block_dim=_THREADS)
+    wp.launch(
+        kernel,
+        dim=(A.shape[0], _THREADS),
+        inputs=[extra, size, on, A, pivot],
+        outputs=[B],
+        device=A.device,
+        block_dim=_THREADS,
+    )

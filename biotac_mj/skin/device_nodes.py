@@ -40,7 +40,9 @@ def single(p: vec3):
 
 
 @wp.kernel
-def begin_nodes(mask: wp.array(dtype=real), increment: wp.array2d(dtype=vec3), st: Worlds, x: wp.array2d(dtype=vec3)):
+def begin_nodes(
+    mask: wp.array(dtype=real), increment: wp.array2d(dtype=vec3), st: Worlds, x: wp.array2d(dtype=vec3)
+):
     """Starts from the last step's increment, as far as the geoms repeat their last motion."""
     i, w = wp.tid()
     if st.active[w] == 1 and mask[i] > real(0.0) and st.repeat[w] > real(0.0):
@@ -101,7 +103,8 @@ def assemble_force(
     core_out: wp.array2d(dtype=vec3),
     gradient_out: wp.array2d(dtype=vec3),
 ):
-    """Sums what the corners of elements and faces hold into their nodes. Arrays of length zero: there is no such thing."""
+    """Sums what the corners of elements and faces hold into their nodes. Arrays of length zero: there is no
+    such thing."""
     i, w = wp.tid()
     if on[w] == 0:
         return
@@ -162,7 +165,12 @@ def add_inertia(
 
 
 @wp.kernel
-def displacement(x_last: wp.array2d(dtype=vec3), x: wp.array2d(dtype=vec3), on: wp.array(dtype=int), out: wp.array2d(dtype=wp.vec3)):
+def displacement(
+    x_last: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    out: wp.array2d(dtype=wp.vec3),
+):
     i, w = wp.tid()
     if on[w] == 1:
         out[i, w] = single(x[i, w] - x_last[i, w])
@@ -211,7 +219,8 @@ def residuals(
     touch_out: wp.array(dtype=int),
     go_on: wp.array(dtype=int),
 ):
-    """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the work of inertia."""
+    """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the work
+    of inertia."""
     c, w = wp.tid()
     if c == 0 and w == 0:
         go_on[0] = 0
@@ -277,7 +286,12 @@ def end_nodes(
 
 
 @wp.kernel
-def end_core(pos: wp.array(dtype=vec3), mat: wp.array(dtype=mat33), pos_out: wp.array(dtype=vec3), mat_out: wp.array(dtype=mat33)):
+def end_core(
+    pos: wp.array(dtype=vec3),
+    mat: wp.array(dtype=mat33),
+    pos_out: wp.array(dtype=vec3),
+    mat_out: wp.array(dtype=mat33),
+):
     w = wp.tid()
     pos_out[w] = pos[w]
     mat_out[w] = mat[w]

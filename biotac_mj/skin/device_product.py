@@ -1,9 +1,9 @@
-"""One world alone: the dense inverse times two vectors, each entry of its upper triangle read once, and what is made of the result.
+"""One world alone: the dense inverse times two vectors, each entry of its upper triangle read once, and what
+is made of the result.
 
-A product with the inverse costs what reading it costs. One pass gives the answers to the residual and to the liquid's gradient together;
-what contact answers needs only rows of the touching nodes. For many worlds the tensor cores' matrix product is better, see
-`device_preconditioner`.
-"""
+A product with the inverse costs what reading it costs. One pass gives the answers to the residual and to the
+liquid's gradient together; what contact answers needs only rows of the touching nodes. For many worlds the
+tensor cores' matrix product is better, see `device_preconditioner`."""
 
 import functools
 
@@ -21,8 +21,9 @@ wp.set_module_options({"enable_backward": False})
 TILE = 192  # rows and columns, as `factor` pads the inverse; threads of a block too
 PARTS = 8  # threads that share a node's sum over the touching ones
 
-# A block's 192 threads as 8 groups of 24; a thread holds 8 columns and walks over every eighth row. Of the tile (I, J) above the
-# diagonal both products are made: with x_J for the rows I, and of the transposed tile with x_I for the rows J. Fixed order: no atomics.
+# A block's 192 threads as 8 groups of 24; a thread holds 8 columns and walks over every eighth row. Of the
+# tile (I, J) above the diagonal both products are made: with x_J for the rows I, and of the transposed tile
+# with x_I for the rows J. Fixed order: no atomics.
 _TILE_PRODUCT = """
     const int t = threadIdx.x, c = t % 24, g = t / 24;
     __shared__ float sums[2 * 192 * 25];
@@ -103,9 +104,13 @@ _TILE_PRODUCT = """
 def _kernel():
     @wp.func_native(_TILE_PRODUCT)
     def multiply_tile(
-        I: int, J: int, A: wp.array2d(dtype=wp.float16), rest: wp.array2d(dtype=wp.float16), X: wp.array2d(dtype=float),
+        I: int,
+        J: int,
+        A: wp.array2d(dtype=wp.float16),
+        rest: wp.array2d(dtype=wp.float16),
+        X: wp.array2d(dtype=float),
         P: wp.array3d(dtype=float),
-    ): ...  # fmt: skip
+    ): ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=TILE)
     def multiply_tiles(
@@ -132,7 +137,8 @@ def sum_tiles(part: wp.array3d(dtype=float), y_out: wp.array2d(dtype=float)):
 
 
 class SymmetricProduct:
-    """The inverse (`half` and its `rest`, see `device_preconditioner`) times the two rows of a (2, padded) array."""
+    """The inverse (`half` and its `rest`, see `device_preconditioner`) times the two rows of a (2, padded)
+    array."""
 
     def __init__(self, half, rest):
         self._half, self._rest, self.device = half, rest, half.device
@@ -198,7 +204,8 @@ def read_pair(
     largest_out: wp.array(dtype=float),
     part_out: wp.array3d(dtype=real),
 ):
-    """What the residual does at the touching nodes and to the liquid's volume; at first, what the liquid's direction does everywhere."""
+    """What the residual does at the touching nodes and to the liquid's volume; at first, what the liquid's
+    direction does everywhere."""
     c = wp.tid()
     if on[0] == 0:
         return
@@ -249,7 +256,9 @@ def correct(
         row = 3 * free_index[node[s, 0]]
         for b in range(3):
             v = wp.vec3(
-                entry(inverse, rest, row + b, 3 * j), entry(inverse, rest, row + b, 3 * j + 1), entry(inverse, rest, row + b, 3 * j + 2)
+                entry(inverse, rest, row + b, 3 * j),
+                entry(inverse, rest, row + b, 3 * j + 1),
+                entry(inverse, rest, row + b, 3 * j + 2),
             )
             total += q[0, has_liquid + 3 * s + b] * v
     part_out[k, i] = total

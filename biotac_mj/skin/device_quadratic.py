@@ -1,11 +1,13 @@
-"""Ten-node tetrahedra as the device step evaluates them: see `quadratic` for the element and `device_elasticity` for the precision.
+"""Ten-node tetrahedra as the device step evaluates them: see `quadratic` for the element and
+`device_elasticity` for the precision.
 
-Forces stay double to the end: an inflated skin that is hardly touched balances forces far larger than its load, and their rounding would be
+Forces stay double to the end: an inflated skin that is hardly touched balances forces far larger than its
+  load, and their rounding would be
 felt. Tangents are single.
 
-On CUDA the four integration points of an element are four threads of a warp, which exchange what they know: the mean dilatation, and their
-stresses, of which each thread makes the forces of its share of the ten nodes. On the CPU, where this is for tests, one thread loops.
-"""
+On CUDA the four integration points of an element are four threads of a warp, which exchange what they know:
+the mean dilatation, and their stresses, of which each thread makes the forces of its share of the ten nodes.
+On the CPU, where this is for tests, one thread loops."""
 
 import functools
 
@@ -21,7 +23,9 @@ __all__ = ["Quadratic", "device_elements"]
 
 wp.set_module_options({"enable_backward": False})
 
-_INVERTED = 0.02  # det F below which a step of the line search is refused where the law cannot recover from inversion
+_INVERTED = (
+    0.02  # det F below which a step of the line search is refused where the law cannot recover from inversion
+)
 _ABREAST = 8  # worlds whose threads lie side by side: what they read does too
 
 # the threads of an element's points are `group` lanes apart
@@ -119,7 +123,8 @@ def place(t: int, group: int, nworld: int):
 
 @functools.cache
 def _kernels(corotational):
-    """(force, product) kernels; the corotational law's own: what the others need would take registers from it."""
+    """(force, product) kernels; the corotational law's own: what the others need would take registers from
+    it."""
 
     @wp.func
     def rotation(F: mat33):
@@ -165,7 +170,11 @@ def _kernels(corotational):
             trace_s = wp.trace(S)
             turn = wp.vec3(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
             dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=float) - S) * turn)
-            return 2.0 * m * (dF - dR) + float(lam) * wp.trace(A) * R + (float(lam) * (trace_s - 3.0) + float(pressure)) * dR
+            return (
+                2.0 * m * (dF - dR)
+                + float(lam) * wp.trace(A) * R
+                + (float(lam) * (trace_s - 3.0) + float(pressure)) * dR
+            )
         D, Q, G = widen(dF), widen(R), widen(F)
         return narrow(stress_derivative(law, mu, lam, G, Q, D) + pressure * dilatation_hessian(law, G, Q, D))
 
@@ -297,7 +306,15 @@ def _kernels(corotational):
             corner_out[10 * e + a, w] = vec3()
         for q in range(4):
             F = deformation(mesh, e, q, x, w)
-            H = force_of(law, mu[w], local, pressure, F, rotation(F), -mesh.weight[e, q] * wp.transpose(mesh.inverse[e, q]))
+            H = force_of(
+                law,
+                mu[w],
+                local,
+                pressure,
+                F,
+                rotation(F),
+                -mesh.weight[e, q] * wp.transpose(mesh.inverse[e, q]),
+            )
             for a in range(10):
                 corner_out[10 * e + a, w] = corner_out[10 * e + a, w] + H * mesh.shape[q, a]
 
@@ -322,7 +339,9 @@ def _kernels(corotational):
         mean = float(0.0)
         for q in range(4):
             F = narrow(deformation(mesh, e, q, x, w))
-            mean += float(mesh.weight[e, q]) * wp.ddot(direction_of(law, F, rotation_single(F)), gradient(mesh, e, q, p, w))
+            mean += float(mesh.weight[e, q]) * wp.ddot(
+                direction_of(law, F, rotation_single(F)), gradient(mesh, e, q, p, w)
+            )
         for a in range(10):
             corner_out[10 * e + a, w] = wp.vec3()
         for q in range(4):
@@ -338,7 +357,9 @@ def _kernels(corotational):
 
 
 @wp.kernel
-def flag_points_inside_out(mesh: Mesh, x: wp.array2d(dtype=vec3), asked: wp.array(dtype=int), failed_out: wp.array(dtype=int)):
+def flag_points_inside_out(
+    mesh: Mesh, x: wp.array2d(dtype=vec3), asked: wp.array(dtype=int), failed_out: wp.array(dtype=int)
+):
     """Marks worlds with an integration point whose determinant is not positive."""
     e, q, w = wp.tid()
     if asked[w] == 1 and not (wp.determinant(deformation(mesh, e, q, x, w)) > real(0.0)):
@@ -349,7 +370,8 @@ class Quadratic:
     """Ten-node tetrahedra for all worlds.
 
     Attributes:
-      start, slot: CSR lists of the corners of each node. corner_force, corner: what `force` and `product` wrote last [slot, world] [N].
+      start, slot: CSR lists of the corners of each node. corner_force, corner: what `force` and `product`
+        wrote last [slot, world] [N].
     """
 
     def __init__(self, elements, nworld):
@@ -372,7 +394,8 @@ class Quadratic:
         self._kernels = _kernels(self.law == 0)
 
     def force(self, mu, lam, x, on, inverted):
-        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot bear the deformation."""
+        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
+        bear the deformation."""
         self._launch(0, [self.law, mu, lam, self._mesh, x, on], [self._pressure, self.corner_force, inverted])
 
     def product(self, mu, lam, x, p, on):
@@ -387,9 +410,18 @@ class Quadratic:
     def _launch(self, which, inputs, outputs):
         if self.device.is_cuda:
             inputs = [self._group, self._nworld, *inputs]
-            wp.launch(self._kernels[which], self._threads, inputs, outputs, device=self.device, block_dim=self._block_dim)
+            wp.launch(
+                self._kernels[which],
+                self._threads,
+                inputs,
+                outputs,
+                device=self.device,
+                block_dim=self._block_dim,
+            )
         else:
-            wp.launch(self._kernels[2 + which], (self._count, self._nworld), inputs, outputs, device=self.device)
+            wp.launch(
+                self._kernels[2 + which], (self._count, self._nworld), inputs, outputs, device=self.device
+            )
 
 
 def device_elements(elements, nworld):

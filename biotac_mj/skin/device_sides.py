@@ -1,4 +1,5 @@
-"""Right-hand sides of the dense inverse and its answers: how vectors of nodes travel through a product in half precision.
+"""Right-hand sides of the dense inverse and its answers: how vectors of nodes travel through a product in
+half precision.
 
 A right-hand side travels as the sum of two halves, see `factor.DenseFactor`.
 """
@@ -28,7 +29,9 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-STIFF = wp.constant(1.0e5)  # [N/m] of the liquid's direction as it is scaled: like that of contact, so that single precision suffices
+STIFF = wp.constant(
+    1.0e5
+)  # [N/m] of the liquid's direction as it is scaled: like that of contact, so that single precision suffices
 TINY = wp.constant(1.0e-30)
 LOW = wp.constant(2048.0)  # what the second half is magnified by
 
@@ -42,7 +45,9 @@ def write_halves(b: wp.vec3, row: int, column: int, nworld: int, out: wp.array2d
 
 
 @wp.func
-def read_halves(x: wp.array2d(dtype=float), rest: wp.array2d(dtype=float), row: int, column: int, nworld: int):
+def read_halves(
+    x: wp.array2d(dtype=float), rest: wp.array2d(dtype=float), row: int, column: int, nworld: int
+):
     """The answer of both halves, and of the inverse's remainder where it has one."""
     y = wp.vec3()
     for a in range(3):
@@ -145,7 +150,11 @@ def read_along(
 
 @wp.kernel
 def measure_along(
-    chunk: int, r: wp.array2d(dtype=wp.vec3), along: wp.array2d(dtype=wp.vec3), on: wp.array(dtype=int), part_out: wp.array3d(dtype=real)
+    chunk: int,
+    r: wp.array2d(dtype=wp.vec3),
+    along: wp.array2d(dtype=wp.vec3),
+    on: wp.array(dtype=int),
+    part_out: wp.array3d(dtype=real),
 ):
     """What the residual does to the liquid's volume: the inverse is symmetric."""
     c, w = wp.tid()
@@ -175,7 +184,8 @@ def small_rows(
     u_out: wp.array2d(dtype=float),
     largest_out: wp.array(dtype=float),
 ):
-    """What the residual does at the touching nodes, by their rows of the inverse: for few worlds. A block of threads for each row."""
+    """What the residual does at the touching nodes, by their rows of the inverse: for few worlds. A block of
+    threads for each row."""
     w, k, t = wp.tid()
     if on[w] == 0:
         return
@@ -219,7 +229,9 @@ def small_side(
     if s == 0:
         largest_out[w] = 0.0
     if s < size[w]:
-        y = read_halves(answer, rest, 3 * row[node[s, w]], w, on.shape[0]) * (norm[0, w] * scale * float(st.softness[w]))
+        y = read_halves(answer, rest, 3 * row[node[s, w]], w, on.shape[0]) * (
+            norm[0, w] * scale * float(st.softness[w])
+        )
         for a in range(3):
             u_out[w, has_liquid + 3 * s + a] = y[a]
 

@@ -1,7 +1,7 @@
 """The small systems of the device's preconditioner: over the liquid and the touching nodes of each world.
 
-The liquid comes first, then three rows for each touching node. D is sparse and kept by blocks: a node's links and their springs.
-"""
+The liquid comes first, then three rows for each touching node. D is sparse and kept by blocks: a node's links
+and their springs."""
 
 import warp as wp
 
@@ -24,12 +24,18 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-LINKS = wp.constant(24)  # touching nodes that a touching node's faces can have; more are left to conjugate gradients
+LINKS = wp.constant(
+    24
+)  # touching nodes that a touching node's faces can have; more are left to conjugate gradients
 
 
 @wp.kernel
 def sum_liquid(
-    part: wp.array3d(dtype=real), on: wp.array(dtype=int), first: int, W_out: wp.array3d(dtype=float), u_out: wp.array2d(dtype=float)
+    part: wp.array3d(dtype=real),
+    on: wp.array(dtype=int),
+    first: int,
+    W_out: wp.array3d(dtype=float),
+    u_out: wp.array2d(dtype=float),
 ):
     w, t = wp.tid()
     if on[w] == 0:
@@ -143,9 +149,35 @@ def small_stiffness(
     if on[w] == 0 or s >= size[w]:
         return
     i = node[s, w]
-    count = add_links(i, s, w, 0, outer_start, outer_slot, outer_face, outer_touching, outer_block, slot, link_out, spring_out)
+    count = add_links(
+        i,
+        s,
+        w,
+        0,
+        outer_start,
+        outer_slot,
+        outer_face,
+        outer_touching,
+        outer_block,
+        slot,
+        link_out,
+        spring_out,
+    )
     if core_start.shape[0] > 0:
-        count = add_links(i, s, w, count, core_start, core_slot, core_face, core_touching, core_block, slot, link_out, spring_out)
+        count = add_links(
+            i,
+            s,
+            w,
+            count,
+            core_start,
+            core_slot,
+            core_face,
+            core_touching,
+            core_block,
+            slot,
+            link_out,
+            spring_out,
+        )
     count_out[w, s] = count
 
 
@@ -239,7 +271,8 @@ def invert_serial(
                         if j != k:
                             A[w, i, j] = A[w, i, j] - f * A[w, p, j]
                     A[w, i, k] = -f * d
-    # row i of the exchanged matrix gives unknown pivot[i]; its column k belongs to the right-hand side of the row with pivot k
+    # row i of the exchanged matrix gives unknown pivot[i]; its column k belongs to the right-hand side of the
+    # row with pivot k
     for i in range(n):
         for j in range(n):
             B_out[w, pivot[w, i], j] = A[w, i, pivot[w, j]]

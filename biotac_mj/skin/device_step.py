@@ -1,17 +1,20 @@
-"""One step of the skin without a look back at the host: recorded once as a CUDA graph and replayed, alone or inside the caller's own graph.
+"""One step of the skin without a look back at the host: recorded once as a CUDA graph and replayed, alone or
+inside the caller's own graph.
 
     skin = DeviceStep(model, data, geoms)      # allocates and compiles
-    skin.run()                                 # a step: replays the graph (on the CPU, where it is for tests, it runs kernel by kernel)
+    skin.run()                                 # a step: replays the graph (on the CPU, where it is for tests,
+    it runs kernel by kernel)
 
-Everything that changes between steps is read from device arrays: poses and frictions `geoms.struct.pos, .mat, .friction` [geom, world],
-materials `data.mu, .lam`, the liquids `data.worlds.kappa, .natural, .holds`, `data.dt` and the pose of the BioTac frame
-`data.frame_pos, .frame_mat` (implicit dynamics only). Overwrite them, then step. Inside a captured step of something else call
-`step_device(model, data, geoms)`, which only launches; make it ready with `prepare_device` before the capture begins.
+Everything that changes between steps is read from device arrays: poses and frictions `geoms.struct.pos, .mat,
+.friction` [geom, world], materials `data.mu, .lam`, the liquids `data.worlds.kappa, .natural, .holds`,
+`data.dt` and the pose of the BioTac frame `data.frame_pos, .frame_mat` (implicit dynamics only). Overwrite
+them, then step. Inside a captured step of something else call `step_device(model, data, geoms)`, which only
+launches; make it ready with `prepare_device` before the capture begins.
 
-A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its last good state, is counted in
-`data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do not notice. Branches and loops are conditional nodes of
-the graph (CUDA 12.4 and later); worlds that are done idle inside them.
-"""
+A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its
+last good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do
+not notice. Branches and loops are conditional nodes of the graph (CUDA 12.4 and later); worlds that are done
+idle inside them."""
 
 import weakref
 
@@ -30,28 +33,40 @@ __all__ = ["DeviceStep", "prepare_device", "step_device"]
 
 
 def prepare_device(model, data, geoms) -> "DeviceStep":
-    """Allocates and compiles what `step_device` needs; again only where the model's options or the geoms are others.
+    """Allocates and compiles what `step_device` needs; again only where the model's options or the geoms are
+    others.
 
     Raises:
-      ValueError: the data does not live on the device, geoms of another number of worlds, or called first while a graph is captured.
+      ValueError: the data does not live on the device, geoms of another number of worlds, or called first
+        while a graph is captured.
     """
     if not data.resident:
-        raise ValueError("this data is stepped from the host: make it with SkinData(model, nworld, resident=True), as on CUDA it is")
+        raise ValueError(
+            "this data is stepped from the host: make it with SkinData(model, nworld, resident=True), as on "
+            "CUDA it is"
+        )
     if geoms.nworld != data.nworld:
-        raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
+        raise ValueError(
+            f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same "
+            "number"
+        )
     key = (id(geoms), model.options)
     if key not in data.device_steps:
         if model.device.is_cuda and model.device.is_capturing:
-            raise ValueError("the device step is not ready: call prepare_device(model, data, geoms) before the capture begins")
+            raise ValueError(
+                "the device step is not ready: call prepare_device(model, data, geoms) before the capture "
+                "begins"
+            )
         data.device_steps[key] = DeviceStep(model, data, geoms)
     return data.device_steps[key]
 
 
 def step_device(model, data, geoms) -> None:
-    """Launches a step of every world on the device's current stream: for use inside a captured graph, or without one.
+    """Launches a step of every world on the device's current stream: for use inside a captured graph, or
+    without one.
 
-    Takes the poses from `geoms.struct` as they are when it runs; see the module's docstring. Raises what `prepare_device` raises.
-    """
+    Takes the poses from `geoms.struct` as they are when it runs; see the module's docstring. Raises what
+    `prepare_device` raises."""
     ready = prepare_device(model, data, geoms)
     ready.record()
 
@@ -87,7 +102,9 @@ class _Memory:
             self.world, self.target = (wp.zeros((n, w) if implicit else (0, w), dtype=vec3) for _ in range(2))
             self.inertial = wp.zeros((n if implicit else 0, w), dtype=wp.vec3)
             self.node_volume = wp.array(model.elasticity.node_volume, dtype=real)
-            self.damped = device_elements(model.elasticity, w) if implicit and model.options.stiffness_damping else None
+            self.damped = (
+                device_elements(model.elasticity, w) if implicit and model.options.stiffness_damping else None
+            )
         self.elements = device_elements(model.elasticity, w)
         capacity = data.contact_capacity or (63 if n <= 8000 else 127)
         self.preconditioner = DevicePreconditioner(model, (data.outer, data.core), w, self.chunk, capacity)
@@ -116,10 +133,14 @@ class DeviceStep:
             self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, w), dtype=vec3)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
-        self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (flags[i : i + 1] for i in range(5))
+        self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (
+            flags[i : i + 1] for i in range(5)
+        )
         self._graph = None
         few = model.device.is_cuda and data.nworld <= FEW
-        self._streams = [wp.Stream(model.device) for _ in range(2 if few else 0)]  # many worlds fill the device without
+        self._streams = [
+            wp.Stream(model.device) for _ in range(2 if few else 0)
+        ]  # many worlds fill the device without
         self._events = [wp.Event(model.device) for _ in range(3 if few else 0)]
         self._warm_up()
 
@@ -141,10 +162,18 @@ class DeviceStep:
 
     def _decide(self, kernel, inputs, outputs=()):
         """A block of threads for each world."""
-        wp.launch_tiled(kernel, dim=[self.d.nworld], inputs=inputs, outputs=list(outputs), block_dim=worlds.BLOCK, device=self.m.device)
+        wp.launch_tiled(
+            kernel,
+            dim=[self.d.nworld],
+            inputs=inputs,
+            outputs=list(outputs),
+            block_dim=worlds.BLOCK,
+            device=self.m.device,
+        )
 
     def _beside(self, *branches):
-        """Launches up to three functions, which do not need each other's results, as branches of the graph."""
+        """Launches up to three functions, which do not need each other's results, as branches of the
+        graph."""
         if not self._streams:
             for branch in branches:
                 branch()
@@ -161,7 +190,8 @@ class DeviceStep:
             main.wait_event(done)
 
     def _warm_up(self):
-        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made, before anything is captured."""
+        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made,
+        before anything is captured."""
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
             flag.zero_()
         self._evaluate(self.st.active)
@@ -173,7 +203,7 @@ class DeviceStep:
         self._refuse_impossible()
         self.k.flags.zero_()
 
-    # --- the step ---------------------------------------------------------------------------------------------------------------
+    # --- the step  ---
 
     def record(self):
         """Launches one step."""
@@ -182,18 +212,29 @@ class DeviceStep:
         if m.has_core and g.count:
             chunk = 8 if w < 32 else 64
             dim = (g.count, -(-len(m.core_vert) // chunk), w)
-            self._launch(contact.contact_inside_core, dim, [chunk, m.options.max_core_depth, m.core_vert, g.struct], [st.deep])
+            self._launch(
+                contact.contact_inside_core,
+                dim,
+                [chunk, m.options.max_core_depth, m.core_vert, g.struct],
+                [st.deep],
+            )
         motion, touched_by, wrench = self._of_geoms
         E = m.material.youngs_modulus
         self._launch(worlds.begin_worlds, w, [m.law, E, g.struct, motion, st, touched_by], [k.flags])
         if self.implicit:
-            self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt],
-                         [k.world, k.target])  # fmt: skip
+            self._launch(
+                nodes.fly_freely,
+                (n, w),
+                [d.x, d.velocity, d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt],
+                [k.world, k.target],
+            )
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x])
         self._newton()
         self._launch(worlds.retry_worlds, w, [st, self._again])
         wp.capture_if(self._again, self._second_try)
-        self._launch(worlds.hold_geoms, w, [g.struct, st], [self._held_pos, self._held_mat, motion, self._any_failed])
+        self._launch(
+            worlds.hold_geoms, w, [g.struct, st], [self._held_pos, self._held_mat, motion, self._any_failed]
+        )
         wp.capture_if(self._any_failed, self._stay)
         self._finish(touched_by, wrench)
 
@@ -213,13 +254,19 @@ class DeviceStep:
         self._refuse_impossible()
 
     def _refuse_impossible(self):
-        """Balance of an inverted element, or of skin that went through the core, is none: see `solver._Step._possible`."""
+        """Balance of an inverted element, or of skin that went through the core, is none: see
+        `solver._Step._possible`."""
         m, d, st = self.m, self.d, self.st
         if m.material.law != "linear":
             self.k.elements.refuse_inverted(d.x, st.asked, st.failed)
         if d.core:
             face, core = d.core.surface.face, m.core(d.nworld).struct
-            self._launch(contact.crushed_on_core, (len(face), d.nworld), [m.crushed_depth, face, core, d.x, st.asked], [st.failed])
+            self._launch(
+                contact.crushed_on_core,
+                (len(face), d.nworld),
+                [m.crushed_depth, face, core, d.x, st.asked],
+                [st.failed],
+            )
 
     def _iterate(self):
         self._solve()
@@ -232,11 +279,23 @@ class DeviceStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, d, k, st = self.m, self.d, self.k, self.st
         self._launch(
-            nodes.residuals, (k.nchunk, d.nworld),
-            [k.chunk, m.free_mask, d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, self._external(),
-             self._gradient(), d.x, d.rest_vert, k.inertial, st.active],
+            nodes.residuals,
+            (k.nchunk, d.nworld),
+            [
+                k.chunk,
+                m.free_mask,
+                d.force,
+                d.outer.node_force,
+                d.core.node_force if d.core else k.no_vector,
+                self._external(),
+                self._gradient(),
+                d.x,
+                d.rest_vert,
+                k.inertial,
+                st.active,
+            ],
             [k.r, k.worth, k.preconditioner.any_touch, self._newton_on],
-        )  # fmt: skip
+        )
         k.preconditioner.update(st, k.worth, k.r, self._gradient(), k.p, k.part, self._beside)
         touch = k.preconditioner.any_touch
         limits = [m.options.tolerance, m.options.max_newton, int(m.has_liquid)]
@@ -262,19 +321,48 @@ class DeviceStep:
         if self.implicit:
             inertia = wp.vec3d(m.material.density, m.options.mass_damping, m.options.stiffness_damping)
         self._launch(
-            krylov.assemble_product, d.x.shape,
-            [e.start, e.slot, e.corner, *self._blocks(m.outer, d.outer), *self._blocks(m.core_surface if d.core else None, d.core),
-             *self._wet_faces(), m.free_mask, inertia, k.node_volume, d.dt, d.x, k.p, st],
+            krylov.assemble_product,
+            d.x.shape,
+            [
+                e.start,
+                e.slot,
+                e.corner,
+                *self._blocks(m.outer, d.outer),
+                *self._blocks(m.core_surface if d.core else None, d.core),
+                *self._wet_faces(),
+                m.free_mask,
+                inertia,
+                k.node_volume,
+                d.dt,
+                d.x,
+                k.p,
+                st,
+            ],
             [k.q],
-        )  # fmt: skip
+        )
         chunks, gradient = (k.nchunk, d.nworld), self._gradient()
-        self._launch(krylov.measure_product, chunks, [k.chunk, k.p, k.q, gradient, m.free_mask, st.running], [k.part, self._solve_on])
+        self._launch(
+            krylov.measure_product,
+            chunks,
+            [k.chunk, k.p, k.q, gradient, m.free_mask, st.running],
+            [k.part, self._solve_on],
+        )
         self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
-        self._launch(krylov.update_solution, chunks, [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r], [k.part])
+        self._launch(
+            krylov.update_solution,
+            chunks,
+            [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r],
+            [k.part],
+        )
 
     def _search(self):
         d, k = self.d, self.k
-        self._launch(krylov.first_length, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st, d.x], [k.base, k.part])
+        self._launch(
+            krylov.first_length,
+            (k.nchunk, d.nworld),
+            [k.chunk, d.force, k.dx, self.st, d.x],
+            [k.base, k.part],
+        )
         self._look()
 
     def _continue_search(self):
@@ -284,7 +372,12 @@ class DeviceStep:
     def _look(self):
         d, k = self.d, self.k
         self._evaluate(self.st.moving)
-        self._launch(krylov.measure_slope, (k.nchunk, d.nworld), [k.chunk, d.force, k.dx, self.st], [k.part, self._search_on])
+        self._launch(
+            krylov.measure_slope,
+            (k.nchunk, d.nworld),
+            [k.chunk, d.force, k.dx, self.st],
+            [k.part, self._search_on],
+        )
         self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
     def _finish(self, touched_by, wrench):
@@ -295,21 +388,39 @@ class DeviceStep:
             self._fill(st.moving)  # the cavity's volume is told all the same
         if g.ngroup:
             self._launch(
-                contact.partial_wrench, (self._wrench_chunks, w),
-                [self._wrench_chunk, o.surface.face, m.sample, g.struct, d.x, o.touching, o.trial_geom, o.sample_force],
+                contact.partial_wrench,
+                (self._wrench_chunks, w),
+                [
+                    self._wrench_chunk,
+                    o.surface.face,
+                    m.sample,
+                    g.struct,
+                    d.x,
+                    o.touching,
+                    o.trial_geom,
+                    o.sample_force,
+                ],
                 [self._part, touched_by],
-            )  # fmt: skip
+            )
             self._launch(contact.sum_wrench, (2 * g.ngroup, w), [self._part], [wrench])
-        self._launch(contact.commit_contacts, o.touching.shape, [len(m.sample), o.touching, o.trial_geom, o.trial_anchor, o.kept],
-                     [o.anchor_geom, o.anchor])  # fmt: skip
+        self._launch(
+            contact.commit_contacts,
+            o.touching.shape,
+            [len(m.sample), o.touching, o.trial_geom, o.trial_anchor, o.kept],
+            [o.anchor_geom, o.anchor],
+        )
         self._launch(worlds.release_geoms, w, [g.struct, self._held_pos, self._held_mat, st])
-        self._launch(nodes.end_nodes, d.x.shape, [int(self.implicit), d.x, k.world, d.frame_pos, d.frame_mat, d.dt, d.x_last],
-                     [d.increment, d.velocity])  # fmt: skip
+        self._launch(
+            nodes.end_nodes,
+            d.x.shape,
+            [int(self.implicit), d.x, k.world, d.frame_pos, d.frame_mat, d.dt, d.x_last],
+            [d.increment, d.velocity],
+        )
         if self.implicit:
             self._launch(nodes.end_core, w, [d.frame_pos, d.frame_mat], [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])
 
-    # --- forces -----------------------------------------------------------------------------------------------------------------
+    # --- forces  ---
 
     def _evaluate(self, on):
         """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia."""
@@ -321,24 +432,58 @@ class DeviceStep:
         )
         none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
         core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner] if d.core else none
-        wet = [m.inner.start, m.inner.slot, k.wet_corner] if m.has_liquid else [k.no_list, k.no_list, k.no_vector]
+        wet = (
+            [m.inner.start, m.inner.slot, k.wet_corner]
+            if m.has_liquid
+            else [k.no_list, k.no_list, k.no_vector]
+        )
         self._launch(
-            nodes.assemble_force, d.x.shape,
-            [k.elements.start, k.elements.slot, k.elements.corner_force, m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner,
-             *core, *wet, self._external(), st.pressure, on],
+            nodes.assemble_force,
+            d.x.shape,
+            [
+                k.elements.start,
+                k.elements.slot,
+                k.elements.corner_force,
+                m.outer.start,
+                m.outer.slot,
+                d.outer.touching,
+                d.outer.corner,
+                *core,
+                *wet,
+                self._external(),
+                st.pressure,
+                on,
+            ],
             [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
-        )  # fmt: skip
+        )
         if self.implicit:
             o = m.options
-            self._launch(nodes.add_inertia, d.x.shape,
-                         [m.material.density, o.mass_damping, k.node_volume, d.dt, k.target, d.x_last, d.x, on, d.force],
-                         [k.inertial])  # fmt: skip
+            self._launch(
+                nodes.add_inertia,
+                d.x.shape,
+                [
+                    m.material.density,
+                    o.mass_damping,
+                    k.node_volume,
+                    d.dt,
+                    k.target,
+                    d.x_last,
+                    d.x,
+                    on,
+                    d.force,
+                ],
+                [k.inertial],
+            )
             if k.damped:
                 self._launch(nodes.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
                 k.damped.force(d.mu, d.lam, d.x, on, st.inverted)
                 k.damped.product(d.mu, d.lam, d.x, k.q, on)
                 e = k.damped
-                self._launch(nodes.add_damping, d.x.shape, [e.start, e.slot, e.corner, real(o.stiffness_damping), d.dt, on, d.force])
+                self._launch(
+                    nodes.add_damping,
+                    d.x.shape,
+                    [e.start, e.slot, e.corner, real(o.stiffness_damping), d.dt, on, d.force],
+                )
 
     def _inside(self, on):
         """The skin's inner side: core and liquid."""
@@ -351,19 +496,38 @@ class DeviceStep:
     def _contact(self, state, geoms, near, still, on):
         m, d, s = self.m, self.d, state.surface
         dim, nsample = state.touching.shape, len(m.sample)
-        self._launch(contact.cull_faces, dim, [still, nsample, s.face, geoms.struct, d.x, on, state.seen, state.clearance, state.touching],
-                     [near, state.trial_geom])  # fmt: skip
-        law = [s.face, s.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
-        held, out = [state.anchor_geom, state.anchor, on, near], [state.trial_geom, state.trial_anchor, state.sample_force]
+        self._launch(
+            contact.cull_faces,
+            dim,
+            [still, nsample, s.face, geoms.struct, d.x, on, state.seen, state.clearance, state.touching],
+            [near, state.trial_geom],
+        )
+        law = [
+            s.face,
+            s.area,
+            m.sample,
+            m.contact_stiffness,
+            m.options.stick_ratio,
+            geoms.struct,
+            d.x,
+            d.x_last,
+        ]
+        held, out = (
+            [state.anchor_geom, state.anchor, on, near],
+            [state.trial_geom, state.trial_anchor, state.sample_force],
+        )
         if d.nworld > FEW:
             self._launch(contact.near_contact, dim, [still, *law, *held, state.seen, state.clearance],
                          [state.corner, state.block, state.touching, *out])  # fmt: skip
             return
         gap, tangent = self.k.by_sample[still]
         self._launch(contact.sample_contact, out[0].shape, [*law, *held], [*out, gap, tangent])
-        self._launch(contact.sum_samples, (dim[0], 3, dim[1]),
-                     [still, s.face, m.sample, d.x, on, near, state.trial_geom, state.sample_force, gap, tangent],
-                     [state.corner, state.block, state.touching, state.seen, state.clearance])  # fmt: skip
+        self._launch(
+            contact.sum_samples,
+            (dim[0], 3, dim[1]),
+            [still, s.face, m.sample, d.x, on, near, state.trial_geom, state.sample_force, gap, tangent],
+            [state.corner, state.block, state.touching, state.seen, state.clearance],
+        )
 
     def _fill(self, on):
         """The liquid's volume; with it, its pressure."""
@@ -378,9 +542,17 @@ class DeviceStep:
                      [k.chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
                      [k.share, k.wet, k.wet_corner])  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume
-        self._decide(liquid.settle_pressure, [enclosed, k.share, st.offset, st.kappa, st.natural, on], [st.volume, st.pressure])
+        self._decide(
+            liquid.settle_pressure,
+            [enclosed, k.share, st.offset, st.kappa, st.natural, on],
+            [st.volume, st.pressure],
+        )
         if m.has_liquid and c:
-            self._launch(liquid.release_pressure, c.touching.shape, [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block])
+            self._launch(
+                liquid.release_pressure,
+                c.touching.shape,
+                [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block],
+            )
 
     def _external(self):
         return self.k.no_vector if self.d.external is None else self.d.external_device
@@ -396,4 +568,8 @@ class DeviceStep:
 
     def _wet_faces(self):
         m, k = self.m, self.k
-        return [m.inner.face, m.inner.start, m.inner.slot, k.wet] if m.has_liquid else [k.no_face, k.no_list, k.no_list, k.no_vector]
+        return (
+            [m.inner.face, m.inner.start, m.inner.slot, k.wet]
+            if m.has_liquid
+            else [k.no_face, k.no_list, k.no_list, k.no_vector]
+        )

@@ -1,4 +1,5 @@
-"""What decides on the device: one thread for each world begins its step, judges its balance, steers its line search and ends its step."""
+"""What decides on the device: one thread for each world begins its step, judges its balance, steers its line
+search and ends its step."""
 
 import warp as wp
 
@@ -196,7 +197,8 @@ def judge_balance(
     # Out:
     go_on: wp.array(dtype=int),
 ):
-    """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see `device_nodes.residuals`."""
+    """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
+    `device_nodes.residuals`."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
@@ -213,7 +215,8 @@ def judge_balance(
         st.active[w] = 0
         st.error[w] = real(0.0)
         return
-    # single precision leaves more residual than nothing, so a vibration without contact is measured by the work of its inertia
+    # single precision leaves more residual than nothing, so a vibration without contact is measured by the
+    # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     st.error[w] = wp.sqrt(wp.max(rz, real(0.0)) / work)
     settled = int(1)
@@ -246,7 +249,8 @@ def retry_worlds(st: Worlds, again: wp.array(dtype=int)):
 
 @wp.kernel
 def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
-    """Looks for the length where the residual has (nearly) no component along the step, by regula falsi; see `solver._line_search`.
+    """Looks for the length where the residual has (nearly) no component along the step, by regula falsi; see
+    `solver._line_search`.
 
     part: force . direction after the step, and before it where this is the first try.
     """
@@ -336,7 +340,8 @@ def hold_geoms(
 
 @wp.kernel
 def release_geoms(geoms: Geoms, pos: wp.array2d(dtype=vec3), mat: wp.array2d(dtype=mat33), st: Worlds):
-    """Makes the poses of this step those of the last one, where it went well, and writes back what was set."""
+    """Makes the poses of this step those of the last one, where it went well, and writes back what was
+    set."""
     w = wp.tid()
     for g in range(geoms.count):
         if st.failed[w] == 0:

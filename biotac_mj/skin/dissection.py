@@ -1,8 +1,8 @@
 """Nested dissection of a mesh: the order in which a sparse factor of its stiffness stays small (George 1973).
 
-The nodes are cut in two across their longest direction; the fewest nodes that separate both sides are a smallest vertex cover of the
-cut edges (Koenig: a largest matching gives it). They come last, both sides are cut on in the same way.
-"""
+The nodes are cut in two across their longest direction; the fewest nodes that separate both sides are a
+smallest vertex cover of the cut edges (Koenig: a largest matching gives it). They come last, both sides are
+cut on in the same way."""
 
 import numpy as np
 import scipy.sparse as sp

@@ -1,4 +1,5 @@
-"""Elastic forces of linear tetrahedra. Arrays are [item, world], so that neighbouring threads read neighbouring worlds."""
+"""Elastic forces of linear tetrahedra. Arrays are [item, world], so that neighbouring threads read
+neighbouring worlds."""
 
 from typing import NamedTuple
 
@@ -10,7 +11,16 @@ from . import material as mat
 from .launch import Launches
 from .types import mat33, real, vec3
 
-__all__ = ["LinearTetrahedra", "elastic_energy", "elastic_force", "gather", "hessian_product", "rest_shape", "rest_stiffness", "tet_stress"]
+__all__ = [
+    "LinearTetrahedra",
+    "elastic_energy",
+    "elastic_force",
+    "gather",
+    "hessian_product",
+    "rest_shape",
+    "rest_stiffness",
+    "tet_stress",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,13 +37,16 @@ def rest_shape(vert: np.ndarray, elem: np.ndarray):
     bad = np.flatnonzero(~(volume > 1e-9 * scale))
     if len(bad):
         raise ValueError(
-            f"{len(bad)} of {len(elem)} tetrahedra are inverted or degenerate (first: {bad[0]}, volume {volume[bad[0]]:.3g} m^3): "
+            f"{len(bad)} of {len(elem)} tetrahedra are inverted or degenerate (first: {bad[0]}, volume "
+            f"{volume[bad[0]]:.3g} m^3): "
             "repair the mesh or swap two nodes of each inverted tetrahedron"
         )
     return np.linalg.inv(edges), volume
 
 
-def rest_stiffness(nvert: int, elem: np.ndarray, inverse_edges: np.ndarray, volume: np.ndarray, mu: float, lame: float) -> sp.csc_matrix:
+def rest_stiffness(
+    nvert: int, elem: np.ndarray, inverse_edges: np.ndarray, volume: np.ndarray, mu: float, lame: float
+) -> sp.csc_matrix:
     """Stiffness matrix at rest (3 nvert, 3 nvert) [N/m]; every law here has the same linearisation."""
     grad = np.empty((len(elem), 4, 3))  # shape function gradients
     grad[:, 1:] = inverse_edges
@@ -174,7 +187,8 @@ def gather(
     # Out:
     node_out: wp.array2d(dtype=vec3),
 ):
-    """Sums what the corners of elements (or faces) hold into their nodes: no atomics, so the sum's order is fixed."""
+    """Sums what the corners of elements (or faces) hold into their nodes: no atomics, so the sum's order is
+    fixed."""
     i, w = wp.tid()
     total = vec3()
     for k in range(start[i], start[i + 1]):
@@ -186,7 +200,8 @@ def gather(
 
 
 def incidence(nvert: int, cells: np.ndarray):
-    """CSR lists of the corner slots (cell * ncorner + corner) that belong to each node: start (nvert+1,), slot (ncell * ncorner,)."""
+    """CSR lists of the corner slots (cell * ncorner + corner) that belong to each node: start (nvert+1,),
+    slot (ncell * ncorner,)."""
     flat = cells.ravel()
     slot = np.argsort(flat, kind="stable").astype(np.int32)
     start = np.zeros(nvert + 1, np.int32)
@@ -204,7 +219,8 @@ def scale_stress(modulus, cauchy, mises):
 class LinearTetrahedra:
     """Four-node tetrahedra with constant strain (the paper's, CalculiX's C3D4).
 
-    An element formulation offers what the solver asks for: `node_volume`, `rest_stiffness`, `allocate`, `force`, `product`,
+    An element formulation offers what the solver asks for: `node_volume`, `rest_stiffness`, `allocate`,
+      `force`, `product`,
     `smallest_jacobian` and `stress`.
 
     Args:
@@ -249,15 +265,23 @@ class LinearTetrahedra:
     def force(self, scratch, mu, lam, x, force_out):
         """Elastic nodal forces at x: [nvert, nworld] vec3 -> the same [N]."""
         n, w = x.shape
-        self._launch(elastic_force, (self.nelem, w), [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x],
-                     [scratch.rotation, scratch.corner, scratch.jacobian])  # fmt: skip
+        self._launch(
+            elastic_force,
+            (self.nelem, w),
+            [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x],
+            [scratch.rotation, scratch.corner, scratch.jacobian],
+        )
         self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [force_out])
 
     def product(self, scratch, mu, lam, x, p, product_out):
         """Tangent stiffness at x, where `force` was evaluated last, times p [N]."""
         n, w = x.shape
-        self._launch(hessian_product, (self.nelem, w),
-                     [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x, scratch.rotation, p], [scratch.corner])  # fmt: skip
+        self._launch(
+            hessian_product,
+            (self.nelem, w),
+            [self.law, mu, lam, self.elem, self.inverse_edges, self.volume, x, scratch.rotation, p],
+            [scratch.corner],
+        )
         self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [product_out])
 
     def smallest_jacobian(self, scratch) -> np.ndarray:
@@ -270,7 +294,9 @@ class LinearTetrahedra:
         """Cauchy stress [nelem, nworld] mat33 and von Mises stress [nelem, nworld] [Pa]."""
         cauchy = wp.zeros((self.nelem, x.shape[1]), dtype=mat33, device=self.device)
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
-        self._launch(tet_stress, mises.shape, [self.law, mu, lam, self.elem, self.inverse_edges, x], [cauchy, mises])
+        self._launch(
+            tet_stress, mises.shape, [self.law, mu, lam, self.elem, self.inverse_edges, x], [cauchy, mises]
+        )
         scale_stress(self.modulus, cauchy, mises)
         return cauchy, mises
 

@@ -1,6 +1,7 @@
 """The inverse of the rest stiffness: constant, shared by all worlds, and the heart of every solve.
 
-Both classes hold the same operator over the free nodes: `solve` applies it and `rows` gives what one node's unit forces do everywhere.
+Both classes hold the same operator over the free nodes: `solve` applies it and `rows` gives what one node's
+  unit forces do everywhere.
 """
 
 import numpy as np
@@ -43,8 +44,8 @@ class SparseFactor:
     def rows(self, nodes) -> np.ndarray:
         """Rows of the inverse that belong to free nodes: (3 len(nodes), size) float32.
 
-        A row is computed with the rest of its cluster of nodes, always the same one, so that it does not depend on the order of requests.
-        """
+        A row is computed with the rest of its cluster of nodes, always the same one, so that it does not
+        depend on the order of requests."""
         local = self._index[nodes]
         out = np.empty((len(nodes), 3, self.size), np.float32)
         for cluster in np.unique(self._cluster[local]):
@@ -63,16 +64,17 @@ class SparseFactor:
         return (3 * self._index[nodes][:, None] + np.arange(3)).ravel()
 
 
-_ALIGN = 192  # rows of whole nodes (3) that fill the tensor cores' tiles (64): ragged sizes run at a third of the speed
+# rows of whole nodes (3) that fill the tensor cores' tiles (64): ragged sizes run at a third of the speed
+_ALIGN = 192
 
 
 class DenseFactor:
     """The dense inverse on a CUDA device (torch), rounded to half precision; sums are in single precision.
 
-    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs nothing as long as
-    everything is computed from the same rounded entries. Rounding the right-hand side would cost: contact makes results that are
-    small differences of large ones. So it travels as a sum of two halves, 22 bits in all.
-    """
+    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs
+    nothing as long as everything is computed from the same rounded entries. Rounding the right-hand side
+    would cost: contact makes results that are small differences of large ones. So it travels as a sum of two
+    halves, 22 bits in all."""
 
     def __init__(self, stiffness, free, vert, device):
         import torch
@@ -91,7 +93,8 @@ class DenseFactor:
         return self._torch.cholesky_inverse(self._torch.linalg.cholesky(matrix))
 
     def remainder(self, magnified):
-        """What rounding took from `inverse`, magnified, in half precision too: for materials to which it matters."""
+        """What rounding took from `inverse`, magnified, in half precision too: for materials to which it
+        matters."""
         out = self._torch.zeros_like(self.inverse)
         inside = (slice(self.size), slice(self.size))
         out[inside] = (self._inverse() / self.scale - self.inverse[inside]) * magnified
@@ -113,7 +116,8 @@ class DenseFactor:
 
 
 def _bisection_order(points: np.ndarray) -> np.ndarray:
-    """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and again."""
+    """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and
+    again."""
     order = np.arange(len(points))
     stack, out = [order], []
     while stack:

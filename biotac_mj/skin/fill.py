@@ -9,7 +9,8 @@ from .liquid import Rest
 
 __all__ = ["rest_state"]
 
-# Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no residual for later steps.
+# Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no
+# residual for later steps.
 _UNDERWAY, _ARRIVED = 1e-2, 1e-5
 
 
@@ -24,14 +25,20 @@ def rest_state(model) -> Rest:
     if not (model.has_liquid and (options.fill_volume or options.rest_pressure)):
         return Rest(vert, 0.0, volume, volume)
     if volume + options.fill_volume <= 0:
-        raise ValueError(f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)")
+        raise ValueError(
+            f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
+        )
     from .data import SkinData
     from .solver import step
 
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
-    bare.options = dataclasses.replace(options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY)
-    bare.material = dataclasses.replace(model.material, prony=(), mullins=None, hysteresis=())  # relaxed and virgin
+    bare.options = dataclasses.replace(
+        options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY
+    )
+    bare.material = dataclasses.replace(
+        model.material, prony=(), mullins=None, hysteresis=()
+    )  # relaxed and virgin
     bare.rest = Rest(vert, 0.0, volume, volume)
     data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
     liquid = data.liquid
@@ -53,11 +60,14 @@ def rest_state(model) -> Rest:
             if size < 1e-3:
                 which = "rest_pressure" if options.rest_pressure else "fill_volume"
                 raise ValueError(
-                    f"no balance of skin and liquid beyond {done:.0%} of {which} {getattr(options, which):g}: "
+                    f"no balance of skin and liquid beyond {done:.0%} of {which} "
+                    f"{getattr(options, which):g}: "
                     "this rubber does not hold it; take less"
                 )
     pressure, filled = float(liquid.gauge_pressure[0]), float(liquid.volume[0])
     natural = float(liquid.natural_volume[0])
     if options.rest_pressure:
-        natural = filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
+        natural = (
+            filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
+        )
     return Rest(data.vert_xpos[0].copy(), pressure, filled, natural)

@@ -24,28 +24,42 @@ class GeomSet:
       device: Warp device.
 
     Raises:
-      ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh without a grid.
+      ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh
+        without a grid.
     """
 
-    def __init__(self, types, sizes, friction=None, groups=None, rounding=None, grids=(), nworld=1, device="cpu"):
+    def __init__(
+        self, types, sizes, friction=None, groups=None, rounding=None, grids=(), nworld=1, device="cpu"
+    ):
         count = len(types)
         for kind in types:
             if kind not in GEOM_TYPES:
-                raise ValueError(f"geom type {kind!r} cannot touch the skin: use one of {', '.join(GEOM_TYPES)}")
-        if sum(kind == "mesh" for kind in types) != len(grids) or not all(isinstance(g, DistanceGrid) for g in grids):
-            raise ValueError("every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)")
+                raise ValueError(
+                    f"geom type {kind!r} cannot touch the skin: use one of {', '.join(GEOM_TYPES)}"
+                )
+        if sum(kind == "mesh" for kind in types) != len(grids) or not all(
+            isinstance(g, DistanceGrid) for g in grids
+        ):
+            raise ValueError(
+                "every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)"
+            )
         size = np.zeros((count, 3))
         for row, given in zip(size, sizes, strict=True):
             row[: len(given)] = given
         used = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0}
         for kind, row in zip(types, size, strict=True):
             if not np.isfinite(row).all() or (row[: used[kind]] <= 0).any():
-                raise ValueError(f"a {kind} of size {row.tolist()} is not a solid: sizes must be positive and finite")
+                raise ValueError(
+                    f"a {kind} of size {row.tolist()} is not a solid: sizes must be positive and finite"
+                )
         friction = np.zeros(count) if friction is None else np.asarray(friction, float)
         rounding = np.zeros(count) if rounding is None else np.asarray(rounding, float)
         for kind, row, radius in zip(types, size, rounding, strict=True):
             if not 0 <= radius <= row[: used[kind]].min(initial=np.inf):
-                raise ValueError(f"rounding of a {kind} is {radius}: a fillet's radius lies between 0 and the smallest size")
+                raise ValueError(
+                    f"rounding of a {kind} is {radius}: a fillet's radius lies between 0 and the smallest "
+                    "size"
+                )
         groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
         if not (np.isfinite(friction).all() and (friction >= 0).all()):
             raise ValueError(f"friction {friction.tolist()} must be finite and not negative")
@@ -63,7 +77,11 @@ class GeomSet:
             struct.group = wp.array(groups.astype(np.int32), dtype=int)
             struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
             struct.pos = wp.zeros((count, nworld), dtype=vec3)
-            struct.mat = wp.array(np.tile(np.eye(3), (count, nworld, 1, 1)), dtype=mat33) if count else wp.zeros((0, nworld), dtype=mat33)
+            struct.mat = (
+                wp.array(np.tile(np.eye(3), (count, nworld, 1, 1)), dtype=mat33)
+                if count
+                else wp.zeros((0, nworld), dtype=mat33)
+            )
             struct.pos_last = wp.clone(struct.pos)
             struct.mat_last = wp.clone(struct.mat)
         struct.grids, self._meshes = pack_grids(grids, self.device)
@@ -101,8 +119,22 @@ class GeomSet:
         if value.shape == (self.count, *item):
             value = np.broadcast_to(value, (self.nworld, *value.shape))
         if value.shape != (self.nworld, self.count, *item):
-            raise ValueError(f"geom {what} have shape {value.shape}: expected {(self.count, *item)} or {(self.nworld, self.count, *item)}")
+            raise ValueError(
+                f"geom {what} have shape {value.shape}: expected {(self.count, *item)} or "
+                f"{(self.nworld, self.count, *item)}"
+            )
         if not np.isfinite(value).all():
-            raise ValueError(f"geom {what} contain NaN or infinite numbers: the simulation has diverged or a pose was never set")
+            raise ValueError(
+                f"geom {what} contain NaN or infinite numbers: the simulation has diverged or a pose was "
+                "never set"
+            )
         if self.count:
-            wp.copy(target, wp.array(np.ascontiguousarray(np.swapaxes(value, 0, 1)), dtype=target.dtype, ndim=2, device=self.device))
+            wp.copy(
+                target,
+                wp.array(
+                    np.ascontiguousarray(np.swapaxes(value, 0, 1)),
+                    dtype=target.dtype,
+                    ndim=2,
+                    device=self.device,
+                ),
+            )

@@ -1,15 +1,16 @@
-"""Rubber with internal friction: loading and unloading differ at any speed, as Prandtl and Ishlinskii's friction elements beside the law.
+"""Rubber with internal friction: loading and unloading differ at any speed, as Prandtl and Ishlinskii's
+friction elements beside the law.
 
-Every branch is a spring (shear modulus g mu) in series with a friction element that slips when the spring's von Mises equivalent strain is
-`strain`. Within a step it has the potential
+Every branch is a spring (shear modulus g mu) in series with a friction element that slips when the spring's
+von Mises equivalent strain is `strain`. Within a step it has the potential
 
     min over E'  of   g mu |dev(A - E')|^2  +  2 g mu r |E' - E_p|,         r = sqrt(3/2) strain
 
-of the strain A, with E_p the slip when the last step ended (Simo and Hughes 1998, ch. 1-3: radial return is its minimum). So its stress
-Q = 2 g mu dev(A - E') has at most the size 2 g mu r, its tangent is symmetric and exact, slip only dissipates, and nothing depends on time.
-A is the strain of Green and Lagrange, of neo_hookean the isochoric one, (J^(-2/3) F^T F - I) / 2, of linear the small strain; Q is the
-second Piola stress that belongs to it and turns with the body.
-"""
+of the strain A, with E_p the slip when the last step ended (Simo and Hughes 1998, ch. 1-3: radial return is
+its minimum). So its stress Q = 2 g mu dev(A - E') has at most the size 2 g mu r, its tangent is symmetric and
+exact, slip only dissipates, and nothing depends on time. A is the strain of Green and Lagrange, of
+neo_hookean the isochoric one, (J^(-2/3) F^T F - I) / 2, of linear the small strain; Q is the second Piola
+stress that belongs to it and turns with the body."""
 
 import numpy as np
 import warp as wp
@@ -169,7 +170,8 @@ class FrictionBranches:
     """The branches of `Material.hysteresis` at every integration point of every world.
 
     Args:
-      hysteresis: ((g, strain), ...); law: number of the material law; mu: (nworld,) Warp array [Pa]; points: IntegrationPoints.
+      hysteresis: ((g, strain), ...); law: number of the material law; mu: (nworld,) Warp array [Pa]; points:
+        IntegrationPoints.
 
     Attributes:
       slip: (nbranch, npoint, nworld, 3, 3) E_p, deviatoric.
@@ -196,9 +198,12 @@ class FrictionBranches:
         self._points.launch(add_stress, [self._law, self._mu, self._branch, self._slip, gradient], [stress])
 
     def add_derivative(self, gradient, change, stress):
-        self._points.launch(add_derivative, [self._law, self._mu, self._branch, self._slip, gradient, change], [stress])
+        self._points.launch(
+            add_derivative, [self._law, self._mu, self._branch, self._slip, gradient, change], [stress]
+        )
 
     def commit(self, gradient, good):
-        """Takes over the slip of the step that ended at these gradients in the worlds that are good (nworld,)."""
+        """Takes over the slip of the step that ended at these gradients in the worlds that are good
+        (nworld,)."""
         self._points.launch(slide, [self._law, self._branch, self._slip, gradient], [self._next])
         self.slip[:, :, good] = self._next.numpy()[:, :, good]

@@ -1,4 +1,5 @@
-"""Contact of a skin's outer surface by a `ContactLaw`: adhesion, and friction that depends on pressure. See `contact_law` for the law."""
+"""Contact of a skin's outer surface by a `ContactLaw`: adhesion, and friction that depends on pressure. See
+`contact_law` for the law."""
 
 import warp as wp
 
@@ -15,7 +16,8 @@ _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
 @wp.struct
 class Laws:
-    """One number for each world: n; W of coming together and of parting [J/m^2]; range [m]. For all: p0 [Pa]; nodal areas [m^2]."""
+    """One number for each world: n; W of coming together and of parting [J/m^2]; range [m]. For all: p0 [Pa];
+    nodal areas [m^2]."""
 
     exponent: wp.array(dtype=real)
     work: wp.array(dtype=real)
@@ -27,7 +29,8 @@ class Laws:
 
 @wp.func
 def normal_traction(k: real, peak: real, reach: real, gap: real):
-    """Push (negative: pull) per area and its slope where it is not softening, for contact springs k; all three in one unit of area."""
+    """Push (negative: pull) per area and its slope where it is not softening, for contact springs k; all
+    three in one unit of area."""
     if k * gap <= peak:
         return wp.vec2d(-k * gap, k)
     return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
@@ -50,13 +53,18 @@ def push(
     t = face[f]
     c0 = x[t[0], w]
     center = (c0 + x[t[1], w] + x[t[2], w]) / real(3.0)
-    radius = wp.max(wp.length(c0 - center), wp.max(wp.length(x[t[1], w] - center), wp.length(x[t[2], w] - center)))
+    radius = wp.max(
+        wp.length(c0 - center), wp.max(wp.length(x[t[1], w] - center), wp.length(x[t[2], w] - center))
+    )
     total = vec3()
     k = stiffness * area[f] / real(sample.shape[0])
     for g in range(geoms.count):
         R = wp.transpose(geoms.mat[g, w])
         y = R * (center - geoms.pos[g, w])
-        if distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y) < radius:
+        if (
+            distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            < radius
+        ):
             for s in range(sample.shape[0]):
                 b = sample[s]
                 y = R * (b[0] * c0 + b[1] * x[t[1], w] + b[2] * x[t[2], w] - geoms.pos[g, w])
@@ -85,8 +93,8 @@ def touch_sample(
     anchor_geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
 ):
-    """Contact of sample i with its share of area [m^2]: geom (-1: none), the geom that it has touched, force [N], its tangent [N/m],
-    anchor."""
+    """Contact of sample i with its share of area [m^2]: geom (-1: none), the geom that it has touched, force
+    [N], its tangent [N/m], anchor."""
     p = b[0] * x0 + b[1] * x1 + b[2] * x2
     touched = int(-1)
     gap = laws.reach[w]
@@ -167,7 +175,8 @@ def lawful_contact_force(
     force_out: wp.array2d(dtype=vec3),
     bond_out: wp.array2d(dtype=int),
 ):
-    """As `contact.contact_force`; bond_out: the geom that a sample is in contact with, or has been and is still in range of."""
+    """As `contact.contact_force`; bond_out: the geom that a sample is in contact with, or has been and is
+    still in range of."""
     f, w = wp.tid()
     nsample = sample.shape[0]
     t = face[f]
@@ -175,7 +184,9 @@ def lawful_contact_force(
     x1 = x[t[1], w]
     x2 = x[t[2], w]
     center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center))))
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
     near = int(0)
     for g in range(geoms.count):
         R = geoms.mat[g, w]

@@ -1,13 +1,16 @@
 """The liquid between core and skin: one pressure per sensor that resists a change of the volume between them.
 
-The inner surface of the skin is closed, so the divergence theorem gives the cavity's volume and its gradient; the core inside is rigid
-and only subtracts a constant. Liquid is what is between the two: where the skin lies on the core there is none, so the overlap that
-penalty contact needs is no volume, and no pressure acts there. p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the
-liquid has without pressure; with infinite K the pressure is an unknown of its own (see `docs/liquid.md`).
+The inner surface of the skin is closed, so the divergence theorem gives the cavity's volume and its gradient;
+the core inside is rigid and only subtracts a constant. Liquid is what is between the two: where the skin lies
+on the core there is none, so the overlap that penalty contact needs is no volume, and no pressure acts there.
+p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the liquid has without pressure; with
+infinite K the pressure is an unknown of its own (see `docs/liquid.md`).
 
-Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c, s = min(c / 2 p_ref, 1),
-p_ref the liquid's pressure when the step began. What pushes the skin off, c + (1 - s) p, then grows with the overlap everywhere. Switched
-at c = 0 instead, the skin would have two states of balance: pressed off the core by liquid under it, or stuck to it without. Bonded
+Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c,
+  s = min(c / 2 p_ref, 1),
+p_ref the liquid's pressure when the step began. What pushes the skin off, c + (1 - s) p, then grows with the
+overlap everywhere. Switched at c = 0 instead, the skin would have two states of balance: pressed off the core
+by liquid under it, or stuck to it without. Bonded
 faces need no such care: their nodes are held, so it does not matter that pressure is counted on them as well.
 """
 
@@ -35,7 +38,8 @@ def cavity_volume(
     # Out:
     volume_out: wp.array2d(dtype=real),
 ):
-    """Each inner face's share of the cavity's volume [face, world]; normals point into the cavity, hence the sign."""
+    """Each inner face's share of the cavity's volume [face, world]; normals point into the cavity, hence the
+    sign."""
     f, w = wp.tid()
     t = face[f]
     volume_out[f, w] = -wp.dot(x[t[0], w], wp.cross(x[t[1], w], x[t[2], w])) / real(6.0)
@@ -84,10 +88,11 @@ def wetting(
     volume_out: wp.array2d(dtype=real),
     wet_out: wp.array2d(dtype=vec3),
 ):
-    """Share of the liquid's volume under each inner face, and of the face's area that is wet and pushes on each corner (1/3 where all is).
+    """Share of the liquid's volume under each inner face, and of the face's area that is wet and pushes on
+    each corner (1/3 where all is).
 
-    `slot` is a face's number on the surface that can meet the core, -1 where it cannot; `area` to `force` are of that surface.
-    """
+    `slot` is a face's number on the surface that can meet the core, -1 where it cannot; `area` to `force` are
+    of that surface."""
     f, w = wp.tid()
     t = face[f]
     x0 = x[t[0], w]
@@ -144,7 +149,8 @@ def gradient_derivative(
     # Out:
     corner_out: wp.array2d(dtype=vec3),
 ):
-    """Derivative of `wet_gradient` along p, the wet parts held; its sum over a closed surface is symmetric."""
+    """Derivative of `wet_gradient` along p, the wet parts held; its sum over a closed surface is
+    symmetric."""
     f, w = wp.tid()
     t = face[f]
     e1 = x[t[1], w] - x[t[0], w]
@@ -171,7 +177,8 @@ def soften_face(
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """Takes from a core face's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref) of k."""
+    """Takes from a core face's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref)
+    of k."""
     nsample = sample.shape[0]
     share = area[f] / real(nsample)
     factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * share
@@ -236,7 +243,11 @@ class _PerWorld:
         self._name = "_" + name
 
     def __get__(self, liquid, owner=None):
-        return getattr(liquid, self._name) if liquid.worlds is None else getattr(liquid.worlds, self._field).numpy()
+        return (
+            getattr(liquid, self._name)
+            if liquid.worlds is None
+            else getattr(liquid.worlds, self._field).numpy()
+        )
 
     def __set__(self, liquid, value):
         value = np.array(np.broadcast_to(np.asarray(value, float), (liquid.nworld,)))
@@ -247,15 +258,19 @@ class _PerWorld:
 
 
 class Liquid:
-    """The liquid of one SkinData: `evaluate` after the contact forces, then `force`; `product` is its share of the tangent.
+    """The liquid of one SkinData: `evaluate` after the contact forces, then `force`; `product` is its share
+    of the tangent.
 
     Args:
-      worlds: `device_worlds.Worlds` where the state lives on the device, which then also evaluates; else None.
+      worlds: `device_worlds.Worlds` where the state lives on the device, which then also evaluates; else
+        None.
 
     Attributes (nworld,):
       bulk_modulus: K [Pa]. extra: liquid beyond the model's fill [m^3].
-      natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V [Pa/m^3].
-      offset: pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is incompressible.
+      natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V
+        [Pa/m^3].
+      offset: pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is
+        incompressible.
       last_pressure: above the surroundings, of the last step [Pa].
       gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
@@ -292,7 +307,8 @@ class Liquid:
 
     def fill(self, natural_volume):
         """Takes as much liquid as has this volume without pressure [m^3]."""
-        # an incompressible liquid: the pressure of the last step is what the next starts from, and this stiffness only finds the change
+        # an incompressible liquid: the pressure of the last step is what the next starts from, and this
+        # stiffness only finds the change
         K = self.bulk_modulus
         self.natural_volume = natural_volume
         self.stiffness = np.where(np.isfinite(K), K, WATER) / natural_volume if self.m.has_liquid else 0.0
@@ -316,7 +332,8 @@ class Liquid:
         _view(self._reference)[...] = np.maximum(np.abs(self.last_pressure), _REFERENCE)
 
     def evaluate(self, x, core):
-        """Volume, wet faces and pressure of the skin at x [nvert, nworld]; `core` is the contact with the core there, or None."""
+        """Volume, wet faces and pressure of the skin at x [nvert, nworld]; `core` is the contact with the
+        core there, or None."""
         m = self.m
         if core is None:
             area, touching, geom, force = self._no_area, self._none[0], self._none[0], self._none[1]
@@ -331,7 +348,12 @@ class Liquid:
         self.gauge_pressure = self.offset - self.stiffness * (self.volume - self.natural_volume)
         if core is not None:
             _view(self._pressure)[...] = self.gauge_pressure
-            self._launch(soften_contact, touching.shape, [*contact, self._pressure, touching, geom, force], [core.block])
+            self._launch(
+                soften_contact,
+                touching.shape,
+                [*contact, self._pressure, touching, geom, force],
+                [core.block],
+            )
 
     def gradient(self, x):
         """dV/dx by corners of the inner faces, for `elasticity.gather`."""
@@ -340,7 +362,9 @@ class Liquid:
 
     def gradient_derivative(self, x, p):
         """The same of the derivative of dV/dx along p."""
-        self._launch(gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner])
+        self._launch(
+            gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner]
+        )
         return self._corner
 
     def commit(self, good):

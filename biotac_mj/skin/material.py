@@ -1,11 +1,14 @@
-"""Hyperelastic materials of the skin: energy density, first Piola-Kirchhoff stress and its directional derivative.
+"""Hyperelastic materials of the skin: energy density, first Piola-Kirchhoff stress and its directional
+derivative.
 
 The four laws take the same two Lame-like constants and differ in the energy W(F):
 
-  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar decomposition
+  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar
+  decomposition
   svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2       Saint Venant-Kirchhoff
-  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and CalculiX have it
-  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not invariant to rotation
+  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and
+  CalculiX have it linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not
+  invariant to rotation
 """
 
 import dataclasses
@@ -34,12 +37,15 @@ class Material:
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
       liquid: whether the preset fills the space between skin and core with the liquid.
-      element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see `SkinOptions`.
-      prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term modulus. Steps need their dt.
+      element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see
+        `SkinOptions`.
+      prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term
+        modulus. Steps need their dt.
       mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `stress_memory`.
-      hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus that slips at this von Mises
-        strain, see `hysteresis`.
-      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four: CPU, full tier.
+      hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus
+        that slips at this von Mises strain, see `hysteresis`.
+      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four:
+        CPU, full tier.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.
@@ -63,15 +69,21 @@ class Material:
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
         if self.element not in (None, *ELEMENTS):
-            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the geometry's")
+            raise ValueError(
+                f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the "
+                "geometry's"
+            )
         for name in ("youngs_modulus", "poissons_ratio", "friction", "density", "stiffening"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
         if self.youngs_modulus <= 0 or self.density <= 0:
-            raise ValueError(f"Young's modulus {self.youngs_modulus} Pa and density {self.density} kg/m^3 must be positive")
+            raise ValueError(
+                f"Young's modulus {self.youngs_modulus} Pa and density {self.density} kg/m^3 must be positive"
+            )
         if not -1 < self.poissons_ratio < 0.5:
             raise ValueError(
-                f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber needs nu below 0.5, "
+                f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber "
+                "needs nu below 0.5, "
                 "the liquid's volume constraint does the rest"
             )
         if self.friction < 0:
@@ -85,25 +97,32 @@ class Material:
                 object.__setattr__(self, "mullins", (r, m, beta))
         except (TypeError, ValueError):
             raise ValueError(
-                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and (r, m, beta) or None"
+                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and (r, m, "
+                "beta) or None"
             ) from None  # noqa: E501
         for g, tau in self.prony:
             if not (math.isfinite(g) and g >= 0 and math.isfinite(tau) and tau > 0):
                 raise ValueError(
-                    f"a Prony term of g {g} and tau {tau} s: g must be >= 0 and tau positive, else energy would come from nothing"
+                    f"a Prony term of g {g} and tau {tau} s: g must be >= 0 and tau positive, else energy "
+                    "would come from nothing"
                 )  # noqa: E501
         if self.mullins is not None and not (r > 1 and m > 0 and beta >= 0 and math.isfinite(r + m + beta)):
-            raise ValueError(f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0")
+            raise ValueError(
+                f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0"
+            )
 
     def _check_hysteresis(self):
         try:
-            object.__setattr__(self, "hysteresis", tuple((float(g), float(strain)) for g, strain in self.hysteresis))
+            object.__setattr__(
+                self, "hysteresis", tuple((float(g), float(strain)) for g, strain in self.hysteresis)
+            )
         except (TypeError, ValueError):
             raise ValueError(f"hysteresis is {self.hysteresis!r}: pass ((g, strain), ...)") from None
         for g, strain in self.hysteresis:
             if not (math.isfinite(g) and g >= 0 and math.isfinite(strain) and strain > 0):
                 raise ValueError(
-                    f"a friction element of g {g} and strain {strain}: g must be >= 0 and the strain at which it slips positive"
+                    f"a friction element of g {g} and strain {strain}: g must be >= 0 and the strain at "
+                    "which it slips positive"
                 )
 
     @property
@@ -129,7 +148,11 @@ class Material:
     @property
     def lame(self) -> float:
         """Lame's first constant lambda [Pa]."""
-        return self.youngs_modulus * self.poissons_ratio / ((1 + self.poissons_ratio) * (1 - 2 * self.poissons_ratio))
+        return (
+            self.youngs_modulus
+            * self.poissons_ratio
+            / ((1 + self.poissons_ratio) * (1 - 2 * self.poissons_ratio))
+        )
 
     @property
     def bulk(self) -> float:
@@ -137,9 +160,10 @@ class Material:
         return self.youngs_modulus / (3 * (1 - 2 * self.poissons_ratio))
 
 
-# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on elements that do not lock:
-# nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is squeezed on the core; "rubber": nu 0.45, as the reference
-# solutions). "paper" keeps to linear tetrahedra: the stiffness of its mesh is in the fitted modulus.
+# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on
+# elements that do not lock: nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is
+# squeezed on the core; "rubber": nu 0.45, as the reference solutions). "paper" keeps to linear tetrahedra:
+# the stiffness of its mesh is in the fitted modulus.
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False, element="linear"),
@@ -153,13 +177,16 @@ def material(choice) -> Material:
     if isinstance(choice, Material):
         return choice
     if choice not in PRESETS:
-        raise ValueError(f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, or pass a Material")
+        raise ValueError(
+            f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, or pass a Material"
+        )
     return PRESETS[choice]
 
 
 @wp.func
 def polar_rotation(F: mat33):
-    """Rotation of the polar decomposition F = R S (Newton's iteration; by SVD where F is inverted or nearly flat)."""
+    """Rotation of the polar decomposition F = R S (Newton's iteration; by SVD where F is inverted or nearly
+    flat)."""
     if wp.determinant(F) < real(1.0e-3):
         U = mat33()
         s = wp.vec3d()
@@ -200,9 +227,9 @@ def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
         return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
     if law == 2:
         J = wp.determinant(F)
-        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(0.5) * lam * (J - real(1.0)) * (
-            J - real(1.0)
-        )
+        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(
+            0.5
+        ) * lam * (J - real(1.0)) * (J - real(1.0))
     e = real(0.5) * (F + wp.transpose(F)) - eye
     return real(0.5) * lam * wp.trace(e) * wp.trace(e) + mu * wp.ddot(e, e)
 
@@ -219,7 +246,10 @@ def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
     if law == 2:
         J = wp.determinant(F)
         G = wp.transpose(wp.inverse(F))
-        return mu * wp.pow(J, -real(2.0) / real(3.0)) * (F - wp.ddot(F, F) / real(3.0) * G) + lam * (J - real(1.0)) * J * G
+        return (
+            mu * wp.pow(J, -real(2.0) / real(3.0)) * (F - wp.ddot(F, F) / real(3.0) * G)
+            + lam * (J - real(1.0)) * J * G
+        )
     e = real(0.5) * (F + wp.transpose(F)) - eye
     return lam * wp.trace(e) * eye + real(2.0) * mu * e
 
@@ -241,7 +271,9 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         E = real(0.5) * (Ft * F - eye)
         A = Ft * dF
         dE = real(0.5) * (A + wp.transpose(A))
-        return dF * (lam * wp.trace(E) * eye + real(2.0) * mu * E) + F * (lam * wp.trace(dE) * eye + real(2.0) * mu * dE)
+        return dF * (lam * wp.trace(E) * eye + real(2.0) * mu * E) + F * (
+            lam * wp.trace(dE) * eye + real(2.0) * mu * dE
+        )
     if law == 2:
         J = wp.determinant(F)
         G = wp.transpose(wp.inverse(F))
@@ -249,7 +281,9 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         GdF = wp.ddot(G, dF)
         dG = -G * wp.transpose(dF) * G
         I1 = wp.ddot(F, F) / real(3.0)
-        iso = a * (dF - real(2.0) / real(3.0) * wp.ddot(F, dF) * G - I1 * dG) - real(2.0) / real(3.0) * a * GdF * (F - I1 * G)
+        iso = a * (dF - real(2.0) / real(3.0) * wp.ddot(F, dF) * G - I1 * dG) - real(2.0) / real(
+            3.0
+        ) * a * GdF * (F - I1 * G)
         return mu * iso + lam * J * ((real(2.0) * J - real(1.0)) * GdF * G + (J - real(1.0)) * dG)
     de = real(0.5) * (dF + wp.transpose(dF))
     return lam * wp.trace(de) * eye + real(2.0) * mu * de
@@ -257,7 +291,8 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
 
 @wp.func
 def dilatation(law: int, F: mat33, R: mat33):
-    """The measure theta of volume change that multiplies `lam` in the energy: W = W(lam = 0) + lam/2 theta^2."""
+    """The measure theta of volume change that multiplies `lam` in the energy: W = W(lam = 0) + lam/2
+    theta^2."""
     eye = wp.identity(n=3, dtype=real)
     if law == 0:
         return wp.trace(wp.transpose(R) * F) - real(3.0)

@@ -29,24 +29,29 @@ class SkinOptions:
     """How the skin is solved.
 
     Attributes:
-      element: "linear" (four nodes) or "quadratic" (ten nodes: does not lock); None takes the material's choice, and where it has none the
-        geometry's. Ten-node tetrahedra are solved as linear ones by their eight parts; four-node ones as quadratic get a node on every
-        edge, behind the geometry's own (`with_edge_nodes`).
+      element: "linear" (four nodes) or "quadratic" (ten nodes: does not lock); None takes the material's
+        choice, and where it has none the geometry's. Ten-node tetrahedra are solved as linear ones by their
+        eight parts; four-node ones as quadratic get a node on every edge, behind the geometry's own
+        (`with_edge_nodes`).
       dynamics: "quasistatic" (no inertia) or "implicit" (backward Euler with lumped masses).
       liquid: fills the space between skin and core; None takes the material preset's choice.
       bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf keeps its volume.
-      fill_volume: liquid beyond what the unstressed skin holds [m^3]; less where negative. It inflates the skin at rest.
+      fill_volume: liquid beyond what the unstressed skin holds [m^3]; less where negative. It inflates the
+        skin at rest.
       rest_pressure: instead, the liquid's pressure at rest above the surroundings [Pa].
       core_contact: whether the inner surface can touch the rigid core.
-      core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core contact [m].
+      core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core
+        contact [m].
       max_core_depth: a geom that reaches deeper into the core than this is refused [m].
-      contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference solutions' ratio.
+      contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference
+        solutions' ratio.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
-      contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's law. On the CPU's full tier.
+      contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's
+        law. On the CPU's full tier.
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
-      tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below this fraction of the energy
-        norm of the load.
+      tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below
+        this fraction of the energy norm of the load.
       max_newton, max_cg: iteration limits of a step and of each linear solve.
 
     Raises:
@@ -76,11 +81,21 @@ class SkinOptions:
         if self.dynamics not in ("quasistatic", "implicit"):
             raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
         if self.element not in (None, *ELEMENTS):
-            raise ValueError(f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the material's choice")
+            raise ValueError(
+                f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the "
+                "material's choice"
+            )
         if not self.bulk_modulus > 0:
-            raise ValueError(f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf")
-        if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (self.fill_volume and self.rest_pressure):
-            raise ValueError(f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of them, a finite number")
+            raise ValueError(
+                f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf"
+            )
+        if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (
+            self.fill_volume and self.rest_pressure
+        ):
+            raise ValueError(
+                f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of "
+                "them, a finite number"
+            )
         object.__setattr__(self, "contact_law", contact_law(self.contact_law))
         for name in ("stick_ratio", "tolerance"):
             value = getattr(self, name)
@@ -90,16 +105,24 @@ class SkinOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}: pass a finite number >= 0")
-        if self.contact_stiffness is not None and not (math.isfinite(self.contact_stiffness) and self.contact_stiffness > 0):
-            raise ValueError(f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None")
+        if self.contact_stiffness is not None and not (
+            math.isfinite(self.contact_stiffness) and self.contact_stiffness > 0
+        ):
+            raise ValueError(
+                f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None"
+            )
         if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
             raise ValueError("samples, max_newton and max_cg must be at least 1")
 
 
-def solved_geometry(geometry: SkinGeometry, material: Material, options: SkinOptions) -> tuple[SkinGeometry, str]:
+def solved_geometry(
+    geometry: SkinGeometry, material: Material, options: SkinOptions
+) -> tuple[SkinGeometry, str]:
     """The geometry with all nodes that the solver moves, and its element, see `SkinOptions.element`."""
     element = options.element or material.element or geometry.element
-    return (with_edge_nodes(geometry) if element == "quadratic" and geometry.element == "linear" else geometry), element
+    return (
+        with_edge_nodes(geometry) if element == "quadratic" and geometry.element == "linear" else geometry
+    ), element
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +152,9 @@ class Surface:
 class SkinModel:
     """Constants of a skin on one device.
 
-    With quadratic elements on a geometry of four-node tetrahedra `geometry` is the refined one: the nodes of the given geometry come first
-    and keep their numbers, so `vert_xpos[:, :given.nvert]` fits it; a node on each edge follows.
+    With quadratic elements on a geometry of four-node tetrahedra `geometry` is the refined one: the nodes of
+    the given geometry come first and keep their numbers, so `vert_xpos[:, :given.nvert]` fits it; a node on
+    each edge follows.
 
     Args:
       geometry: the skin.
@@ -138,15 +162,18 @@ class SkinModel:
       options: SkinOptions.
       device: "cpu" or a CUDA device of Warp.
       fixed: (n,) nodes of the given geometry that do not move, instead of its own.
-      core_faces: (n,) inner faces of the given geometry that can meet the core, instead of all that start clear of it.
-      modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each element of the given geometry, or a
-        function of rest positions (n, 3) [m] that gives (n,), asked at the centroids of the elements that are solved. CPU, full tier.
+      core_faces: (n,) inner faces of the given geometry that can meet the core, instead of all that start
+        clear of it.
+      modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each
+        element of the given geometry, or a function of rest positions (n, 3) [m] that gives (n,), asked at
+        the centroids of the elements that are solved. CPU, full tier.
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.
 
     Raises:
-      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed, a modulus of another shape or not positive, or on CUDA.
+      ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed, a modulus of another shape or not
+        positive, or on CUDA.
     """
 
     def __init__(
@@ -168,7 +195,8 @@ class SkinModel:
         vert = geometry.vert
         if not np.isfinite(vert).all():
             raise ValueError(
-                f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or infinite: repair the mesh"
+                f"skin {geometry.name!r} has {(~np.isfinite(vert)).any(1).sum()} nodes that are NaN or "
+                "infinite: repair the mesh"
             )
         if fixed is not None:
             geometry = dataclasses.replace(geometry, fixed=fixed)
@@ -181,7 +209,10 @@ class SkinModel:
         self.nvert, self.nelem, self._elem = len(vert), len(elem), elem
         self.fixed = geometry.fixed.astype(int)
         if not len(self.fixed):
-            raise ValueError(f"skin {geometry.name!r} has no fixed nodes: it would float away; fix those on core, nail and clamp")
+            raise ValueError(
+                f"skin {geometry.name!r} has no fixed nodes: it would float away; fix those on core, nail "
+                "and clamp"
+            )
         self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
         self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
@@ -197,7 +228,9 @@ class SkinModel:
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(contact.face_samples(self.options.samples), dtype=vec3)
             self.outer = Surface.create(vert, geometry.outer_face, self.device)
-            self.inner = Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
+            self.inner = (
+                Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
+            )
         self.has_liquid = bool(self.has_liquid and self.inner is not None)
         self.has_core = bool(self.options.core_contact and self.inner is not None and len(geometry.core_face))
         if self.has_core:
@@ -217,7 +250,10 @@ class SkinModel:
     def _moduli(self, modulus, given):
         """(nelem,) factors on Young's modulus of the elements that are solved."""
         if self.device.is_cuda:
-            raise ValueError("skin with a modulus of its own in every element is solved on the CPU's full tier only: choose device='cpu'")
+            raise ValueError(
+                "skin with a modulus of its own in every element is solved on the CPU's full tier only: "
+                "choose device='cpu'"
+            )
         if callable(modulus):
             at = self.geometry.vert[self._elem[:, :4]].mean(1)
             factor, n, what = np.asarray(modulus(at), float), self.nelem, f"{self.nelem} positions"
@@ -225,26 +261,39 @@ class SkinModel:
             factor, n = np.asarray(modulus, float), len(given.elem)
             what = f"{n} elements of {given.name!r}"
         if factor.shape != (n,):
-            raise ValueError(f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)")
+            raise ValueError(
+                f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
+            )
         if not (np.isfinite(factor) & (factor > 0)).all():
             raise ValueError(
-                f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not positive finite numbers"
+                f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
+                "positive finite numbers"
             )
-        return np.repeat(factor, self.nelem // n)  # the eight linear parts of a ten-node tetrahedron follow each other
+        return np.repeat(
+            factor, self.nelem // n
+        )  # the eight linear parts of a ten-node tetrahedron follow each other
 
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
         if nworld not in self._cores:
             grid = _core_grid(self.geometry)
-            self._cores[nworld] = GeomSet(["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device)
+            self._cores[nworld] = GeomSet(
+                ["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device
+            )
         return self._cores[nworld]
 
     def _core_faces(self) -> np.ndarray:
-        """Inner faces that can meet the core: those that start nearer to it than the clearance lie on it (bonded, or faceted into it)."""
+        """Inner faces that can meet the core: those that start nearer to it than the clearance lie on it
+        (bonded, or faceted into it)."""
         face = self.geometry.inner_face
         gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
-        wp.launch(clearance.rest_gap, dim=(len(face), len(self.sample)),
-                  inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert], outputs=[gap], device=self.device)  # fmt: skip
+        wp.launch(
+            clearance.rest_gap,
+            dim=(len(face), len(self.sample)),
+            inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert],
+            outputs=[gap],
+            device=self.device,
+        )
         return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 
     def _core_slots(self):
@@ -260,7 +309,13 @@ class SkinModel:
         if self.inner is None:
             return 0.0, 0.0
         share = wp.zeros((len(self.inner.face), 1), dtype=real, device=self.device)
-        wp.launch(liquid.cavity_volume, dim=share.shape, inputs=[self.inner.face, self.vert], outputs=[share], device=self.device)
+        wp.launch(
+            liquid.cavity_volume,
+            dim=share.shape,
+            inputs=[self.inner.face, self.vert],
+            outputs=[share],
+            device=self.device,
+        )
         cavity = float(share.numpy().sum())
         a, b, c = np.moveaxis(self.geometry.core_vert[self.geometry.core_face], 1, 0)
         core = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6) if len(a) else 0.0
@@ -273,7 +328,8 @@ class SkinModel:
 
     @functools.cached_property
     def rest(self) -> liquid.Rest:
-        """The skin and its liquid without touching geoms: inflated where the options say so, solved when first asked for."""
+        """The skin and its liquid without touching geoms: inflated where the options say so, solved when
+        first asked for."""
         return rest_state(self)
 
     @functools.cached_property
@@ -282,10 +338,13 @@ class SkinModel:
         return self._invert(self._stiffness)
 
     def factor_at(self, vert_xpos):
-        """The same for the skin in a deformed shape: its stiffness had it been made so, always positive definite.
+        """The same for the skin in a deformed shape: its stiffness had it been made so, always positive
+        definite.
 
-        Nearly incompressible rubber that has turned and strained resists volume change along other directions than at rest, which the
-        factor at rest does not know: preconditioned by it, conjugate gradients need hundreds of iterations at nu 0.4999 where this one
+        Nearly incompressible rubber that has turned and strained resists volume change along other directions
+        than at rest, which the
+        factor at rest does not know: preconditioned by it, conjugate gradients need hundreds of iterations at
+          nu 0.4999 where this one
         needs a few.
 
         Args:
@@ -294,7 +353,9 @@ class SkinModel:
         Raises:
           ValueError: a tetrahedron is inverted there.
         """
-        formulation = type(self.elasticity)(vert_xpos, self._elem, self.law, self.device, modulus=self.modulus)
+        formulation = type(self.elasticity)(
+            vert_xpos, self._elem, self.law, self.device, modulus=self.modulus
+        )
         return self._invert(self._of_free(formulation.rest_stiffness(self.material.mu, self.material.lame)))
 
     def _invert(self, stiffness):
@@ -316,7 +377,8 @@ def _cached_core_grid(key, spacing):
 
 
 class _Key:
-    """Makes a pair of arrays hashable by content, so that models of one geometry share the core's distance grid."""
+    """Makes a pair of arrays hashable by content, so that models of one geometry share the core's distance
+    grid."""
 
     def __init__(self, *arrays):
         self.arrays = arrays

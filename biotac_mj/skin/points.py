@@ -1,4 +1,5 @@
-"""From nodes to integration points and back: deformation gradients there, and the nodal forces of stresses there, for both elements."""
+"""From nodes to integration points and back: deformation gradients there, and the nodal forces of stresses
+there, for both elements."""
 
 import numpy as np
 import warp as wp
@@ -52,7 +53,9 @@ def linear_divergence(
 ):
     """Nodal forces of first Piola stresses, times sign."""
     e, w = wp.tid()
-    elasticity.write_corners(sign * volume[e] * stress[e, w] * wp.transpose(inverse_edges[e]), e, w, corner_out)
+    elasticity.write_corners(
+        sign * volume[e] * stress[e, w] * wp.transpose(inverse_edges[e]), e, w, corner_out
+    )
 
 
 @wp.kernel
@@ -69,7 +72,9 @@ def quadratic_divergence(
     e, w = wp.tid()
     C = quadratic.mat310()
     for q in range(4):
-        C += (sign * weight[e, q] * stress[4 * e + q, w] * wp.transpose(inverse[e, q])) * wp.transpose(shape[q])
+        C += (sign * weight[e, q] * stress[4 * e + q, w] * wp.transpose(inverse[e, q])) * wp.transpose(
+            shape[q]
+        )
     quadratic.scatter(C, e, w, corner_out)
 
 
@@ -81,7 +86,8 @@ class IntegrationPoints:
       nworld: number of worlds.
 
     Attributes:
-      shape: (npoint, nworld). modulus: (npoint,) Warp array of factors on the elastic constants. share: (npoint,) of the element's volume.
+      shape: (npoint, nworld). modulus: (npoint,) Warp array of factors on the elastic constants. share:
+        (npoint,) of the element's volume.
     """
 
     def __init__(self, elements, nworld):
@@ -91,7 +97,11 @@ class IntegrationPoints:
         with wp.ScopedDevice("cpu"):
             self._corner = wp.zeros((corners * elements.nelem, nworld), dtype=vec3)
             self.modulus = wp.full(self.shape[0], real(1.0), dtype=real)
-        self.share = (elements._weight / elements._volume[:, None]).ravel() if self.quadratic else np.ones(elements.nelem)
+        self.share = (
+            (elements._weight / elements._volume[:, None]).ravel()
+            if self.quadratic
+            else np.ones(elements.nelem)
+        )
         if elements.modulus is not None:
             self.modulus.numpy()[:] = elements.modulus.repeat(each)
 
@@ -108,7 +118,8 @@ class IntegrationPoints:
             self.launch(linear_gradient, [e.elem, e.inverse_edges, x], [out])
 
     def add_forces(self, stress, sign, node_out):
-        """Adds the nodal forces of first Piola stresses [npoint, nworld], times sign, to node_out [nvert, nworld]."""
+        """Adds the nodal forces of first Piola stresses [npoint, nworld], times sign, to node_out [nvert,
+        nworld]."""
         e = self._elements
         if self.quadratic:
             inputs = [e.shape, e.inverse, e.weight, stress, sign]

@@ -1,9 +1,11 @@
 """Preconditioner of the linear solves: the rest stiffness' inverse, corrected exactly for contact and liquid.
 
-Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume. With
-U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's identity gives
+Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume.
+With U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's
+identity gives
 
-  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T and g).
+  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T
+  and g).
 """
 
 import numpy as np
@@ -32,7 +34,8 @@ class Preconditioner:
         self.factor, self._rows = self._rest, self._rest_rows
 
     def update(self, states, residual, gradient, kappa):
-        """Takes the tangents of contact and liquid; returns the approximate inverse of the new tangent times the residual.
+        """Takes the tangents of contact and liquid; returns the approximate inverse of the new tangent times
+        the residual.
 
         Args:
           states: ContactState of each surface that can touch, just evaluated.
@@ -80,7 +83,8 @@ class Preconditioner:
         return nodes, rows, solver, compliance, D
 
     def _compliance(self, w, nodes):
-        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes stays the same."""
+        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes
+        stays the same."""
         key = nodes.tobytes()
         if w not in self._rows or self._rows[w][0] != key:
             rows = self.factor.rows(nodes)
@@ -109,7 +113,8 @@ class Preconditioner:
         return z
 
     def tangent(self, w, blocks, x):
-        """Stiffness (6, 6) of the skin against rigid motions of a body that touches it, see `body_tangent`."""
+        """Stiffness (6, 6) of the skin against rigid motions of a body that touches it, see
+        `body_tangent`."""
         small = self.worlds[w]
         if small is None:
             return np.zeros((6, 6))
@@ -118,10 +123,13 @@ class Preconditioner:
 
 
 def body_tangent(nodes, compliance, solver, blocks, x, nvert):
-    """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin (translation, rotation vector).
+    """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin
+    (translation, rotation vector).
 
-    The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0 + U D U^T)^-1 over
-    T: G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness stands for the tangent
+    The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0
+    + U D U^T)^-1 over
+    T: G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness
+      stands for the tangent
     here, as in the preconditioner.
 
     Args:

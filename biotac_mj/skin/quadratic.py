@@ -1,17 +1,19 @@
-"""Quadratic tetrahedra: ten nodes, four integration points, selectively averaged dilatation: incompressible rubber does not lock.
+"""Quadratic tetrahedra: ten nodes, four integration points, selectively averaged dilatation: incompressible
+rubber does not lock.
 
-The four points are Gauss's, pulled towards the centroid by `CONTRACTION`. That lowers the energy of a strain's variation inside an element,
-of which a mesh as coarse as the wall has too much, by CONTRACTION^2 and leaves its mean alone: a strain that is constant is still exact
-(the alpha finite element method of Liu, Nguyen-Thoi and Lam 2008 scales strain gradients the same way).
+The four points are Gauss's, pulled towards the centroid by `CONTRACTION`. That lowers the energy of a
+strain's variation inside an element, of which a mesh as coarse as the wall has too much, by CONTRACTION^2 and
+leaves its mean alone: a strain that is constant is still exact (the alpha finite element method of Liu,
+Nguyen-Thoi and Lam 2008 scales strain gradients the same way).
 
-Each element's energy is  sum_q w_q W(F_q; lam_q) + V (lam - lam_q)/2 mean(theta)^2,  lam_q = min(lam, POINTWISE mu),
-with the law's measure of dilatation theta (`material.dilatation`; J - 1 for neo_hookean). What goes beyond lam_q is felt by the
-element's mean dilatation alone (Nagtegaal, Parks and Rice 1974; Simo, Taylor and Pister 1985): volume is kept per element, not at
-every point, which leaves the element free to bend. A mean dilatation for all of lam (POINTWISE = 0) would be too soft under local
-loads, since a pressure that is constant over large elements is crude. What varies inside an element vanishes with its size, so
-POINTWISE changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTION = 1 and lam <= POINTWISE mu integration is full,
-as in CalculiX's C3D10.
-"""
+Each element's energy is  sum_q w_q W(F_q; lam_q) + V (lam - lam_q)/2 mean(theta)^2,  lam_q = min(lam,
+POINTWISE mu), with the law's measure of dilatation theta (`material.dilatation`; J - 1 for neo_hookean). What
+goes beyond lam_q is felt by the element's mean dilatation alone (Nagtegaal, Parks and Rice 1974; Simo, Taylor
+and Pister 1985): volume is kept per element, not at every point, which leaves the element free to bend. A
+mean dilatation for all of lam (POINTWISE = 0) would be too soft under local loads, since a pressure that is
+constant over large elements is crude. What varies inside an element vanishes with its size, so POINTWISE
+changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTION = 1 and lam <= POINTWISE mu
+integration is full, as in CalculiX's C3D10."""
 
 from typing import NamedTuple
 
@@ -40,8 +42,12 @@ wp.set_module_options({"enable_backward": False})
 
 POINTWISE = wp.constant(5.0)  # of mu; docs/elements.md has the error of other values
 
-CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/elements.md has the error with and without
-_NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric coordinates of the four Gauss points, exact to degree 2
+# of the distance from the centroid to Gauss's points; docs/elements.md has the error with and without
+CONTRACTION = 0.92
+_NEAR, _FAR = (
+    (5 + 3 * 5**0.5) / 20,
+    (5 - 5**0.5) / 20,
+)  # barycentric coordinates of the four Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
 mat310 = wp.types.matrix(shape=(3, 10), dtype=wp.float64)
@@ -139,7 +145,9 @@ def quadratic_product(
             R = mat33()
             if law == 0:
                 R = rotation[4 * e + q, w]
-            change += weight[e, q] * wp.ddot(dilatation_gradient(law, deformation[4 * e + q, w], R), X * shape[q] * inverse[e, q])
+            change += weight[e, q] * wp.ddot(
+                dilatation_gradient(law, deformation[4 * e + q, w], R), X * shape[q] * inverse[e, q]
+            )
     C = mat310()
     for q in range(4):
         F = deformation[4 * e + q, w]
@@ -149,7 +157,9 @@ def quadratic_product(
             R = rotation[4 * e + q, w]
         dP = stress_derivative(law, mu[w], local, F, R, dF)
         if rest > real(0.0):
-            dP += pressure[e, w] * dilatation_hessian(law, F, R, dF) + (rest * change) * dilatation_gradient(law, F, R)
+            dP += pressure[e, w] * dilatation_hessian(law, F, R, dF) + (rest * change) * dilatation_gradient(
+                law, F, R
+            )
         C += (weight[e, q] * dP * wp.transpose(inverse[e, q])) * wp.transpose(shape[q])
     scatter(C, e, w, corner_out)
 
@@ -243,9 +253,13 @@ class QuadraticTetrahedra:
         weight = np.linalg.det(edges) / 24
         folded = np.flatnonzero(weight.min(1) <= 0)
         if len(folded):
-            raise ValueError(f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): straighten their edges")
+            raise ValueError(
+                f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): "
+                "straighten their edges"
+            )
         inverse = np.linalg.inv(edges)
-        # lumped as by the eight linear parts: 1/32 to a corner, 7/48 to an edge (Hinton, Rock and Zienkiewicz 1976)
+        # lumped as by the eight linear parts: 1/32 to a corner, 7/48 to an edge (Hinton, Rock and Zienkiewicz
+        # 1976)
         share = np.array([1 / 32] * 4 + [7 / 48] * 6)
         self.node_volume = np.bincount(elem.ravel(), np.outer(weight.sum(1), share).ravel(), self.nvert)
         if modulus is not None:  # energy is linear in the constants: they may as well multiply the volume
@@ -263,13 +277,16 @@ class QuadraticTetrahedra:
             self.slot = wp.array(slot, dtype=int)
 
     def rest_stiffness(self, mu, lame) -> sp.csc_matrix:
-        """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]; the law decides which part of the stiffness is averaged."""
+        """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]; the law decides which part of the stiffness is
+        averaged."""
         second = lame + 2 / 3 * mu if self.law == LAWS["neo_hookean"] else lame
         local = min(second, POINTWISE * mu)
         pointwise = local + lame - second
         dof = (3 * self._elem[:, :, None] + np.arange(3, dtype=np.int32)).reshape(self.nelem, 30)
         total = sp.csc_matrix((3 * self.nvert, 3 * self.nvert))
-        for part in np.array_split(np.arange(self.nelem), 1 + self.nelem // 8192):  # 900 numbers an element: in slices
+        for part in np.array_split(
+            np.arange(self.nelem), 1 + self.nelem // 8192
+        ):  # 900 numbers an element: in slices
             g, w = self._gradient[part], self._weight[part]
             gw = w[:, :, None, None] * g
             outer = np.einsum("eqai,eqbj->eaibj", gw, g, optimize=True)
@@ -279,7 +296,9 @@ class QuadraticTetrahedra:
                 block[:, :, i, :, i] += mu * dot
             mean = gw.sum(1).reshape(len(part), 30)
             block = block.reshape(len(part), 30, 30)
-            block += ((second - local) / self._volume[part])[:, None, None] * mean[:, :, None] * mean[:, None, :]
+            block += (
+                ((second - local) / self._volume[part])[:, None, None] * mean[:, :, None] * mean[:, None, :]
+            )
             rows = np.repeat(dof[part], 30, axis=1).ravel()
             cols = np.tile(dof[part], 30).ravel()
             total += sp.coo_matrix((block.ravel(), (rows, cols)), shape=total.shape).tocsc()
@@ -303,15 +322,23 @@ class QuadraticTetrahedra:
     def force(self, scratch, mu, lam, x, force_out):
         """Elastic nodal forces at x: [nvert, nworld] vec3 -> the same [N]."""
         n, w = x.shape
-        self._launch(quadratic_force, (self.nelem, w), [*self._mesh(mu, lam), x],
-                     [scratch.deformation, scratch.rotation, scratch.pressure, scratch.jacobian, scratch.corner])  # fmt: skip
+        self._launch(
+            quadratic_force,
+            (self.nelem, w),
+            [*self._mesh(mu, lam), x],
+            [scratch.deformation, scratch.rotation, scratch.pressure, scratch.jacobian, scratch.corner],
+        )
         self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [force_out])
 
     def product(self, scratch, mu, lam, x, p, product_out):
         """Tangent stiffness at x, where `force` was evaluated last, times p [N]."""
         n, w = x.shape
-        self._launch(quadratic_product, (self.nelem, w),
-                     [*self._mesh(mu, lam), scratch.deformation, scratch.rotation, scratch.pressure, p], [scratch.corner])  # fmt: skip
+        self._launch(
+            quadratic_product,
+            (self.nelem, w),
+            [*self._mesh(mu, lam), scratch.deformation, scratch.rotation, scratch.pressure, p],
+            [scratch.corner],
+        )
         self._launch(gather, (n, w), [self.start, self.slot, scratch.corner, 1.0, 0], [product_out])
 
     def energy(self, mu, lam, x) -> np.ndarray:
@@ -327,7 +354,8 @@ class QuadraticTetrahedra:
         return scratch.jacobian.numpy().min(0)
 
     def stress(self, mu, lam, x):
-        """Mean Cauchy stress of each element [nelem, nworld] mat33 and the von Mises stress of this mean [nelem, nworld] [Pa]."""
+        """Mean Cauchy stress of each element [nelem, nworld] mat33 and the von Mises stress of this mean
+        [nelem, nworld] [Pa]."""
         cauchy = wp.zeros((self.nelem, x.shape[1]), dtype=mat33, device=self.device)
         mises = wp.zeros((self.nelem, x.shape[1]), dtype=real, device=self.device)
         self._launch(quadratic_stress, mises.shape, [*self._mesh(mu, lam), x], [cauchy, mises])

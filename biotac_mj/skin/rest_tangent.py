@@ -1,4 +1,5 @@
-"""Stiffness of a skin that rests on its filling, as a sparse matrix: what the condensed tier is linear about."""
+"""Stiffness of a skin that rests on its filling, as a sparse matrix: what the condensed tier is linear
+about."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,7 +12,8 @@ __all__ = ["rest_tangent"]
 
 
 def rest_tangent(model) -> sp.csc_matrix:
-    """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates [N/m].
+    """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates
+    [N/m].
 
     Columns come from products with the tangent; nodes without a common neighbour are probed together.
 
@@ -27,8 +29,13 @@ def rest_tangent(model) -> sp.csc_matrix:
     color = _colors(pattern)
     if model.has_liquid:
         nface = len(model.inner.face)
-        wet = wp.full((nface, 1), value=wp.vec3d(1 / 3, 1 / 3, 1 / 3), dtype=vec3, device=model.device)  # all: the skin is off its core
-        bend, nodal = wp.zeros((3 * nface, 1), dtype=vec3, device=model.device), wp.zeros((model.nvert, 1), dtype=vec3, device=model.device)
+        wet = wp.full(
+            (nface, 1), value=wp.vec3d(1 / 3, 1 / 3, 1 / 3), dtype=vec3, device=model.device
+        )  # all: the skin is off its core
+        bend, nodal = (
+            wp.zeros((3 * nface, 1), dtype=vec3, device=model.device),
+            wp.zeros((model.nvert, 1), dtype=vec3, device=model.device),
+        )
     row, column, value = [], [], []
     for c in range(color.max() + 1):
         nodes = np.flatnonzero(color == c)
@@ -48,13 +55,18 @@ def rest_tangent(model) -> sp.csc_matrix:
             column.append(np.repeat(3 * nodes[part.col] + axis, 3))
             value.append(q[part.row].ravel())
     n = 3 * model.nvert
-    K = sp.coo_matrix((np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=(n, n)).tocsc()
+    K = sp.coo_matrix(
+        (np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape=(n, n)
+    ).tocsc()
     return model._of_free((K + K.T) / 2)
 
 
 def _neighbours(nvert, elem):
     """Which nodes share an element (nvert, nvert)."""
-    belongs = sp.coo_matrix((np.ones(elem.size, bool), (np.repeat(np.arange(len(elem)), elem.shape[1]), elem.ravel())), (len(elem), nvert))
+    belongs = sp.coo_matrix(
+        (np.ones(elem.size, bool), (np.repeat(np.arange(len(elem)), elem.shape[1]), elem.ravel())),
+        (len(elem), nvert),
+    )
     belongs = belongs.tocsr().astype(np.int32)
     return ((belongs.T @ belongs) > 0).tocsc()
 

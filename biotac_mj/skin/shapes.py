@@ -1,7 +1,8 @@
-"""Signed distance to MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane and meshes as distance grids.
+"""Signed distance to MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane and meshes as
+distance grids.
 
-A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: its edges become fillets of radius r, its faces stay.
-"""
+A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: its edges become fillets of
+radius r, its faces stay."""
 
 import dataclasses
 
@@ -38,7 +39,8 @@ class DistanceGrid:
       value: (nx, ny, nz) float32, negative inside [m].
       origin: (3,) position of value[0, 0, 0] [m].
       spacing: of the grid, the same along the three axes [m].
-      vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from the triangles.
+      vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from
+        the triangles.
     """
 
     value: np.ndarray
@@ -49,7 +51,15 @@ class DistanceGrid:
 
 
 @wp.kernel
-def _bake(mesh: wp.uint64, origin: wp.vec3, spacing: float, ny: int, nz: int, reach: float, value_out: wp.array(dtype=wp.float32)):
+def _bake(
+    mesh: wp.uint64,
+    origin: wp.vec3,
+    spacing: float,
+    ny: int,
+    nz: int,
+    reach: float,
+    value_out: wp.array(dtype=wp.float32),
+):
     i = wp.tid()
     p = origin + spacing * wp.vec3(float(i // (ny * nz)), float((i // nz) % ny), float(i % nz))
     query = wp.mesh_query_point_sign_normal(mesh, p, reach)
@@ -90,14 +100,21 @@ def bake_distance_grid(
     origin = low - margin
     value = wp.zeros(int(shape.prod()), dtype=wp.float32, device="cpu")
     reach = float(np.linalg.norm(high - low) + 4 * margin) * scale
-    wp.launch(_bake, dim=len(value), inputs=[mesh.id, wp.vec3(*(origin * scale)), spacing * scale, int(shape[1]), int(shape[2]), reach],
-              outputs=[value], device="cpu")  # fmt: skip
+    wp.launch(
+        _bake,
+        dim=len(value),
+        inputs=[mesh.id, wp.vec3(*(origin * scale)), spacing * scale, int(shape[1]), int(shape[2]), reach],
+        outputs=[value],
+        device="cpu",
+    )
     return DistanceGrid((value.numpy() / scale).reshape(shape), origin, spacing, vert, face)
 
 
 def _mesh(vert, face, device) -> wp.Mesh:
     """In millimetres: single-precision queries drop triangles that are tiny in metres."""
-    return wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device))
+    return wp.Mesh(
+        wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device)
+    )
 
 
 def pack_grids(grids, device):
@@ -107,7 +124,9 @@ def pack_grids(grids, device):
     packed = Grids()
     with wp.ScopedDevice(device):
         packed.mesh = wp.array([m.id for m in meshes], dtype=wp.uint64)
-        packed.value = wp.array(np.concatenate([g.value.ravel() for g in grids] or [np.zeros(0)]), dtype=wp.float32)
+        packed.value = wp.array(
+            np.concatenate([g.value.ravel() for g in grids] or [np.zeros(0)]), dtype=wp.float32
+        )
         packed.first = wp.array(np.cumsum([0] + [g.value.size for g in grids[:-1]])[: len(grids)], dtype=int)
         packed.shape = wp.array(np.array([g.value.shape for g in grids]).reshape(-1, 3), dtype=wp.vec3i)
         packed.origin = wp.array(np.array([g.origin for g in grids]).reshape(-1, 3), dtype=vec3)
@@ -117,7 +136,8 @@ def pack_grids(grids, device):
 
 @wp.func
 def _grid_value(grids: Grids, k: int, p: vec3):
-    """Trilinear; outside the grid, whose box holds the mesh, a lower bound of the distance (by the box's nearest point)."""
+    """Trilinear; outside the grid, whose box holds the mesh, a lower bound of the distance (by the box's
+    nearest point)."""
     n = grids.shape[k]
     top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
     asked = (p - grids.origin[k]) / grids.spacing[k]
@@ -145,21 +165,27 @@ def _grid_value(grids: Grids, k: int, p: vec3):
 
 @wp.func
 def _mesh_distance(grids: Grids, k: int, p: vec3):
-    """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay sharp."""
+    """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay
+    sharp."""
     d = _grid_value(grids, k, p)
     h = grids.spacing[k]
     if d > real(0.5) * h:  # more than the trilinear error at a sharp edge: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     if d < -h:
         n = vec3(
-            _grid_value(grids, k, p + vec3(h, real(0.0), real(0.0))) - _grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
-            _grid_value(grids, k, p + vec3(real(0.0), h, real(0.0))) - _grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
-            _grid_value(grids, k, p + vec3(real(0.0), real(0.0), h)) - _grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
+            _grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
+            - _grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
+            _grid_value(grids, k, p + vec3(real(0.0), h, real(0.0)))
+            - _grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
+            _grid_value(grids, k, p + vec3(real(0.0), real(0.0), h))
+            - _grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
         )
         n = wp.normalize(n)
         return wp.vec4d(n[0], n[1], n[2], d)
     mesh = grids.mesh[k]
-    q = wp.vec3(wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3)))
+    q = wp.vec3(
+        wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3))
+    )
     query = wp.mesh_query_point_sign_normal(mesh, q, 4.0e3 * wp.float32(h))
     if not query.result:
         return wp.vec4d(real(1.0), real(0.0), real(0.0), real(4.0) * h)
@@ -239,7 +265,8 @@ def _rounded_cylinder(radius: real, half: real, r: real, p: vec3):
 
 @wp.func
 def _ellipsoid(radii: vec3, p: vec3):
-    """Closest point p_i r_i^2 / (t + r_i^2), t the largest root of sum (r_i p_i / (t + r_i^2))^2 = 1 (Eberly): Newton from the left."""
+    """Closest point p_i r_i^2 / (t + r_i^2), t the largest root of sum (r_i p_i / (t + r_i^2))^2 = 1
+    (Eberly): Newton from the left."""
     q = wp.cw_mul(_signs(p), p) + vec3(real(1.0e-12), real(1.0e-12), real(1.0e-12))
     r2 = wp.cw_mul(radii, radii)
     t = wp.max(wp.cw_mul(radii, q) - r2)

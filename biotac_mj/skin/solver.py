@@ -1,4 +1,5 @@
-"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate gradients."""
+"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned
+conjugate gradients."""
 
 import contextlib
 
@@ -24,24 +25,30 @@ _FACTOR = 25  # products of the tangent: about what a factor costs
 _PRESSURE_NOISE = 1.0  # [Pa] a thirtieth of the sensor's resolution
 
 
-def step(model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None) -> None:
+def step(
+    model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None
+) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
-    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted in
-    `data.nonconverged` and flagged in `data.converged`.
+    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is
+    counted in `data.nonconverged` and flagged in `data.converged`.
 
     Args:
       model, data: the skin.
       geoms: touching geoms, poses in the BioTac frame at the end of the step.
       dt: time step [s]; needed by implicit dynamics and by skin with a Prony series.
-      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of the step, for the inertia of
-        implicit dynamics; None means that it does not move.
+      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
+        the step, for the inertia of implicit dynamics; None means that it does not move.
 
     Raises:
-      ValueError: a geom deep inside the rigid core, geoms of another number of worlds, or implicit dynamics without a positive dt.
+      ValueError: a geom deep inside the rigid core, geoms of another number of worlds, or implicit dynamics
+        without a positive dt.
     """
     if geoms.nworld != data.nworld:
-        raise ValueError(f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number")
+        raise ValueError(
+            f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same "
+            "number"
+        )
     if data.resident:
         _step_on_device(model, data, geoms, dt, core_pos, core_mat)
         return
@@ -60,7 +67,10 @@ def _step_on_device(model, data, geoms, dt, core_pos, core_mat):
         if dt is None or not dt > 0:
             raise ValueError("implicit dynamics needs the time step: pass dt > 0")
         data.dt.fill_(dt)
-        for array, last, value in ((data.frame_pos, data.frame_pos_last, core_pos), (data.frame_mat, data.frame_mat_last, core_mat)):
+        for array, last, value in (
+            (data.frame_pos, data.frame_pos_last, core_pos),
+            (data.frame_mat, data.frame_mat_last, core_mat),
+        ):
             if value is None:
                 wp.copy(array, last)
             else:
@@ -74,12 +84,15 @@ def _refuse_core(model, geoms):
     if not (model.has_core and geoms.count):
         return
     depth = wp.zeros((geoms.count, geoms.nworld), dtype=wp.float64, device=model.device)
-    wp.launch(clearance.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device)
+    wp.launch(
+        clearance.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device
+    )
     depth = depth.numpy()
     if depth.max() > model.options.max_core_depth:
         geom, world = np.unravel_index(depth.argmax(), depth.shape)
         raise ValueError(
-            f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: "
+            f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the "
+            "rigid core: "
             "no skin fits between them; move it out, press less deep or take smaller steps"
         )
 
@@ -112,7 +125,10 @@ class _Step:
         d = self.d
         pos = d.core_pos if core_pos is None else np.asarray(core_pos, float)
         mat = d.core_mat if core_mat is None else np.asarray(core_mat, float)
-        was, velocity = d.x.numpy(), d.velocity.numpy()  # where free flight would take the nodes, seen from the moved frame
+        was, velocity = (
+            d.x.numpy(),
+            d.velocity.numpy(),
+        )  # where free flight would take the nodes, seen from the moved frame
         world = np.einsum("wij,nwj->nwi", d.core_mat, was) + d.core_pos
         target = np.einsum("wji,nwj->nwi", mat, world + dt * velocity - pos)
         coefficient = self.m.material.density * self.m.elasticity.node_volume[:, None, None] / dt**2
@@ -125,7 +141,8 @@ class _Step:
         return np.swapaxes(struct.pos.numpy() - struct.pos_last.numpy(), 0, 1)
 
     def _predict(self):
-        """Starts from the last step's increment, scaled by how much of the touching geoms' last motion this one repeats."""
+        """Starts from the last step's increment, scaled by how much of the touching geoms' last motion this
+        one repeats."""
         d = self.d
         if d.motion.shape[1] != self.geoms.count:
             return
@@ -153,10 +170,11 @@ class _Step:
             self.x[:, w] = self.start[:, w]
 
     def _renew_factor(self, x):
-        """Nearly incompressible rubber, turned and strained, is no longer like that at rest: solved with the factor of its present shape.
+        """Nearly incompressible rubber, turned and strained, is no longer like that at rest: solved with the
+        factor of its present shape.
 
-        For this step alone, so that a step remains a function of the state it starts from. Worlds share a factor: not where there are many.
-        """
+        For this step alone, so that a step remains a function of the state it starts from. Worlds share a
+        factor: not where there are many."""
         self.products = -np.inf  # once is enough until the next start
         if self.m.material.poissons_ratio > 0.45 and self.d.nworld == 1:
             with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
@@ -177,12 +195,23 @@ class _Step:
                 self.M.clear()
                 d.error = np.zeros(d.nworld)
                 return asked & self._possible()
-            z = self.M.update(states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa)
+            z = self.M.update(
+                states, residual, self.gradient * self.mask if self.m.has_liquid else None, self.kappa
+            )
             error = (residual * z).sum((0, 2))
-            load = view(d.outer.node_force) + (view(d.core.node_force) if d.core else 0) + (0 if d.external is None else d.external)
+            load = (
+                view(d.outer.node_force)
+                + (view(d.core.node_force) if d.core else 0)
+                + (0 if d.external is None else d.external)
+            )
             work = np.abs((load * (self.x - view(d.rest_vert))).sum((0, 2))) + 1e-12
             d.error = np.sqrt(np.maximum(error, 0) / work)
-            active = asked & finite & ~at_rest & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
+            active = (
+                asked
+                & finite
+                & ~at_rest
+                & ~((error <= options.tolerance**2 * work) & self._pressure_settled(z))
+            )
             if not active.any() or iteration == options.max_newton:
                 break
             d.iterations += active
@@ -192,29 +221,38 @@ class _Step:
         return asked & finite & ~active & self._possible()
 
     def _possible(self):
-        """Worlds (nworld,) whose skin a body can have: balance of an inverted element, or of skin that went through the core, is none."""
+        """Worlds (nworld,) whose skin a body can have: balance of an inverted element, or of skin that went
+        through the core, is none."""
         m, d = self.m, self.d
         good = np.ones(d.nworld, bool)
         if m.material.law != "linear":  # small strain: its determinant means nothing
             good &= m.elasticity.smallest_jacobian(d.elastic) > 0
         if m.has_core:
             depth = wp.zeros((len(d.core.surface.face), d.nworld), dtype=wp.float64, device=m.device)
-            wp.launch(clearance.deepest_corner, depth.shape, [d.core.surface.face, m.core(d.nworld).struct, d.x], [depth], device=m.device)
+            wp.launch(
+                clearance.deepest_corner,
+                depth.shape,
+                [d.core.surface.face, m.core(d.nworld).struct, d.x],
+                [depth],
+                device=m.device,
+            )
             good &= depth.numpy().max(0) < m.crushed_depth
         return good
 
     def _pressure_settled(self, z):
-        """Whether the step z would hardly change the liquid's pressure. Its energy cannot tell: the liquid is almost incompressible."""
+        """Whether the step z would hardly change the liquid's pressure. Its energy cannot tell: the liquid is
+        almost incompressible."""
         if not self.m.has_liquid:
             return True
         change = self.kappa * np.abs((self.gradient * self.mask * z).sum((0, 2)))
         return change <= _PRESSURE_TOLERANCE * np.abs(self.d.liquid.gauge_pressure) + _PRESSURE_NOISE
 
     def _line_search(self, dx, residual, active):
-        """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the full step overshoots.
+        """Moves along dx to where the residual has (nearly) no component along it, by regula falsi where the
+        full step overshoots.
 
-        Along a descent direction of an energy that is its minimum; friction has no energy, its work along dx still has to balance.
-        """
+        Along a descent direction of an energy that is its minimum; friction has no energy, its work along dx
+        still has to balance."""
         base, slope = self.x.copy(), (residual * dx).sum((0, 2))
         low, high = np.zeros_like(slope), np.full_like(slope, np.nan)
         slope_low, slope_high = slope.copy(), slope.copy()
@@ -238,7 +276,10 @@ class _Step:
             slope_high = np.where(under & (side == -1), slope_high / 2, slope_high)
             side = np.where(over, 1, np.where(under, -1, side))
             low, slope_low = np.where(under, alpha, low), np.where(under, now, slope_low)
-            high, slope_high = np.where(over, alpha, high), np.where(over, np.where(valid, now, -np.inf), slope_high)
+            high, slope_high = (
+                np.where(over, alpha, high),
+                np.where(over, np.where(valid, now, -np.inf), slope_high),
+            )
             with np.errstate(invalid="ignore", divide="ignore"):
                 secant = low + (high - low) * slope_low / (slope_low - slope_high)
                 further = alpha * np.clip(slope / np.maximum(slope - now, slope / 4), 1.25, 4)
@@ -264,12 +305,21 @@ class _Step:
         if d.liquid:
             d.liquid.evaluate(d.x, d.core)
         if m.has_liquid:
-            launch(elasticity.gather, (n, w), [m.inner.start, m.inner.slot, d.liquid.gradient(d.x), 1.0, 0], [d.gradient])
+            launch(
+                elasticity.gather,
+                (n, w),
+                [m.inner.start, m.inner.slot, d.liquid.gradient(d.x), 1.0, 0],
+                [d.gradient],
+            )
             self.force += d.liquid.gauge_pressure[:, None] * self.gradient
         if self.inertia is not None:
-            self.force -= self.inertia * (self.x - self.target) + m.options.mass_damping * self.dt * self.inertia * (self.x - self.start)
+            self.force -= self.inertia * (
+                self.x - self.target
+            ) + m.options.mass_damping * self.dt * self.inertia * (self.x - self.start)
             if m.options.stiffness_damping:
-                self.force -= m.options.stiffness_damping / self.dt * self._elastic_product(self.x - self.start)
+                self.force -= (
+                    m.options.stiffness_damping / self.dt * self._elastic_product(self.x - self.start)
+                )
 
     def _contact(self, state, geoms):
         m, d = self.m, self.d
@@ -282,11 +332,33 @@ class _Step:
         launch(
             kernel,
             state.touching.shape,
-            [surface.face, surface.area, m.sample, m.contact_stiffness, m.options.stick_ratio, geoms.struct, d.x, d.x_last]
+            [
+                surface.face,
+                surface.area,
+                m.sample,
+                m.contact_stiffness,
+                m.options.stick_ratio,
+                geoms.struct,
+                d.x,
+                d.x_last,
+            ]
             + [state.anchor_geom, state.anchor, *known],
-            [state.corner, state.block, state.touching, state.trial_geom, state.trial_anchor, state.sample_force, *out],
+            [
+                state.corner,
+                state.block,
+                state.touching,
+                state.trial_geom,
+                state.trial_anchor,
+                state.sample_force,
+                *out,
+            ],
         )
-        launch(elasticity.gather, (m.nvert, d.nworld), [surface.start, surface.slot, state.corner, 1.0, 0], [state.node_force])
+        launch(
+            elasticity.gather,
+            (m.nvert, d.nworld),
+            [surface.start, surface.slot, state.corner, 1.0, 0],
+            [state.node_force],
+        )
         self.force += view(state.node_force)
 
     def _contacts(self):
@@ -309,17 +381,33 @@ class _Step:
             q += (1 + m.options.mass_damping * self.dt) * self.inertia * p
         launch = d.launch
         for s in self._contacts():
-            launch(contact.contact_product, s.touching.shape, [s.surface.face, s.touching, s.block, d.direction], [s.corner])
-            launch(elasticity.gather, (m.nvert, d.nworld), [s.surface.start, s.surface.slot, s.corner, 1.0, 1], [d.product])
+            launch(
+                contact.contact_product,
+                s.touching.shape,
+                [s.surface.face, s.touching, s.block, d.direction],
+                [s.corner],
+            )
+            launch(
+                elasticity.gather,
+                (m.nvert, d.nworld),
+                [s.surface.start, s.surface.slot, s.corner, 1.0, 1],
+                [d.product],
+            )
         if m.has_liquid:
             q += (self.kappa * (self.gradient * p).sum((0, 2)))[:, None] * self.gradient
             bend = d.liquid.gradient_derivative(d.x, d.direction)
-            launch(elasticity.gather, (m.nvert, d.nworld), [m.inner.start, m.inner.slot, bend, 1.0, 0], [d.bending])
+            launch(
+                elasticity.gather,
+                (m.nvert, d.nworld),
+                [m.inner.start, m.inner.slot, bend, 1.0, 0],
+                [d.bending],
+            )
             q -= d.liquid.gauge_pressure[:, None] * view(d.bending)
         return q * self.mask
 
     def _conjugate_gradients(self, residual, z, active):
-        """Solves tangent dx = residual until the preconditioned residual has fallen by ten; worlds that are not active get zero."""
+        """Solves tangent dx = residual until the preconditioned residual has fallen by ten; worlds that are
+        not active get zero."""
         r, p = residual, z.copy()
         dx = 0 * z
         rz = (r * z).sum((0, 2))
@@ -329,7 +417,8 @@ class _Step:
             q = self._product(p)
             self.products += 1
             curvature = (p * q).sum((0, 2))
-            # negative curvature: the tangent is not positive definite there; what has been found so far is a descent direction
+            # negative curvature: the tangent is not positive definite there; what has been found so far is a
+            # descent direction
             running = running * (curvature > 0)
             if not running.any():
                 break
@@ -354,7 +443,8 @@ class _Step:
         return dx
 
     def _hold(self, failed):
-        """Puts worlds that did not converge back to where the step began, geoms too, so that forces and contacts are the last good ones.
+        """Puts worlds that did not converge back to where the step began, geoms too, so that forces and
+        contacts are the last good ones.
 
         Returns what has to be written back when the step is over: the poses as they were set.
         """
@@ -379,7 +469,15 @@ class _Step:
         wrench = wp.zeros((groups, d.nworld, 6), dtype=wp.float64, device=self.m.device)
         if groups:
             o = d.outer
-            inputs = [o.surface.face, self.m.sample, self.geoms.struct, d.x, o.touching, o.trial_geom, o.sample_force]
+            inputs = [
+                o.surface.face,
+                self.m.sample,
+                self.geoms.struct,
+                d.x,
+                o.touching,
+                o.trial_geom,
+                o.sample_force,
+            ]
             wp.launch(contact.contact_wrench, (groups, d.nworld), inputs, [wrench], device=self.m.device)
         d.wrench = np.swapaxes(wrench.numpy(), 0, 1).copy()
         d.outer.commit()
@@ -396,5 +494,7 @@ class _Step:
         if self.inertia is not None:
             pos, mat = self.pose
             world = np.einsum("wij,nwj->nwi", mat, d.x.numpy()) + pos
-            wp.copy(d.velocity, wp.array((world - self.world) / self.dt, dtype=vec3, ndim=2, device=self.m.device))
+            wp.copy(
+                d.velocity, wp.array((world - self.world) / self.dt, dtype=vec3, ndim=2, device=self.m.device)
+            )
             d.core_pos, d.core_mat = pos.copy(), mat.copy()

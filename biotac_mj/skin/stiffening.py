@@ -1,13 +1,16 @@
-"""Rubber that stiffens with strain: what a second term in the isochoric first invariant adds to any of the laws.
+"""Rubber that stiffens with strain: what a second term in the isochoric first invariant adds to any of the
+laws.
 
-Every law's shear energy is mu/2 q. For neo_hookean q is J^(-2/3) tr(F^T F) - 3; for the others it is 2 |dev A|^2 of their own strain A
-(Biot's for corotational, Green and Lagrange's for svk, the small one for linear), the same number to second order. With s = c2 / c1
+Every law's shear energy is mu/2 q. For neo_hookean q is J^(-2/3) tr(F^T F) - 3; for the others it is 2 |dev
+A|^2 of their own strain A (Biot's for corotational, Green and Lagrange's for svk, the small one for linear),
+the same number to second order. With s = c2 / c1
 
     mu/2 (q + s q^2)                            s >= 0    Yeoh's first two terms (1993), c1 = mu/2
-    mu/2 (sqrt(1 - 4 s q) - 1) / (-2 s)         s < 0     Knowles's power law (1977) of exponent 1/2, same slope in q at rest
+    mu/2 (sqrt(1 - 4 s q) - 1) / (-2 s)         s < 0     Knowles's power law (1977) of exponent 1/2, same
+    slope in q at rest
 
-stand in its place. A negative second term of Yeoh's would have no lower bound; Knowles's is the softest of his that stays elliptic.
-"""
+stand in its place. A negative second term of Yeoh's would have no lower bound; Knowles's is the softest of
+his that stays elliptic."""
 
 import warp as wp
 

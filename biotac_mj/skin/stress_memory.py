@@ -1,22 +1,27 @@
-"""What a material has beyond its law, at every integration point of any element: relaxation, Mullins softening, friction, stiffening.
+"""What a material has beyond its law, at every integration point of any element: relaxation, Mullins
+softening, friction, stiffening.
 
-Relaxation is finite linear viscoelasticity (Simo 1987; Holzapfel 2000, ch. 6): every term of the series adds an overstress Q_i to the
+Relaxation is finite linear viscoelasticity (Simo 1987; Holzapfel 2000, ch. 6): every term of the series adds
+  an overstress Q_i to the
 second Piola-Kirchhoff stress S of the elastic law, which stays the long-term one,
 
     dQ_i/dt + Q_i / tau_i = g_i dS/dt,    so that   G(t) = G_inf (1 + sum_i g_i exp(-t / tau_i))
 
-and S, taken as linear in time within a step, gives Q_i exactly from its last value. Softening is the pseudo-elasticity of Ogden and
-Roxburgh (1999): S is multiplied by  eta = 1 - erf((W_max - W) / (m + beta W_max)) / r,  W_max the largest energy density so far.
+and S, taken as linear in time within a step, gives Q_i exactly from its last value. Softening is the
+pseudo-elasticity of Ogden and
+Roxburgh (1999): S is multiplied by  eta = 1 - erf((W_max - W) / (m + beta W_max)) / r,  W_max the largest
+  energy density so far.
 
-Both act on what has to do with shape. For neo_hookean that is the isochoric part; the other laws have no such split and the whole stress
-remembers, but for the dilatation that quadratic elements keep for an element's mean (lam beyond 5 mu). Second Piola stresses turn with
-the body, so that nothing here depends on rotations (but for the `linear` law, which never does).
+Both act on what has to do with shape. For neo_hookean that is the isochoric part; the other laws have no such
+split and the whole stress remembers, but for the dilatation that quadratic elements keep for an element's
+mean (lam beyond 5 mu). Second Piola stresses turn with the body, so that nothing here depends on rotations
+(but for the `linear` law, which never does).
 
-Within a step the past is a constant H, S = (1 + c) eta S_elastic + H with c = sum_i g_i h_i: the elastic law again, stiffer, with an
-initial stress. Hence the tangent is symmetric and exact (algorithmic).
+Within a step the past is a constant H, S = (1 + c) eta S_elastic + H with c = sum_i g_i h_i: the elastic law
+again, stiffer, with an initial stress. Hence the tangent is symmetric and exact (algorithmic).
 
-Stiffening (`stiffening.py`) belongs to the elastic law, so it relaxes and softens too; friction (`hysteresis.py`) stands beside both.
-"""
+Stiffening (`stiffening.py`) belongs to the elastic law, so it relaxes and softens too; friction
+(`hysteresis.py`) stands beside both."""
 
 import numpy as np
 import warp as wp
@@ -32,7 +37,11 @@ __all__ = ["StressMemory"]
 
 wp.set_module_options({"enable_backward": False})
 
-_ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]  # six numbers of a symmetric 3 x 3, and back
+_ROW, _COLUMN, _WHOLE = (
+    [0, 0, 0, 1, 1, 2],
+    [0, 1, 2, 1, 2, 2],
+    [0, 1, 2, 1, 3, 4, 2, 4, 5],
+)  # six numbers of a symmetric 3 x 3, and back
 
 
 @wp.func
@@ -91,7 +100,9 @@ def evaluate(
             width = mullins[1] + mullins[2] * worst[i, w]
             s = (worst[i, w] - W) / width
             eta = real(1.0) - wp.erf(s) / mullins[0]
-            slope = modulus[i] * real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)  # 2 / sqrt(pi)
+            slope = (
+                modulus[i] * real(1.1283791670955126) * wp.exp(-s * s) / (mullins[0] * width)
+            )  # 2 / sqrt(pi)
     softening_out[i, w] = eta
     slope_out[i, w] = slope
     H = past[i, w]
@@ -175,15 +186,19 @@ def settle(
 
 
 class StressMemory:
-    """What the points of a skin remember, of every world: overstresses, the largest energy so far, the slip of friction elements.
+    """What the points of a skin remember, of every world: overstresses, the largest energy so far, the slip
+    of friction elements.
 
-    Made by `SkinData` where the model's material has `prony`, `mullins`, `hysteresis` or `stiffening`; on the CPU's full tier.
+    Made by `SkinData` where the model's material has `prony`, `mullins`, `hysteresis` or `stiffening`; on the
+    CPU's full tier.
 
     Args:
-      model: SkinModel; nworld: number of worlds; mu, lam: (nworld,) Warp arrays of the elastic constants [Pa].
+      model: SkinModel; nworld: number of worlds; mu, lam: (nworld,) Warp arrays of the elastic constants
+        [Pa].
 
     Attributes:
-      overstress: (nterm, npoint, nworld, 3, 3) second Piola [Pa]; worst: (npoint, nworld) largest energy density [J/m^3].
+      overstress: (nterm, npoint, nworld, 3, 3) second Piola [Pa]; worst: (npoint, nworld) largest energy
+        density [J/m^3].
       last: (npoint, nworld, 3, 3) second Piola stress that relaxes, when the last step ended [Pa].
       friction: FrictionBranches, or None.
       stiffness: factor on the stiffness of a step as long as the current one, without its history.
@@ -195,7 +210,8 @@ class StressMemory:
     def __init__(self, model, nworld, mu, lam):
         if model.device.is_cuda:
             raise ValueError(
-                f"skin with {' and '.join(model.material.extensions)} is solved on the CPU's full tier only: choose device='cpu', "
+                f"skin with {' and '.join(model.material.extensions)} is solved on the CPU's full tier "
+                "only: choose device='cpu', "
                 "or leave this out of the material"
             )
         material = model.material
@@ -206,12 +222,16 @@ class StressMemory:
         self._law = [model.law, mu, lam, cap]
         self.stiffening = material.stiffening
         self.gain = 0.0
-        self.gradient, self.change, self.rotation, self.past, self.stress = (points.allocate(mat33) for _ in range(5))
+        self.gradient, self.change, self.rotation, self.past, self.stress = (
+            points.allocate(mat33) for _ in range(5)
+        )
         self._worst, self.softening, self.slope, self.energy = (points.allocate(real) for _ in range(4))
         self.worst = self._worst.numpy()
         self.overstress = np.zeros((len(self.prony), *points.shape, 3, 3))
         self.last = np.zeros((*points.shape, 3, 3))
-        self.friction = FrictionBranches(material.hysteresis, model.law, mu, points) if material.hysteresis else None
+        self.friction = (
+            FrictionBranches(material.hysteresis, model.law, mu, points) if material.hysteresis else None
+        )
         self._remembers = material.remembers
 
     @property
@@ -251,9 +271,20 @@ class StressMemory:
     def _evaluate(self, x):
         points = self.points
         points.gradient(x, self.gradient)
-        points.launch(evaluate,
-                      [*self._law, self.stiffening, self.mullins, self.gain, points.modulus, self._worst, self.past, self.gradient],
-                      [self.rotation, self.softening, self.slope, self.stress])  # fmt: skip
+        points.launch(
+            evaluate,
+            [
+                *self._law,
+                self.stiffening,
+                self.mullins,
+                self.gain,
+                points.modulus,
+                self._worst,
+                self.past,
+                self.gradient,
+            ],
+            [self.rotation, self.softening, self.slope, self.stress],
+        )
         if self.friction:
             self.friction.add_stress(self.gradient, self.stress)
 
@@ -261,21 +292,36 @@ class StressMemory:
         """Adds their tangent stiffness, where `add_force` was last, times p."""
         points = self.points
         points.gradient(p, self.change)
-        points.launch(differentiate,
-                      [*self._law, self.stiffening, self.gain, self.past, self.gradient, self.rotation, self.softening, self.slope,
-                       self.change], [self.stress])  # fmt: skip
+        points.launch(
+            differentiate,
+            [
+                *self._law,
+                self.stiffening,
+                self.gain,
+                self.past,
+                self.gradient,
+                self.rotation,
+                self.softening,
+                self.slope,
+                self.change,
+            ],
+            [self.stress],
+        )
         if self.friction:
             self.friction.add_derivative(self.gradient, self.change, self.stress)
         points.add_forces(self.stress, 1.0, product)
 
     def commit(self, x, good):
-        """Takes over the step that has ended at x in the worlds that are good (nworld,); the others keep their past."""
+        """Takes over the step that has ended at x in the worlds that are good (nworld,); the others keep
+        their past."""
         if not self._remembers:
             return
         new = self._settle(x)
         if len(self.prony):
             gained = self.share[:, None, None, None, None] * (new - self.last)
-            self.overstress[:, :, good] = (self.decay[:, None, None, None, None] * self.overstress + gained)[:, :, good]
+            self.overstress[:, :, good] = (self.decay[:, None, None, None, None] * self.overstress + gained)[
+                :, :, good
+            ]
         self.last[:, good] = new[:, good]
         if self.mullins[0] > 0:
             self.worst[:, good] = np.maximum(self.worst, self.energy.numpy())[:, good]
@@ -283,8 +329,8 @@ class StressMemory:
             self.friction.commit(self.gradient, good)
 
     def add_cauchy(self, x, cauchy, mises):
-        """Adds what the law does not have, at x where the last step ended, to the elements' mean Cauchy stresses [nelem, nworld] mat33 and
-        renews their von Mises stresses [nelem, nworld] [Pa]."""
+        """Adds what the law does not have, at x where the last step ended, to the elements' mean Cauchy
+        stresses [nelem, nworld] mat33 and renews their von Mises stresses [nelem, nworld] [Pa]."""
         nworld = x.shape[1]
         self.past.numpy()[:] = self.overstress.sum(0)
         gain, self.gain = self.gain, 0.0
@@ -309,7 +355,8 @@ class StressMemory:
         return np.concatenate([*(p[:, :, 0][..., _ROW, _COLUMN].ravel() for p in parts), self.worst[:, 0]])
 
     def load(self, state, x):
-        """Sets the first world's memory, of a skin that is at x (Warp, [nvert, nworld]); the inverse of `state`."""
+        """Sets the first world's memory, of a skin that is at x (Warp, [nvert, nworld]); the inverse of
+        `state`."""
         n = len(self.worst)
         parts = np.asarray(state[:-n]).reshape(-1, n, 6)[..., _WHOLE].reshape(-1, n, 3, 3)
         self.overstress[:, :, 0] = parts[: len(self.prony)]
@@ -319,9 +366,14 @@ class StressMemory:
         self.last[:, 0] = self._settle(x)[:, 0]
 
     def _settle(self, x):
-        """(npoint, nworld, 3, 3) second Piola stress at x that relaxes, softened by what was borne up to now."""
+        """(npoint, nworld, 3, 3) second Piola stress at x that relaxes, softened by what was borne up to
+        now."""
         self.points.gradient(x, self.gradient)
-        self.points.launch(settle, [*self._law, self.stiffening, self.points.modulus, self.gradient], [self.stress, self.energy])
+        self.points.launch(
+            settle,
+            [*self._law, self.stiffening, self.points.modulus, self.gradient],
+            [self.stress, self.energy],
+        )
         out = self.stress.numpy().copy()
         if self.mullins[0] > 0:
             from scipy.special import erf

@@ -1,11 +1,11 @@
 """Multifrontal factor of a symmetric positive definite sparse matrix, made for many fast solves on one core.
 
-Groups of nodes are eliminated together (`dissection`), each with a dense front: A within the group, B to what is eliminated later, both
-after what was eliminated before has been added in (Duff and Reid 1983). S = A^-1 and C = B S are kept. A solve is  b_later -= C b  up the
-tree and  x = S b - C^T x_later  down it: products with dense panels, nothing else. Panels are kept in single precision, which halves what
-a solve reads, and reading is what it takes; all sums are in double. The operator stays linear and symmetric to double precision, and
-differs from the inverse by 1e-6 in the energy norm (2e-5 at a Poisson's ratio of 0.4999).
-"""
+Groups of nodes are eliminated together (`dissection`), each with a dense front: A within the group, B to what
+is eliminated later, both after what was eliminated before has been added in (Duff and Reid 1983). S = A^-1
+and C = B S are kept. A solve is  b_later -= C b  up the tree and  x = S b - C^T x_later  down it: products
+with dense panels, nothing else. Panels are kept in single precision, which halves what a solve reads, and
+reading is what it takes; all sums are in double. The operator stays linear and symmetric to double precision,
+and differs from the inverse by 1e-6 in the energy norm (2e-5 at a Poisson's ratio of 0.4999)."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,7 +18,9 @@ __all__ = ["Elimination", "SupernodalFactor"]
 
 wp.set_module_options({"enable_backward": False})
 
-_LANES = 8  # numbers that are multiplied at once; rows of panels are filled up with zeros to whole groups of them
+_LANES = (
+    8  # numbers that are multiplied at once; rows of panels are filled up with zeros to whole groups of them
+)
 
 # both sweeps for all right-hand sides; four rows of a panel at a time
 _SWEEPS = """
@@ -113,7 +115,8 @@ def substitute(
     # In and out:
     work: wp.array2d(dtype=wp.float64),
 ):
-    """Solves for the right-hand sides in `work`, one in a row; behind its first `size` entries a row is scratch."""
+    """Solves for the right-hand sides in `work`, one in a row; behind its first `size` entries a row is
+    scratch."""
     sweeps(size, front, row, panel, work)
 
 
@@ -126,13 +129,16 @@ class Elimination:
 
     Attributes:
       order: (n,) nodes in the order of elimination.
-      fronts: for each group its first coordinate, its coordinates in the new order that are eliminated later (b,), and the groups below it.
+      fronts: for each group its first coordinate, its coordinates in the new order that are eliminated later
+        (b,), and the groups below it.
     """
 
     def __init__(self, matrix, points):
         n = len(points)
         coo = matrix.tocoo()
-        near = sp.coo_matrix((np.ones(len(coo.row), np.int8), (coo.row // 3, coo.col // 3)), shape=(n, n)).tocsr()
+        near = sp.coo_matrix(
+            (np.ones(len(coo.row), np.int8), (coo.row // 3, coo.col // 3)), shape=(n, n)
+        ).tocsr()
         groups = dissect(near, points)
         self.order = np.concatenate(groups)
         place = np.empty(n, int)
@@ -183,7 +189,10 @@ class SupernodalFactor:
                 front[np.ix_(there, there)] += update
             factor, trouble = lapack.dpotrf(front[:a, :a], lower=1)
             if trouble:
-                raise ValueError("the stiffness is not positive definite: elements are inverted, or parts of the skin are not held")
+                raise ValueError(
+                    "the stiffness is not positive definite: elements are inverted, or parts of the skin "
+                    "are not held"
+                )
             inverse = np.tril(lapack.dpotri(factor, lower=1)[0])
             inverse += np.tril(inverse, -1).T
             carry = front[a:, :a] @ inverse
@@ -203,7 +212,8 @@ class SupernodalFactor:
         ]
 
     def solve(self, rhs):
-        """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked at, and zero."""
+        """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked
+        at, and zero."""
         nrhs = rhs.shape[1]
         work = np.zeros((nrhs, self.size + self._scratch))
         work[:, : self.size] = np.swapaxes(rhs[self._rows], 0, 1).reshape(nrhs, self.size)

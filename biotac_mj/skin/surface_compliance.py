@@ -1,9 +1,10 @@
-"""What a unit force at a node of the skin's surface does everywhere: rows of the inverse of the rest stiffness, kept on disk.
+"""What a unit force at a node of the skin's surface does everywhere: rows of the inverse of the rest
+stiffness, kept on disk.
 
-A contact coordinate is one of the three directions of a free outer node, or the direction away from the core of an inner node (the
-liquid lubricates the core, so there is no friction there and one direction is enough). Rows are rounded to half precision (5e-4 of
-the row's largest entry at most) and belong to Young's modulus one, so that one file serves all moduli: 120 MB for the default skin.
-"""
+A contact coordinate is one of the three directions of a free outer node, or the direction away from the core
+of an inner node (the liquid lubricates the core, so there is no friction there and one direction is enough).
+Rows are rounded to half precision (5e-4 of the row's largest entry at most) and belong to Young's modulus
+one, so that one file serves all moduli: 120 MB for the default skin."""
 
 import hashlib
 import os
@@ -58,7 +59,8 @@ class SurfaceCompliance:
         self._file = self._open() if cache and 2 * self.count * self.size <= _LARGEST_FILE else None
 
     def row(self, coordinates) -> list:
-        """For each contact coordinate (n,) its row (size,) float32: displacement of the free nodes per unit force [m/N], times E."""
+        """For each contact coordinate (n,) its row (size,) float32: displacement of the free nodes per unit
+        force [m/N], times E."""
         missing = [c for c in coordinates if c not in self._kept]
         if missing and self._file is not None:
             largest, rows = self._file
@@ -73,7 +75,9 @@ class SurfaceCompliance:
     def part(self, coordinates, at) -> np.ndarray:
         """What `row` has at the places `at` (k,): (n, k) float32; cheaper than the whole rows."""
         if self._file is None:
-            return np.array([row[at] for row in self.row(coordinates.tolist())]).reshape(len(coordinates), len(at))
+            return np.array([row[at] for row in self.row(coordinates.tolist())]).reshape(
+                len(coordinates), len(at)
+            )
         largest, rows = self._file
         return rows[coordinates[:, None], at].astype(np.float32) * largest[coordinates, None]
 
@@ -82,7 +86,8 @@ class SurfaceCompliance:
         return (c,) if c >= 3 * len(self._outer) else (c - c % 3, c - c % 3 + 1, c - c % 3 + 2)
 
     def vector(self, field) -> np.ndarray:
-        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E; refined once, as the factor is rounded."""
+        """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E; refined once, as the
+        factor is rounded."""
         free = self._model.free
         first = self._factor.solve(field[:, None])
         left = field.copy()
@@ -107,14 +112,17 @@ class SurfaceCompliance:
         return self._position[node]
 
     def _open(self):
-        """(scales, rows) mapped from the cache, written there first if need be; None where nothing can be written."""
+        """(scales, rows) mapped from the cache, written there first if need be; None where nothing can be
+        written."""
         path = cache_folder() / f"compliance-{self._digest()}.npy"
         shape = (self.count, self.size + 2)  # two halves in front hold the row's scale
         if not path.is_file() and not self._write(path, shape):
             return None
         table = np.load(path, mmap_mode="r")
         if table.shape != shape:
-            raise ValueError(f"{path} does not hold the compliance of this skin: delete it, it is computed again")
+            raise ValueError(
+                f"{path} does not hold the compliance of this skin: delete it, it is computed again"
+            )
         return np.ascontiguousarray(table[:, :2]).view(np.float32)[:, 0], table[:, 2:]
 
     def _write(self, path, shape):
@@ -144,7 +152,12 @@ class SurfaceCompliance:
     def _digest(self):
         stiffness = self._stiffness
         # rounded, so that the modulus divided out leaves no trace in the last digits
-        content = [(stiffness.data * self._scale).astype(np.float32), stiffness.indices, stiffness.indptr, self._model.free]
+        content = [
+            (stiffness.data * self._scale).astype(np.float32),
+            stiffness.indices,
+            stiffness.indptr,
+            self._model.free,
+        ]
         content += [self._outer, self._inner, self._direction.astype(np.float32)]
         digest = hashlib.sha256(b"1")
         for array in content:

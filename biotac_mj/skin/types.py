@@ -1,4 +1,5 @@
-"""Scalar and small tensor types of the kernels: double precision, so that CPU and CUDA give the same answers."""
+"""Scalar and small tensor types of the kernels: double precision, so that CPU and CUDA give the same
+answers."""
 
 import warp as wp
 

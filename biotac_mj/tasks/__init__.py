@@ -1,4 +1,5 @@
-"""Tasks by touch: the BioTac as a dm_control Entity, a suite of tasks with scripted controllers, Gymnasium, robot hands.
+"""Tasks by touch: the BioTac as a dm_control Entity, a suite of tasks with scripted controllers, Gymnasium,
+robot hands.
 
     env = biotac_mj.tasks.load("finger", "press", task_kwargs={"random": 0})
 
@@ -30,7 +31,9 @@ def __getattr__(name):
         package = (error.name or "").split(".")[0]
         if package not in _EXTRA:
             raise
-        raise ModuleNotFoundError(f"{error}: pip install 'biotac-mj[{_EXTRA[package]}]'", name=error.name) from error
+        raise ModuleNotFoundError(
+            f"{error}: pip install 'biotac-mj[{_EXTRA[package]}]'", name=error.name
+        ) from error
 
 
 def __dir__():

@@ -1,4 +1,5 @@
-"""What all tasks share: arena, machine with BioTacs, actions in [-1, 1], observables by preset, rewards in [0, 1]."""
+"""What all tasks share: arena, machine with BioTacs, actions in [-1, 1], observables by preset, rewards in
+[0, 1]."""
 
 import abc
 
@@ -27,10 +28,26 @@ def arena():
     root.visual.map.set_attributes(znear=0.001, zfar=30)
     root.statistic.set_attributes(center=[0, 0, 0.01], extent=0.1)
     root.asset.add(
-        "texture", name="sky", type="skybox", builtin="gradient", rgb1=[0.95, 0.97, 1.0], rgb2=[0.6, 0.65, 0.7], width=64, height=384
+        "texture",
+        name="sky",
+        type="skybox",
+        builtin="gradient",
+        rgb1=[0.95, 0.97, 1.0],
+        rgb2=[0.6, 0.65, 0.7],
+        width=64,
+        height=384,
     )
-    root.worldbody.add("light", pos=[-0.1, -0.2, 0.5], dir=[0.2, 0.4, -1], directional=True, castshadow=True, diffuse=[0.4] * 3)
-    root.worldbody.add("camera", name="side", pos=[-0.075, -0.115, 0.06], xyaxes=[0.84, -0.55, 0, 0.22, 0.34, 0.91], fovy=35)
+    root.worldbody.add(
+        "light",
+        pos=[-0.1, -0.2, 0.5],
+        dir=[0.2, 0.4, -1],
+        directional=True,
+        castshadow=True,
+        diffuse=[0.4] * 3,
+    )
+    root.worldbody.add(
+        "camera", name="side", pos=[-0.075, -0.115, 0.06], xyaxes=[0.84, -0.55, 0, 0.22, 0.34, 0.91], fovy=35
+    )
     return out
 
 
@@ -38,12 +55,14 @@ class TouchTask(composer.Task, abc.ABC):
     """A machine with BioTacs feels for something.
 
     Args:
-      observe: "tactile" (what real sensors report), "privileged" (forces, patches and the skin besides) or "none" (no touch at all).
+      observe: "tactile" (what real sensors report), "privileged" (forces, patches and the skin besides) or
+        "none" (no touch at all).
       physics_timestep: [s].
       biotac: settings of every `BioTac`.
 
     Attributes:
-      estimated: names of what a controller may want to know of the hidden state, `hidden(physics)` gives it; for calibration only.
+      estimated: names of what a controller may want to know of the hidden state, `hidden(physics)` gives it;
+        for calibration only.
     """
 
     estimated: tuple
@@ -77,7 +96,9 @@ class TouchTask(composer.Task, abc.ABC):
         return self._task_observables
 
     def action_spec(self, physics):
-        return specs.BoundedArray((len(self.machine.axes),), np.float64, -1.0, 1.0, name="\t".join(self.machine.axes))
+        return specs.BoundedArray(
+            (len(self.machine.axes),), np.float64, -1.0, 1.0, name="\t".join(self.machine.axes)
+        )
 
     def before_step(self, physics, action, random_state):
         self.machine.command(physics, action)

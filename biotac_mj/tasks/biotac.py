@@ -1,4 +1,5 @@
-"""The BioTac as a composer Entity: attach it to any site of an arena or a robot; its observables own rate, delay and noise."""
+"""The BioTac as a composer Entity: attach it to any site of an arena or a robot; its observables own rate,
+delay and noise."""
 
 import dataclasses
 
@@ -47,13 +48,21 @@ class Reading(observable.Generic):
 class BioTac(composer.Entity):
     """A BioTac for composer: `robot.attach(BioTac(), site)`; its frame (tip -x, pad -y) is the site's.
 
-    The skin's constants are built when the model is compiled and shared by all BioTacs of the same settings; an episode's reset writes the
-    rest state, nothing is built again. The sensor's own noise is off: noise belongs to the observables, drawn from the environment's
-    random state.
-    """
+    The skin's constants are built when the model is compiled and shared by all BioTacs of the same settings;
+    an episode's reset writes the rest state, nothing is built again. The sensor's own noise is off: noise
+    belongs to the observables, drawn from the environment's random state."""
 
     def _build(
-        self, name="biotac", skin="coarse", tier="condensed", slots=8, noise=True, geoms=None, rounding=None, options=None, **settings
+        self,
+        name="biotac",
+        skin="coarse",
+        tier="condensed",
+        slots=8,
+        noise=True,
+        geoms=None,
+        rounding=None,
+        options=None,
+        **settings,
     ):
         """
         Args:
@@ -65,17 +74,23 @@ class BioTac(composer.Entity):
           options, settings: further ones of `biotac_mj.attach`.
 
         Raises:
-          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a place (site, body, pos, quat, prefix) is given.
+          ValueError, FileNotFoundError: as `biotac_mj.attach`, or a place (site, body, pos, quat, prefix) is
+            given.
         """
         from ..coupling import attach
 
         for key in ("site", "body", "pos", "quat", "prefix"):
             if key in settings:
-                raise ValueError(f"BioTac got {key}={settings[key]!r}: an Entity is placed with robot.attach(BioTac(...), site)")
+                raise ValueError(
+                    f"BioTac got {key}={settings[key]!r}: an Entity is placed with "
+                    "robot.attach(BioTac(...), site)"
+                )
         options = {**(options or {})}
         options["readings"] = {**options.get("readings", {}), "noise": False}
         spec = mujoco.MjSpec()
-        self.handle = attach(spec, prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options, **settings)
+        self.handle = attach(
+            spec, prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options, **settings
+        )
         spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())
         root.model = name
@@ -92,7 +107,9 @@ class BioTac(composer.Entity):
     def _name_geoms(self, root, geoms, rounding):
         """Settings about geoms that are not here yet, but in the arena."""
         named = {"geoms": None if geoms is None else tuple(geoms), "rounding": dict(rounding or {})}
-        self.handle = dataclasses.replace(self.handle, config=dataclasses.replace(self.handle.config, **named))
+        self.handle = dataclasses.replace(
+            self.handle, config=dataclasses.replace(self.handle.config, **named)
+        )
         texts = self.handle.config.strings()
         for entry in root.find("plugin", "skin").config:
             entry.value = texts[entry.key]
@@ -123,7 +140,8 @@ class BioTac(composer.Entity):
             reading.resolve(physics.timestep())
 
     def read(self, physics, channel) -> np.ndarray:
-        """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m], status; see `Handle.read`."""
+        """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m],
+        status; see `Handle.read`."""
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
     def rest(self) -> np.ndarray:
@@ -136,24 +154,29 @@ class BioTac(composer.Entity):
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
         from ..coupling.attach import Handle
 
-        return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(physics.model.ptr, physics.data.ptr)
+        return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(
+            physics.model.ptr, physics.data.ptr
+        )
 
     def contact_patch(self, physics) -> np.ndarray:
-        """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to the line of the total contact
-        force, and the outward direction there (against the force); zeros below 1 mN."""
+        """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to
+        the line of the total contact force, and the outward direction there (against the force); zeros below
+        1 mN."""
         force = self.read(physics, "contact_force")
         size = np.linalg.norm(force[:3])
         if size < 1e-3:
             return np.zeros(6)
         along, lever = force[:3] / size, np.cross(force[:3], force[3:]) / size**2
         node = self.vert_xpos(physics)[self._outer]
-        off = np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along  # of the two sides, the one that is pushed
+        off = (
+            np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along
+        )  # of the two sides, the one that is pushed
         return np.concatenate([node[off.argmin()], -along])
 
 
 class BioTacObservables(composer.Observables):
-    """electrodes (19,), pac (22,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and contact_patch
-    (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
+    """electrodes (19,), pac (22,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and
+    contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
 
     def readings(self):
         """All of them, as `Reading`s."""
@@ -167,7 +190,9 @@ class BioTacObservables(composer.Observables):
         """
         for name in names:
             if name not in TACTILE + PRIVILEGED:
-                raise ValueError(f"a BioTac has no observable {name!r}: choose from {', '.join(TACTILE + PRIVILEGED)}")
+                raise ValueError(
+                    f"a BioTac has no observable {name!r}: choose from {', '.join(TACTILE + PRIVILEGED)}"
+                )
         for name in TACTILE + PRIVILEGED:
             self.get_observable(name).enabled = name in names
 

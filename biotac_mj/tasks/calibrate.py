@@ -1,9 +1,9 @@
-"""Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--estimators press,grip] [--episodes 8]
+"""Calibrates the scripted controllers' estimators: python -m biotac_mj.tasks.calibrate [--estimators
+press,grip] [--episodes 8]
 
-Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch is recorded around where it
-will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are kept in out/calibration, a folder for each kind of BioTac,
-so that an interrupted run goes on.
-"""
+Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch
+is recorded around where it will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are
+kept in out/calibration, a folder for each kind of BioTac, so that an interrupted run goes on."""
 
 import argparse
 import functools
@@ -39,7 +39,8 @@ _TIMES = {"follow_edge": 5}
 
 
 def record(domain, task, seed, biotac=None):
-    """One episode: touch (n, 20) while something touches, and the hidden values (n, k) with it, one row per BioTac and frame."""
+    """One episode: touch (n, 20) while something touches, and the hidden values (n, k) with it, one row per
+    BioTac and frame."""
     env = _environment(domain, task, json.dumps(biotac))
     env.random_state.seed(seed)
     controller, rng = make_controller(task), np.random.RandomState(seed)
@@ -59,7 +60,9 @@ def record(domain, task, seed, biotac=None):
 
 @functools.lru_cache(maxsize=1)
 def _environment(domain, task, biotac):
-    return suite.load(domain, task, task_kwargs={"time_limit": _SECONDS.get(task), "biotac": json.loads(biotac)})
+    return suite.load(
+        domain, task, task_kwargs={"time_limit": _SECONDS.get(task), "biotac": json.loads(biotac)}
+    )
 
 
 def record_explore(seed, name, biotac=None):
@@ -90,7 +93,8 @@ def _kept(path, make):
 
 
 def _discriminant(presses, label, shrink=0.05):
-    """Weights (100, 17) and bias (17,) of Fisher's linear discriminant, with the classes' common covariance shrunk to its diagonal."""
+    """Weights (100, 17) and bias (17,) of Fisher's linear discriminant, with the classes' common covariance
+    shrunk to its diagonal."""
     mean = np.stack([presses[label == k].mean(0) for k in range(len(OBJECTS))])
     rest = presses - mean[label]
     covariance = rest.T @ rest / len(rest)
@@ -101,10 +105,15 @@ def _discriminant(presses, label, shrink=0.05):
 
 def _explore(folder, episodes, biotac):
     rows = [(k, i) for i in range(episodes) for k in range(len(OBJECTS))]
-    presses = np.stack([
-        _kept(folder / f"explore_{OBJECTS[k]}_{i}.npz", lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k], biotac))[0]
-        for k, i in tqdm(rows, desc="explore")
-    ])  # fmt: skip
+    presses = np.stack(
+        [
+            _kept(
+                folder / f"explore_{OBJECTS[k]}_{i}.npz",
+                lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k], biotac),
+            )[0]
+            for k, i in tqdm(rows, desc="explore")
+        ]
+    )
     label, fold = np.array([k for k, _ in rows]), np.array([i for _, i in rows]) % 4
     right = 0
     for held in range(4):
@@ -129,12 +138,22 @@ def _add(path, found):
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument(
-        "--estimators", help="comma-separated: press, follow_edge, roll_ball, explore, grip (of hold and lift); default all"
+        "--estimators",
+        help="comma-separated: press, follow_edge, roll_ball, explore, grip (of hold and lift); default all",
     )
     parser.add_argument("--episodes", type=int, default=8, help="of each task, and of each object of explore")
-    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).with_name("calibration.npz"), help="file to write")
-    parser.add_argument("--skin", default="coarse", help="of the BioTac: coarse, default, fine or a stored skin")
+    parser.add_argument(
+        "--folder", type=pathlib.Path, default=pathlib.Path("out/calibration"), help="of the recordings"
+    )
+    parser.add_argument(
+        "--out",
+        type=pathlib.Path,
+        default=pathlib.Path(__file__).with_name("calibration.npz"),
+        help="file to write",
+    )
+    parser.add_argument(
+        "--skin", default="coarse", help="of the BioTac: coarse, default, fine or a stored skin"
+    )
     parser.add_argument("--tier", default="condensed", help="condensed or full")
     parser.add_argument("--material", help="name of a preset")
     options = parser.parse_args(arguments)
@@ -152,12 +171,21 @@ def main(arguments=None):
             found = _explore(folder, options.episodes, biotac)
         else:
             made = [
-                _kept(folder / f"{task}_{i}.npz", lambda i=i, task=task: record(domain[task], task, _SEED + i, biotac))
-                for i, task in tqdm([(i, t) for i in range(options.episodes * _TIMES.get(name, 1)) for t in groups[name]], desc=name)
+                _kept(
+                    folder / f"{task}_{i}.npz",
+                    lambda i=i, task=task: record(domain[task], task, _SEED + i, biotac),
+                )
+                for i, task in tqdm(
+                    [(i, t) for i in range(options.episodes * _TIMES.get(name, 1)) for t in groups[name]],
+                    desc=name,
+                )
             ]
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
             fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
-            print(f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread {hidden.std(0)}")
+            print(
+                f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread "
+                f"{hidden.std(0)}"
+            )
             found = {f"{name}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
         _add(options.out, found | {f"{name}/fitted_on": np.array(kind)})
 

@@ -1,4 +1,5 @@
-"""Follow an edge: the rim of a round plate of unknown radius and place, at a given speed, with the pad kept on it."""
+"""Follow an edge: the rim of a round plate of unknown radius and place, at a given speed, with the pad kept
+on it."""
 
 import numpy as np
 from dm_control.utils import rewards
@@ -21,8 +22,8 @@ def _name(radius):
 
 
 class FollowEdge(TouchTask):
-    """Reward: the product of three, each in [0, 1]: force between 0.15 and 3 N; the pad within 0.7 mm of the rim (0 at 3 mm); speed along
-    the rim, tip first, 8 mm/s or more (0 at rest)."""
+    """Reward: the product of three, each in [0, 1]: force between 0.15 and 3 N; the pad within 0.7 mm of the
+    rim (0 at 3 mm); speed along the rim, tip first, 8 mm/s or more (0 at rest)."""
 
     estimated = ("offset", "turn", "force")
     seconds = 5.0
@@ -30,11 +31,22 @@ class FollowEdge(TouchTask):
     def __init__(self, **settings):
         gantry = Gantry(yaw=True)
         rounding = {_name(radius): _EDGE for radius in _RADII}
-        super().__init__(gantry, [gantry.mount], **settings | {"biotac": {"rounding": rounding, **(settings.get("biotac") or {})}})
+        super().__init__(
+            gantry,
+            [gantry.mount],
+            **settings | {"biotac": {"rounding": rounding, **(settings.get("biotac") or {})}},
+        )
         self._discs = []
         for radius in _RADII:
             disc = self._arena.mjcf_model.worldbody.add("body", name=_name(radius), mocap=True, pos=AWAY)
-            disc.add("geom", name=disc.name, type="cylinder", size=[radius, 4e-3], pos=[0, 0, -4e-3], rgba=[0.75, 0.6, 0.4, 1])
+            disc.add(
+                "geom",
+                name=disc.name,
+                type="cylinder",
+                size=[radius, 4e-3],
+                pos=[0, 0, -4e-3],
+                rgba=[0.75, 0.6, 0.4, 1],
+            )
             self._discs.append(disc)
         self._center, self._radius = np.zeros(2), _RADII[0]
 
@@ -51,14 +63,19 @@ class FollowEdge(TouchTask):
         self.machine.place(physics, np.array([*place, 0.0, turn]))
 
     def _pose(self, physics):
-        """Signed distance of the pad's point from the rim (positive outside) [m], the finger's turn against the rim [rad], the tangent."""
+        """Signed distance of the pad's point from the rim (positive outside) [m], the finger's turn against
+        the rim [rad], the tangent."""
         x, y, _, yaw = self.machine.position(physics)
         heading = np.array([np.cos(yaw), np.sin(yaw)])
         away = np.array([x, y]) + _REFERENCE * heading - self._center
         distance = np.linalg.norm(away)
         normal = away / distance
         tangent = np.array([-normal[1], normal[0]])  # the plate on its left
-        return distance - self._radius, np.arctan2(tangent[0] * heading[1] - tangent[1] * heading[0], tangent @ heading), tangent
+        return (
+            distance - self._radius,
+            np.arctan2(tangent[0] * heading[1] - tangent[1] * heading[0], tangent @ heading),
+            tangent,
+        )
 
     def hidden(self, physics):
         offset, turn, _ = self._pose(physics)  # offset: how far the rim is to the finger's left

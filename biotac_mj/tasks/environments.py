@@ -13,11 +13,15 @@ from . import suite
 
 __all__ = ["BioTacEnv", "IDS", "register"]
 
-IDS = {f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task) for domain, task in suite.tasks()}
+IDS = {
+    f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task)
+    for domain, task in suite.tasks()
+}
 
 
 class BioTacEnv(gymnasium.Env):
-    """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0, 1].
+    """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0,
+    1].
 
     Args:
       domain, task: see `suite.tasks`.
@@ -40,10 +44,16 @@ class BioTacEnv(gymnasium.Env):
         action = self.suite.action_spec()  # all of them in [-1, 1]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
         counts = ("electrodes", "pac", "pdc", "tac", "tdc")
-        self.observation_space = gymnasium.spaces.Dict({
-            name: gymnasium.spaces.Box(*((0, 4095) if name.split("/")[-1] in counts else (-np.inf, np.inf)), spec.shape, np.float32)
-            for name, spec in sorted(self.suite.observation_spec().items())
-        })  # fmt: skip
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                name: gymnasium.spaces.Box(
+                    *((0, 4095) if name.split("/")[-1] in counts else (-np.inf, np.inf)),
+                    spec.shape,
+                    np.float32,
+                )
+                for name, spec in sorted(self.suite.observation_spec().items())
+            }
+        )
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -74,7 +84,9 @@ def register():
     """Registers all tasks with Gymnasium; once is enough, more do no harm. Returns their ids."""
     for name, (domain, task) in IDS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=f"{__name__}:BioTacEnv", kwargs={"domain": domain, "task": task})
+            gymnasium.register(
+                name, entry_point=f"{__name__}:BioTacEnv", kwargs={"domain": domain, "task": task}
+            )
     return list(IDS)
 
 

@@ -1,4 +1,5 @@
-"""Explore an object and say which of seventeen it is: the paper's eight indenters, six pegs, a table's surface, edge and corner."""
+"""Explore an object and say which of seventeen it is: the paper's eight indenters, six pegs, a table's
+surface, edge and corner."""
 
 import mujoco
 import numpy as np
@@ -13,25 +14,32 @@ __all__ = ["Explore"]
 _PAD = 8.2e-3  # [m]
 CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
 _OFF, _TURN = 1e-3, 0.2  # how badly the object is centred [m] and turned [rad]
-_TURNED_UP = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])  # an object's +y, which goes ahead, to the world's +z
+_TURNED_UP = np.array(
+    [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+)  # an object's +y, which goes ahead, to the world's +z
 
 
 class Explore(TouchTask):
-    """An action moves the finger (3) and holds a belief for each object (17); reward: the share of the right one in the beliefs, which
-    count from -1, that is 1/17 for one who does not know."""
+    """An action moves the finger (3) and holds a belief for each object (17); reward: the share of the right
+    one in the beliefs, which count from -1, that is 1/17 for one who does not know."""
 
     estimated = ("force",)
     seconds = 4.0
 
     def __init__(self, objects=OBJECTS, **settings):
-        """objects: names of those that are laid down; beliefs are always about all 17. Raises ValueError for unknown ones."""
+        """objects: names of those that are laid down; beliefs are always about all 17. Raises ValueError for
+        unknown ones."""
         for name in objects:
             if name not in OBJECTS:
                 raise ValueError(f"no object {name!r}: choose from {', '.join(OBJECTS)}")
         self.choices = [OBJECTS.index(name) for name in objects]
         shapes = [make_object(name) for name in OBJECTS]
         gantry, rounding = Gantry(), {shape.name: shape.rounding for shape in shapes if shape.rounding}
-        super().__init__(gantry, [gantry.mount], **settings | {"biotac": {"rounding": rounding, **(settings.get("biotac") or {})}})
+        super().__init__(
+            gantry,
+            [gantry.mount],
+            **settings | {"biotac": {"rounding": rounding, **(settings.get("biotac") or {})}},
+        )
         self._objects = [_add(self._arena.mjcf_model, shape) for shape in shapes]
         self.chosen = 0
         self._belief = np.full(len(OBJECTS), 1 / len(OBJECTS))
@@ -71,7 +79,9 @@ def _add(root, shape):
     mujoco.mju_mulQuat(quat, _TURNED_UP, shape.quat)
     geom = dict(name=shape.name, type=shape.type, pos=pos, quat=quat, rgba=[0.75, 0.6, 0.4, 1])
     if shape.type == "mesh":
-        root.asset.add("mesh", name=shape.name, vertex=shape.vert.ravel(), face=shape.face.ravel(), inertia="shell")
+        root.asset.add(
+            "mesh", name=shape.name, vertex=shape.vert.ravel(), face=shape.face.ravel(), inertia="shell"
+        )
         body.add("geom", mesh=shape.name, **geom)
     else:
         body.add("geom", size=shape.size, **geom)

@@ -1,4 +1,5 @@
-"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, any other by body name."""
+"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, any other by body
+name."""
 
 import dataclasses
 
@@ -38,7 +39,8 @@ class Mount:
         x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
         if abs(x @ y) > 1e-6 or not x.any() or not y.any():
             raise ValueError(
-                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: a BioTac's pad looks sideways"
+                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: a "
+                "BioTac's pad looks sideways"
             )
         x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
         out = np.empty(4)
@@ -46,38 +48,70 @@ class Mount:
         return out
 
 
-# The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the Menagerie's meshes.
+# The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the
+# Menagerie's meshes.
 _SHADOW = {
-    finger: Mount(f"{finger}distal", (0, 0, (35e-3 if finger == "th" else 32e-3) - _TIP)) for finger in ("ff", "mf", "rf", "lf", "th")
+    finger: Mount(f"{finger}distal", (0, 0, (35e-3 if finger == "th" else 32e-3) - _TIP))
+    for finger in ("ff", "mf", "rf", "lf", "th")
 }
-# Shadow's BioTac fingers (shadow-robot/sr_common, hand/xacro/finger/biotac): no moving distal joint; the sensor is fixed to the middle link
-# at z = 8 mm (thumb 10 mm, turned by -90 deg about z). The sphere of the fingertip is (0, 4, 29) mm behind a joint fixed at 20 deg at
-# z = 20 mm, that is at (0, -6.2, 48.6) mm; ours is at (-14.3, -0.8, 0) mm of the BioTac frame.
-_SHADOW_AUTHENTIC = {f: dataclasses.replace(m, pos=(0, -5.4e-3, 36.3e-3 if f == "th" else 34.3e-3)) for f, m in _SHADOW.items()}
-# Menagerie's Allegro: capsules end 41 mm (fingers) and 55 mm (thumb) beyond the last joint; fingers bend towards +x.
+# Shadow's BioTac fingers (shadow-robot/sr_common, hand/xacro/finger/biotac): no moving distal joint; the
+# sensor is fixed to the middle link at z = 8 mm (thumb 10 mm, turned by -90 deg about z). The sphere of the
+# fingertip is (0, 4, 29) mm behind a joint fixed at 20 deg at z = 20 mm, that is at (0, -6.2, 48.6) mm; ours
+# is at (-14.3, -0.8, 0) mm of the BioTac frame.
+_SHADOW_AUTHENTIC = {
+    f: dataclasses.replace(m, pos=(0, -5.4e-3, 36.3e-3 if f == "th" else 34.3e-3)) for f, m in _SHADOW.items()
+}
+# Menagerie's Allegro: capsules end 41 mm (fingers) and 55 mm (thumb) beyond the last joint; fingers bend
+# towards +x.
 _ALLEGRO = {
     finger: Mount(f"{finger}_tip", (0, 0, (55e-3 if finger == "th" else 41e-3) - _TIP), pad=(1.0, 0.0, 0.0))
     for finger in ("ff", "mf", "rf", "th")
 }
-# Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads look to -x at 11.2 mm, z = +-14.5 mm.
+# Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads look to -x at 11.2
+# mm, z = +-14.5 mm.
 _LEAP = {
     finger: Mount(
-        f"{finger}_ds", (8.2e-3 - 11.2e-3, _TIP - length, z), tip=(0.0, -1.0, 0.0), pad=(-1.0, 0.0, 0.0), replaces=(f"{finger}_tip",)
+        f"{finger}_ds",
+        (8.2e-3 - 11.2e-3, _TIP - length, z),
+        tip=(0.0, -1.0, 0.0),
+        pad=(-1.0, 0.0, 0.0),
+        replaces=(f"{finger}_tip",),
     )
-    for finger, length, z in (("if", 50e-3, 14.5e-3), ("mf", 50e-3, 14.5e-3), ("rf", 50e-3, 14.5e-3), ("th", 62e-3, -14.5e-3))
+    for finger, length, z in (
+        ("if", 50e-3, 14.5e-3),
+        ("mf", 50e-3, 14.5e-3),
+        ("rf", 50e-3, 14.5e-3),
+        ("th", 62e-3, -14.5e-3),
+    )
 }
-HANDS = {"shadow_hand": _SHADOW, "shadow_hand_authentic": _SHADOW_AUTHENTIC, "allegro_hand": _ALLEGRO, "leap_hand": _LEAP}
+HANDS = {
+    "shadow_hand": _SHADOW,
+    "shadow_hand_authentic": _SHADOW_AUTHENTIC,
+    "allegro_hand": _ALLEGRO,
+    "leap_hand": _LEAP,
+}
 
 
-def attach_to_hand(spec, hand="shadow_hand", fingers=None, variant="replace", prefix="biotac_", self_touch=False, slots=None, **settings):
+def attach_to_hand(
+    spec,
+    hand="shadow_hand",
+    fingers=None,
+    variant="replace",
+    prefix="biotac_",
+    self_touch=False,
+    slots=None,
+    **settings,
+):
     """Puts BioTacs onto the fingertips of a hand.
 
     Args:
       spec: the MjSpec that holds the hand. Add the objects first, as for `attach`.
-      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand: Menagerie's models, left or right), or {finger: Mount} of any other.
+      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand: Menagerie's models, left or right), or
+        {finger: Mount} of any other.
       fingers: which of them, e.g. ("ff", "th"); None takes all.
-      variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's BioTac fingers, whose last
-        joint does not move: the joint, and what drove it, are taken out of the model.
+      variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
+        BioTac fingers, whose last joint does not move: the joint, and what drove it, are taken out of the
+        model.
       prefix: each finger's names begin with prefix + finger + "_".
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
@@ -100,7 +134,11 @@ def attach_to_hand(spec, hand="shadow_hand", fingers=None, variant="replace", pr
     own = _subtree(_root(next(iter(links.values()))))
     names = {body.name for body in own}
     if slots is None:
-        outside = {g.parent.name or id(g.parent) for g in spec.geoms if (g.contype or g.conaffinity) and g.parent.name not in names}
+        outside = {
+            g.parent.name or id(g.parent)
+            for g in spec.geoms
+            if (g.contype or g.conaffinity) and g.parent.name not in names
+        }
         slots = max(4, len(outside) + 1, len(names) if self_touch else 0)
     handles, seed = {}, int(settings.pop("seed", 0))
     for i, (finger, link) in enumerate(links.items()):
@@ -113,7 +151,14 @@ def attach_to_hand(spec, hand="shadow_hand", fingers=None, variant="replace", pr
         if link.explicitinertial and link.mass > 2 * _CORE_MASS:
             link.mass -= _CORE_MASS
         handles[finger] = attach(
-            spec, body=link.name, pos=mount.pos, quat=mount.quat, prefix=f"{prefix}{finger}_", seed=seed + i, slots=slots, **settings
+            spec,
+            body=link.name,
+            pos=mount.pos,
+            quat=mount.quat,
+            prefix=f"{prefix}{finger}_",
+            seed=seed + i,
+            slots=slots,
+            **settings,
         )
     if not self_touch:
         _exclude(spec, handles, own)
@@ -126,10 +171,16 @@ def _mounts(hand, variant):
     if variant not in ("replace", "authentic"):
         raise ValueError(f"unknown variant {variant!r}: choose replace or authentic")
     if hand not in HANDS:
-        raise ValueError(f"unknown hand {hand!r}: choose one of {', '.join(HANDS)}, or give {{finger: Mount(body, pos, tip, pad)}}")
+        raise ValueError(
+            f"unknown hand {hand!r}: choose one of {', '.join(HANDS)}, or give "
+            f"{{finger: Mount(body, pos, tip, pad)}}"
+        )
     if variant == "authentic":
         if hand != "shadow_hand":
-            raise ValueError(f"only the shadow_hand comes with authentic BioTac fingers, not {hand!r}: leave the variant out")
+            raise ValueError(
+                f"only the shadow_hand comes with authentic BioTac fingers, not {hand!r}: leave the variant "
+                "out"
+            )
         return HANDS["shadow_hand_authentic"]
     return HANDS[hand]
 
@@ -138,12 +189,15 @@ def _find(spec, name):
     found = [b for b in spec.bodies if b.name == name] or [b for b in spec.bodies if b.name.endswith(name)]
     if len(found) != 1:
         there = ", ".join(b.name for b in (found or spec.bodies) if b.name) or "no named bodies"
-        raise ValueError(f"{'several links end' if found else 'no link ends'} with {name!r}: the model has {there}")
+        raise ValueError(
+            f"{'several links end' if found else 'no link ends'} with {name!r}: the model has {there}"
+        )
     return found[0]
 
 
 def _root(body):
-    """The hand's first body: the child of the world, or the first below a joint that a robot or a carriage moves it with."""
+    """The hand's first body: the child of the world, or the first below a joint that a robot or a carriage
+    moves it with."""
     while body.parent.name != "world":
         body = body.parent
     return body

@@ -25,7 +25,14 @@ class _Grip(TouchTask):
         self._joint = self._body.add("freejoint", name="object")
         inertia = mass / 3 * (np.sum(_HALF**2) - _HALF**2)
         self._body.add("inertial", pos=[0, 0, 0], mass=mass, diaginertia=inertia)
-        self._body.add("geom", name="object", type="box", size=_HALF, friction=[0.5, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 1])
+        self._body.add(
+            "geom",
+            name="object",
+            type="box",
+            size=_HALF,
+            friction=[0.5, 0.005, 1e-4],
+            rgba=[0.85, 0.45, 0.15, 1],
+        )
         self._mass = mass
 
     def _put(self, physics, height, open_by):
@@ -49,15 +56,18 @@ class _Grip(TouchTask):
 
 
 class Hold(_Grip):
-    """The object's support goes away at 0.5 s, and its weight changes three times. Reward: 1 while it has sunk by less than 1 mm (0 at
-    10 mm), times a half to one for gentleness: one up to 1.6 times the grip that friction needs plus 0.3 N, a half where it is 3 N more."""
+    """The object's support goes away at 0.5 s, and its weight changes three times. Reward: 1 while it has
+    sunk by less than 1 mm (0 at 10 mm), times a half to one for gentleness: one up to 1.6 times the grip that
+    friction needs plus 0.3 N, a half where it is 3 N more."""
 
     seconds = 4.0
 
     def __init__(self, **settings):
         super().__init__(lift=False, mass=0.04, **settings)
         self._support = self._arena.mjcf_model.worldbody.add("body", name="support", mocap=True, pos=AWAY)
-        self._support.add("geom", name="support", type="box", size=[0.01, 0.004, 0.002], rgba=[0.5, 0.5, 0.5, 1])
+        self._support.add(
+            "geom", name="support", type="box", size=[0.01, 0.004, 0.002], rgba=[0.5, 0.5, 0.5, 1]
+        )
         self._times, self._pulls = np.zeros(3), np.zeros(4)
         self._begin = 0.0
 
@@ -70,7 +80,9 @@ class Hold(_Grip):
 
     def pull(self, time):
         """What is added to the object's weight [N]; each change takes 0.1 s."""
-        return float(np.interp(time, np.ravel([[t, t + 0.1] for t in self._times]), np.repeat(self._pulls, 2)[1:-1]))
+        return float(
+            np.interp(time, np.ravel([[t, t + 0.1] for t in self._times]), np.repeat(self._pulls, 2)[1:-1])
+        )
 
     def before_substep(self, physics, action, random_state):
         time = physics.data.time  # written directly: see Gantry.command
@@ -86,7 +98,8 @@ class Hold(_Grip):
 
 
 class Lift(_Grip):
-    """Pinch a block of 20 to 150 g on a table and lift it by 30 mm. Reward: the height as a share of 30 mm, times a half to one for
+    """Pinch a block of 20 to 150 g on a table and lift it by 30 mm. Reward: the height as a share of 30 mm,
+    times a half to one for
     gentleness: one up to twice the grip that friction needs plus 0.5 N, a half where it is 3 N more."""
 
     seconds = 4.0
@@ -94,18 +107,24 @@ class Lift(_Grip):
 
     def __init__(self, **settings):
         super().__init__(lift=True, mass=0.1, **settings)
-        table = dict(type="box", size=[0.1, 0.1, 0.005], pos=[0, 0, _PADS - _HALF[2] - 0.005], rgba=[0.75, 0.6, 0.4, 1])
+        table = dict(
+            type="box", size=[0.1, 0.1, 0.005], pos=[0, 0, _PADS - _HALF[2] - 0.005], rgba=[0.75, 0.6, 0.4, 1]
+        )
         self._arena.mjcf_model.worldbody.add("geom", name="table", **table)
 
     def initialize_episode(self, physics, random_state):
         body = physics.bind(self._body)
         mass = random_state.uniform(0.02, 0.15)
         body.mass, body.inertia = mass, mass / 3 * (np.sum(_HALF**2) - _HALF**2)
-        physics.model.body_subtreemass[[0, body.element_id]] += mass - body.subtreemass  # as mj_setConst would
+        physics.model.body_subtreemass[[0, body.element_id]] += (
+            mass - body.subtreemass
+        )  # as mj_setConst would
         self._mass = mass
         self._put(physics, _PADS, random_state.uniform(2e-3, 5e-3))
 
     def get_reward(self, physics):
         raised = np.clip((self.height(physics) - _PADS) / self._goal, 0, 1)
-        gentle = rewards.tolerance(self.grip(physics), (0.0, self._mass * _GRAVITY / FRICTION + 0.5), 6.0, "linear", 0.0)
+        gentle = rewards.tolerance(
+            self.grip(physics), (0.0, self._mass * _GRAVITY / FRICTION + 0.5), 6.0, "linear", 0.0
+        )
         return float(raised * max(0.5, gentle))

@@ -1,4 +1,5 @@
-"""Press to a target force: a plate of unknown height and tilt; the wanted force is told, the felt one is not."""
+"""Press to a target force: a plate of unknown height and tilt; the wanted force is told, the felt one is
+not."""
 
 import numpy as np
 from dm_control.utils import rewards
@@ -14,7 +15,8 @@ _TILT = 0.08  # [rad]
 
 
 class Press(TouchTask):
-    """Reward: 1 where the normal force is within 10 % of the target, down to 0 where it is off by the whole target, which changes once."""
+    """Reward: 1 where the normal force is within 10 % of the target, down to 0 where it is off by the whole
+    target, which changes once."""
 
     estimated = ("force",)
     seconds = 3.0
@@ -23,7 +25,14 @@ class Press(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         self._plate = self._arena.mjcf_model.worldbody.add("body", name="plate", mocap=True, pos=AWAY)
-        self._plate.add("geom", name="plate", type="box", size=[0.04, 0.04, 0.005], pos=[0, 0, -0.005], rgba=[0.75, 0.6, 0.4, 1])
+        self._plate.add(
+            "geom",
+            name="plate",
+            type="box",
+            size=[0.04, 0.04, 0.005],
+            pos=[0, 0, -0.005],
+            rgba=[0.75, 0.6, 0.4, 1],
+        )
         self._targets = np.zeros(2)
         self._observe("target", lambda physics: np.array([self.target(physics)]))
 
@@ -44,4 +53,8 @@ class Press(TouchTask):
 
     def get_reward(self, physics):
         target = self.target(physics)
-        return float(rewards.tolerance(self.force(physics)[1], (0.9 * target, 1.1 * target), 0.9 * target, "linear", 0.0))
+        return float(
+            rewards.tolerance(
+                self.force(physics)[1], (0.9 * target, 1.1 * target), 0.9 * target, "linear", 0.0
+            )
+        )

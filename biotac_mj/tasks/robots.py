@@ -36,12 +36,24 @@ class _Machine(composer.Entity):
     def _axis(self, body, name, direction, limits, speed, hinge=False):
         stiffness = _YAW_STIFFNESS if hinge else _STIFFNESS
         inertia = _YAW_INERTIA if hinge else _MASS
-        joint = body.add("joint", name=name, type="hinge" if hinge else "slide", axis=direction, range=limits, limited=True)
+        joint = body.add(
+            "joint", name=name, type="hinge" if hinge else "slide", axis=direction, range=limits, limited=True
+        )
         actuator = self._root.actuator.add(
-            "general", name=name, joint=joint, dyntype="integrator", biastype="affine", gainprm=[stiffness],
-            biasprm=[0, -stiffness, -2 * np.sqrt(stiffness * inertia)], ctrllimited=True, ctrlrange=[-speed, speed], actlimited=True,
-            actrange=limits, forcelimited=True, forcerange=[-_LARGEST_FORCE, _LARGEST_FORCE],
-        )  # fmt: skip
+            "general",
+            name=name,
+            joint=joint,
+            dyntype="integrator",
+            biastype="affine",
+            gainprm=[stiffness],
+            biasprm=[0, -stiffness, -2 * np.sqrt(stiffness * inertia)],
+            ctrllimited=True,
+            ctrlrange=[-speed, speed],
+            actlimited=True,
+            actrange=limits,
+            forcelimited=True,
+            forcerange=[-_LARGEST_FORCE, _LARGEST_FORCE],
+        )
         self._joints.append(joint)
         self._actuators.append(actuator)
         self._speed.append(speed)
@@ -75,8 +87,11 @@ class _Machine(composer.Entity):
 
     def command(self, physics, action):
         """Sets the velocities of the axes: action (naxis,) in [-1, 1]."""
-        # not through a binding: it would make dm_control recompute the whole step, skin included, before the next reading
-        physics.data.ctrl[physics.bind(self._actuators).element_id] = np.clip(action, -1, 1) * np.array(self._speed)
+        # not through a binding: it would make dm_control recompute the whole step, skin included, before the
+        # next reading
+        physics.data.ctrl[physics.bind(self._actuators).element_id] = np.clip(action, -1, 1) * np.array(
+            self._speed
+        )
 
     def place(self, physics, position):
         """Puts the axes at position (naxis,) [m], [rad], at rest, and the servos with them."""
@@ -90,7 +105,8 @@ class _Machine(composer.Entity):
 
 
 class Gantry(_Machine):
-    """Carries one BioTac, pad down: axes x, y, z and, if asked, yaw about the vertical through the BioTac's origin.
+    """Carries one BioTac, pad down: axes x, y, z and, if asked, yaw about the vertical through the BioTac's
+    origin.
 
     At rest the BioTac's axes are x along the world's x (tip at -x), y up, z along -y of the world.
     """
@@ -112,7 +128,8 @@ class Gantry(_Machine):
 
 
 class Gripper(_Machine):
-    """Two facing BioTacs, tips down: lift raises both, grip moves each towards the other, until at 0 the pads would just meet."""
+    """Two facing BioTacs, tips down: lift raises both, grip moves each towards the other, until at 0 the pads
+    would just meet."""
 
     def _build(self, name="gripper", lift=True):
         self._start(name)
@@ -125,7 +142,11 @@ class Gripper(_Machine):
             finger = self._carriage(body, name, pos=[0, side * _PAD, 0])
             self._axis(finger, name, [0, -side, 0], [-0.05, 0.002], 0.02)
             finger.add("geom", fromto=[0, 0, 0.012, 0, 0, 0.052], **_ROD)
-            self.mounts.append(finger.add("site", name=f"mount_{name}", quat=_quaternion([[0, 0, 1], [0, side, 0], [-side, 0, 0]])))
+            self.mounts.append(
+                finger.add(
+                    "site", name=f"mount_{name}", quat=_quaternion([[0, 0, 1], [0, side, 0], [-side, 0, 0]])
+                )
+            )
 
     @property
     def axes(self):

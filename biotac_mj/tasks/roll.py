@@ -24,12 +24,30 @@ class RollBall(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
-        rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)  # 2: the finger's machine is not in the way
+        rolls = dict(
+            friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2
+        )  # 2: the finger's machine is not in the way
         floor = [0, 0, -_PAD - 2 * _RADIUS]
-        world.add("geom", name="table", type="plane", size=[0.1, 0.1, 0.01], pos=floor, rgba=[0.75, 0.6, 0.4, 1], **rolls)
+        world.add(
+            "geom",
+            name="table",
+            type="plane",
+            size=[0.1, 0.1, 0.01],
+            pos=floor,
+            rgba=[0.75, 0.6, 0.4, 1],
+            **rolls,
+        )
         self._ball = world.add("body", name="ball", pos=AWAY)
         self._joint = self._ball.add("freejoint", name="ball")
-        self._ball.add("geom", name="ball", type="sphere", size=[_RADIUS], mass=_MASS, rgba=[0.85, 0.45, 0.15, 1], **rolls)
+        self._ball.add(
+            "geom",
+            name="ball",
+            type="sphere",
+            size=[_RADIUS],
+            mass=_MASS,
+            rgba=[0.85, 0.45, 0.15, 1],
+            **rolls,
+        )
         self._target = np.zeros(2)
         mark = dict(type="cylinder", size=[5e-4, 1e-4], rgba=[0.1, 0.6, 0.2, 1], contype=0, conaffinity=0)
         world.add("body", name="target", mocap=True).add("geom", **mark)
@@ -39,7 +57,10 @@ class RollBall(TouchTask):
         start = np.array([_CENTER, 0.0]) + random_state.uniform(-1, 1, size=2) * _START
         # along the finger: across it the pad is too round and too narrow to roll a ball far
         self._target = start + np.array(
-            [random_state.choice([-1, 1]) * random_state.uniform(4e-3, 6e-3), random_state.uniform(-1e-3, 1e-3)]
+            [
+                random_state.choice([-1, 1]) * random_state.uniform(4e-3, 6e-3),
+                random_state.uniform(-1e-3, 1e-3),
+            ]
         )
         floor = -_PAD - 2 * _RADIUS
         physics.bind(self._joint).qpos = [*start, floor + _RADIUS, 1, 0, 0, 0]
@@ -53,7 +74,13 @@ class RollBall(TouchTask):
 
     def hidden(self, physics):
         # where the ball is under the finger
-        return np.append(self.ball(physics) - self.machine.position(physics)[:2], self.force(physics)[1])[None]
+        return np.append(self.ball(physics) - self.machine.position(physics)[:2], self.force(physics)[1])[
+            None
+        ]
 
     def get_reward(self, physics):
-        return float(rewards.tolerance(np.linalg.norm(self.ball(physics) - self._target), (0, 5e-4), 3.5e-3, "linear", 0.0))
+        return float(
+            rewards.tolerance(
+                np.linalg.norm(self.ball(physics) - self._target), (0, 5e-4), 3.5e-3, "linear", 0.0
+            )
+        )

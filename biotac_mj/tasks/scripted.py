@@ -1,8 +1,9 @@
-"""Controllers that solve the tasks from touch, the machine's own position and the told target; and one that acts at random.
+"""Controllers that solve the tasks from touch, the machine's own position and the told target; and one that
+acts at random.
 
-A controller never sees the simulation's hidden state. What it believes about force, place and load comes from `touch.Estimator`, a
-regression calibrated on other episodes (`calibrate`), or, in the calibration itself, from the truth handed to `act`.
-"""
+A controller never sees the simulation's hidden state. What it believes about force, place and load comes from
+`touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, in the calibration itself,
+from the truth handed to `act`."""
 
 import numpy as np
 
@@ -15,11 +16,14 @@ _FRICTION = 0.783414394  # of the skin; what the gripper knows about friction
 
 
 class Scripted:
-    """Reads touch, estimates, acts. `act(observation, truth)` takes (nbiotac, nestimated) true values in place of the estimates."""
+    """Reads touch, estimates, acts. `act(observation, truth)` takes (nbiotac, nestimated) true values in
+    place of the estimates."""
 
     task: str
     calibration = None  # name of its estimator, where it is not that of the task
-    estimator = stored = None  # the estimator, once it is needed; arrays of the calibration, None: the package's
+    estimator = stored = (
+        None  # the estimator, once it is needed; arrays of the calibration, None: the package's
+    )
 
     @property
     def fit(self):
@@ -39,7 +43,9 @@ class Scripted:
                 self.estimator = load_estimator(self.fit, self.stored)
             truth = self.estimator(self.felt)
         touching = float(np.abs(self.felt).max()) > 0.6
-        return np.clip(self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1)
+        return np.clip(
+            self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1
+        )
 
     def wait(self, observation):
         return np.zeros(3)
@@ -73,7 +79,9 @@ class FollowEdge(Scripted):
         yaw = observation["position"][3]
         along, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
         velocity = np.clip(6.0 * offset, -8e-3, 8e-3) * left - 9e-3 * (abs(offset) < 1.5e-3) * along
-        return np.array([*(velocity / 0.03), np.clip(0.2 * (force - 0.8), -0.2, 0.2), np.clip(-4.0 * turn, -0.8, 0.8)])
+        return np.array(
+            [*(velocity / 0.03), np.clip(0.2 * (force - 0.8), -0.2, 0.2), np.clip(-4.0 * turn, -0.8, 0.8)]
+        )
 
 
 class RollBall(Scripted):
@@ -85,17 +93,23 @@ class RollBall(Scripted):
         ball, force = observation["position"][:2] + estimate[0, :2], estimate[0, 2]
         if not touching:
             return np.array([0, 0, -0.3])
-        velocity = np.clip(6.0 * (observation["target"] - ball), -0.015, 0.015) if force > 0.1 else np.zeros(2)
+        velocity = (
+            np.clip(6.0 * (observation["target"] - ball), -0.015, 0.015) if force > 0.1 else np.zeros(2)
+        )
         return np.array([*(velocity / 0.03), np.clip(0.3 * (force - 0.4), -0.2, 0.2)])
 
 
 class Explore(Scripted):
-    """Presses at five places to one depth below the first touch, then names the object whose presses felt most alike."""
+    """Presses at five places to one depth below the first touch, then names the object whose presses felt
+    most alike."""
 
     task = "explore"
     places = 1e-3 * np.array([[0, 0], [3, 0], [-3, 0], [0, 3], [0, -3]])
     depth, clear = 0.9e-3, 0.7e-3
-    settle, patience = 4, 25  # frames at depth before the reading; frames after which a stiff thing is taken as it is
+    settle, patience = (
+        4,
+        25,
+    )  # frames at depth before the reading; frames after which a stiff thing is taken as it is
 
     def reset(self):
         super().reset()
@@ -149,10 +163,16 @@ class Explore(Scripted):
 
 
 class Hold(Scripted):
-    """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the friction limit: that is slip."""
+    """Grips as hard as the load that it feels needs, with a margin; closes fast where the load nears the
+    friction limit: that is slip."""
 
     task, calibration = "hold", "grip"
-    least, share, spare, gain = 1.0, 1.5, 0.35, 1.5  # grip before there is a load [N]; what it needs times a share, and more [N]; haste
+    least, share, spare, gain = (
+        1.0,
+        1.5,
+        0.35,
+        1.5,
+    )  # grip before there is a load [N]; what it needs times a share, and more [N]; haste
 
     def wait(self, observation):
         return np.zeros(1)
@@ -189,7 +209,9 @@ class Lift(Hold):
         self.ready = self.ready or (touching and estimate[:, 0].mean() > 0.9 * self.least)
         height = observation["position"][0]
         speed = 0.15 if height < 1.5e-3 else 0.9
-        return np.array([min(speed * (not self.slipping), 20 * (self.goal - height) / 0.03) if self.ready else 0.0, grip])
+        return np.array(
+            [min(speed * (not self.slipping), 20 * (self.goal - height) / 0.03) if self.ready else 0.0, grip]
+        )
 
 
 class Random:
@@ -213,7 +235,8 @@ def make_controller(task, env=None, calibration=None) -> Scripted:
 
     Args:
       task: its name.
-      env: where it will act; it is warned (`CalibrationWarning`) of BioTacs unlike those its estimator was fitted on.
+      env: where it will act; it is warned (`CalibrationWarning`) of BioTacs unlike those its estimator was
+        fitted on.
       calibration: file of `python -m biotac_mj.tasks.calibrate --out`; None takes the package's.
 
     Raises:

@@ -21,12 +21,19 @@ def environment(task, environment_kwargs=None, random=None, time_limit=None, **s
 
     warp.config.log_level = warp.LOG_WARNING
     made = task(**settings)
-    # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the forces that act in it
+    # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
+    # forces that act in it
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
-    limit = (made.seconds if time_limit is None else time_limit) - 1e-6  # sums of time steps may fall short of it by rounding
-    env = composer.Environment(made, time_limit=limit, random_state=random, **options | (environment_kwargs or {}))
+    limit = (
+        made.seconds if time_limit is None else time_limit
+    ) - 1e-6  # sums of time steps may fall short of it by rounding
+    env = composer.Environment(
+        made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
+    )
     state = env.random_state.get_state()
-    env.reset()  # the first one compiles and draws noise that later ones do not: done here, so that a seed means one episode
+    # the first one compiles and draws noise that later ones do not: done here, so that a seed means one
+    # episode
+    env.reset()
     env.random_state.set_state(state)
     return env
 
@@ -47,8 +54,8 @@ def load(domain_name, task_name, task_kwargs=None, environment_kwargs=None):
 
     Args:
       domain_name, task_name: see `tasks()`, docs/tasks.md.
-      task_kwargs: random (seed), time_limit [s], observe ("tactile", "privileged", "none"), physics_timestep [s],
-        biotac (dict, settings of `BioTac`).
+      task_kwargs: random (seed), time_limit [s], observe ("tactile", "privileged", "none"), physics_timestep
+        [s], biotac (dict, settings of `BioTac`).
       environment_kwargs: further arguments of `composer.Environment`.
 
     Raises:
@@ -56,5 +63,7 @@ def load(domain_name, task_name, task_kwargs=None, environment_kwargs=None):
     """
     suite = _domain(domain_name).SUITE
     if task_name not in suite:
-        raise ValueError(f"domain {domain_name!r} has no task {task_name!r}: choose one of {', '.join(suite)}")
+        raise ValueError(
+            f"domain {domain_name!r} has no task {task_name!r}: choose one of {', '.join(suite)}"
+        )
     return suite[task_name](environment_kwargs=environment_kwargs, **(task_kwargs or {}))

@@ -1,4 +1,5 @@
-"""From touch to what a controller wants to know: tared readings, and a regression of hidden quantities on them."""
+"""From touch to what a controller wants to know: tared readings, and a regression of hidden quantities on
+them."""
 
 import dataclasses
 import functools
@@ -11,7 +12,15 @@ import numpy as np
 
 from ..sensor.channels import FULL_SCALE
 
-__all__ = ["CalibrationWarning", "Estimator", "Touch", "check_fitted_on", "fitted_on", "load_calibration", "load_estimator"]
+__all__ = [
+    "CalibrationWarning",
+    "Estimator",
+    "Touch",
+    "check_fitted_on",
+    "fitted_on",
+    "load_calibration",
+    "load_estimator",
+]
 
 _TARE = 5  # frames averaged before anything is touched
 _PDC_SCALE, _LOG_SCALE = 100.0, 0.1  # make features of order one
@@ -38,12 +47,19 @@ class Touch:
         Raises:
           ValueError: the observation has no electrodes.
         """
-        names = sorted(name.removesuffix("electrodes") for name in observation if name.endswith("/electrodes"))
+        names = sorted(
+            name.removesuffix("electrodes") for name in observation if name.endswith("/electrodes")
+        )
         if not names:
             raise ValueError("no electrodes in the observation: load the task with observe='tactile'")
         counts = np.stack([observation[n + "electrodes"] for n in names])
-        raw = np.concatenate([np.log(FULL_SCALE / np.clip(counts, 1, FULL_SCALE - 1) - 1) / _LOG_SCALE,
-                              np.stack([observation[n + "pdc"] for n in names]) / _PDC_SCALE], axis=1)  # fmt: skip
+        raw = np.concatenate(
+            [
+                np.log(FULL_SCALE / np.clip(counts, 1, FULL_SCALE - 1) - 1) / _LOG_SCALE,
+                np.stack([observation[n + "pdc"] for n in names]) / _PDC_SCALE,
+            ],
+            axis=1,
+        )
         if not self.tared:
             self._frames.append(raw)
             self._value = np.zeros_like(raw)
@@ -55,7 +71,8 @@ class Touch:
 
 
 def _features(touch):
-    """(n, 251) of (n, 20): the touch, and constant, linear and quadratic terms of its shape, whose size is that of no touch or any."""
+    """(n, 251) of (n, 20): the touch, and constant, linear and quadratic terms of its shape, whose size is
+    that of no touch or any."""
     shape = 10 * touch / (np.abs(touch).sum(axis=1, keepdims=True) + 1.0)
     i, j = np.triu_indices(touch.shape[1])
     return np.concatenate([np.ones((len(touch), 1)), shape, shape[:, i] * shape[:, j], touch], axis=1)
@@ -66,7 +83,8 @@ class Estimator:
     """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape.
 
     Attributes:
-      scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on episodes that were held out.
+      scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on episodes that were
+        held out.
     """
 
     scale: np.ndarray
@@ -79,7 +97,8 @@ class Estimator:
 
     @classmethod
     def fit(cls, touch, hidden, episode, ridges=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)):
-        """From samples touch (n, 20), hidden (n, k) of episodes (n,); the ridge that predicts every fourth episode best is taken.
+        """From samples touch (n, 20), hidden (n, k) of episodes (n,); the ridge that predicts every fourth
+        episode best is taken.
 
         Raises:
           ValueError: fewer than four episodes.
@@ -108,7 +127,8 @@ class CalibrationWarning(UserWarning):
 
 
 def fitted_on(config) -> dict:
-    """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material, liquid, friction, readings."""
+    """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material,
+    liquid, friction, readings."""
     from ..coupling import skins
 
     skin, digest = skins.load(config.skin), hashlib.sha256()
@@ -127,15 +147,18 @@ def fitted_on(config) -> dict:
 
 
 def check_fitted_on(name, stored, config):
-    """Warns (CalibrationWarning) where the estimator `name` of a calibration was fitted on another BioTac than that of a `Config`."""
+    """Warns (CalibrationWarning) where the estimator `name` of a calibration was fitted on another BioTac
+    than that of a `Config`."""
     now, text = fitted_on(config), stored.get(f"{name}/fitted_on")
     then = {} if text is None else json.loads(str(text))
     differ = [key for key in now if then.get(key) != now[key]]
     if differ:
         was = ", ".join(f"{key} {then.get(key, 'unknown')!r} (here {now[key]!r})" for key in differ)
         warnings.warn(
-            f"the estimator {name!r} was fitted on a BioTac with {was}: how far its estimates are off is unknown. Fit it for this one with "
-            f"`python -m biotac_mj.tasks.calibrate --estimators {name} --skin SKIN --tier TIER --material MATERIAL --out FILE`, "
+            f"the estimator {name!r} was fitted on a BioTac with {was}: how far its estimates are off is "
+            "unknown. Fit it for this one with "
+            f"`python -m biotac_mj.tasks.calibrate --estimators {name} --skin SKIN --tier TIER --material "
+            "MATERIAL --out FILE`, "
             "then make_controller(task, env, calibration=FILE)",
             CalibrationWarning,
             stacklevel=3,
@@ -144,7 +167,8 @@ def check_fitted_on(name, stored, config):
 
 @functools.cache
 def load_calibration(path=None) -> dict:
-    """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's, `biotac_mj/tasks/calibration.npz`."""
+    """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's,
+    `biotac_mj/tasks/calibration.npz`."""
     if path is None:
         with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as own:
             return load_calibration(str(own))
@@ -160,5 +184,7 @@ def load_estimator(task, stored=None) -> Estimator:
     """
     stored = load_calibration() if stored is None else stored
     if f"{task}/weight" not in stored:
-        raise ValueError(f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --estimators {task}`")
+        raise ValueError(
+            f"no calibration of task {task!r}: run `python -m biotac_mj.tasks.calibrate --estimators {task}`"
+        )
     return Estimator(*(stored[f"{task}/{part}"] for part in ("scale", "weight", "error")))
