@@ -1,12 +1,13 @@
 """The skin: finite elements in Warp."""
 
-from .contact_law import ContactLaw
+from . import fill  # noqa: F401  tells SkinModel how its rest is solved
+from .contact.law import ContactLaw
+from .contact.shapes import bake_distance_grid
 from .data import SkinData
 from .geoms import GeomSet
-from .material import PRESETS, Material, material
 from .model import SkinModel, SkinOptions
-from .shapes import bake_distance_grid
-from .solver import step
+from .rubber.material import PRESETS, Material, material
+from .step import launch_step, prepare_step, step
 
 __all__ = [
     "PRESETS",
@@ -17,6 +18,8 @@ __all__ = [
     "SkinModel",
     "SkinOptions",
     "bake_distance_grid",
+    "launch_step",
     "material",
+    "prepare_step",
     "step",
 ]

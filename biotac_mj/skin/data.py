@@ -1,81 +1,55 @@
 """SkinData: everything about a skin that changes, for every world."""
 
-import functools
-
 import numpy as np
 import warp as wp
 
-from .contact_law import world_laws
-from .launch import Launches
+from .contact.law import WorldLaws
 from .liquid import Liquid
 from .model import SkinModel
-from .stress_memory import StressMemory
+from .newton.worlds import Worlds
+from .precondition.dense import DensePreconditioner
+from .precondition.sparse import SparsePreconditioner
+from .program import Launcher
+from .rubber.element_kernels import ElementForces
+from .rubber.memory import RubberMemory, rubber_of_worlds
 from .types import mat33, real, vec3
 
-__all__ = ["ContactState", "SkinData", "view"]
-
-
-def view(array: wp.array):
-    """The array's memory as numpy (CPU) or torch (CUDA), not copied: (item, nworld, ...)."""
-    return wp.to_torch(array) if array.device.is_cuda else array.numpy()
+__all__ = ["ContactState", "SkinData"]
 
 
 class ContactState:
     """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote."""
 
-    def __init__(self, surface, nsample, nvert, nworld):
+    def __init__(self, surface, nsample, nvert, nworld, lawful=False):
         nface = len(surface.face)
-        self.surface, self.bond = surface, None
-        self.anchor_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
-        self.anchor = wp.zeros((nface * nsample, nworld), dtype=vec3)
-        self.trial_geom = wp.full((nface * nsample, nworld), -1, dtype=int)
-        self.trial_anchor = wp.zeros((nface * nsample, nworld), dtype=vec3)
-        self.sample_force = wp.zeros((nface * nsample, nworld), dtype=vec3)
+        samples = (nface * nsample, nworld)
+        self.surface = surface
+        self.anchor_geom = wp.full(samples, -1, dtype=int)
+        self.anchor = wp.zeros(samples, dtype=vec3)
+        self.trial_geom = wp.full(samples, -1, dtype=int)
+        # the geom that a sample is in contact with, or has been and is still in range of
+        self.bond = wp.full(samples, -1, dtype=int) if lawful else self.trial_geom
+        self.trial_anchor = wp.zeros(samples, dtype=vec3)
+        self.sample_force = wp.zeros(samples, dtype=vec3)
         self.corner = wp.zeros((3 * nface, nworld), dtype=vec3)
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
         self.touching = wp.zeros((nface, nworld), dtype=int)
         self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
         self.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
         self.clearance = wp.zeros((nface, nworld), dtype=real)
-        self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors; of the device step
+        self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
 
     def reset(self):
         self.clearance.zero_()
-        self.anchor_geom.fill_(-1)
-        for array in (self.trial_geom, self.touching, self.node_force, self.sample_force, self.kept):
+        for array in (self.anchor_geom, self.trial_geom, self.bond):
+            array.fill_(-1)
+        for array in (self.touching, self.node_force, self.sample_force, self.kept):
             array.zero_()
-        self.trial_geom.fill_(-1)
 
-    def active(self, w):
+    def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
         """Faces of world w that touch (n,) and their tangents (n, 6, 3, 3), on the host."""
-        faces = np.flatnonzero(_host(view(self.touching)[:, w]))
-        return faces, _host(view(self.block)[6 * faces[:, None] + np.arange(6), w])
-
-    def commit(self):
-        wp.copy(self.anchor_geom, self.trial_geom if self.bond is None else self.bond)
-        wp.copy(self.anchor, self.trial_anchor)
-
-
-class _Scalar:
-    """An attribute (nworld,) that numpy holds, or a field of `Worlds` on the device, read when asked for."""
-
-    def __init__(self, field, read=lambda value: value):
-        self._field, self._read = field, read
-
-    def __get__(self, data, owner=None):
-        if data is None:
-            return self
-        return (
-            data.__dict__[self._field]
-            if data.worlds is None
-            else self._read(getattr(data.worlds, self._field).numpy())
-        )
-
-    def __set__(self, data, value):
-        if data.worlds is None:
-            data.__dict__[self._field] = value
-        else:
-            getattr(data.worlds, self._field).fill_(0)
+        faces = np.flatnonzero(self.touching.numpy()[:, w])
+        return faces, self.block.numpy()[6 * faces[:, None] + np.arange(6), w]
 
 
 class SkinData:
@@ -84,12 +58,14 @@ class SkinData:
     Args:
       model: the SkinModel.
       nworld: number of worlds.
-      material: None, or one Material of the model's law for each world.
-      resident: whether all state lives on the device and `step` never looks back at the host (see
-        `device_step`): on CUDA, always. Attributes are then copied when they are read, and a world's contact
-        beyond `contact_capacity` touching nodes slows its solves.
+      material: None, or one Material of the model's law and kind for each world.
+      modulus: (nworld, nelem) factors on Young's modulus of the elements that are solved, of a model that has
+        a modulus; None takes the model's.
+      preconditioner: "sparse" (CPU: double precision) or "dense" (half precision, directions in single); None
+        takes what suits the model's device. With "dense", contact of a world beyond `contact_capacity`
+        touching nodes slows its solves.
 
-    Attributes (all arrays lead with nworld, on the host):
+    Attributes (all arrays lead with nworld, copies on the host):
       vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
       contact_force: (nworld, nvert, 3) nodal forces of the touching geoms on the skin [N].
       core_force: (nworld, nvert, 3) nodal forces of the core on the inner surface [N].
@@ -104,106 +80,104 @@ class SkinData:
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
-      memory: StressMemory of skin with `prony`, `mullins`, `hysteresis` or `stiffening`, or None; `reset`
-        forgets.
+
+    On the device, [item, world] in Warp arrays that may be overwritten between steps:
+      worlds: `newton.worlds.Worlds`, scalars of every world. rubber: `rubber.points.Rubber`.
+      laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
+      x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s], and
+        the pose of the BioTac frame in the world at the end of the step.
+
+    Raises:
+      ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or a
+        modulus of another shape.
     """
 
-    converged = _Scalar("reason", lambda reason: reason == 0)
-    nonconverged = _Scalar("nonconverged", lambda count: count.astype(int))
-    iterations = _Scalar("iterations", lambda count: count.astype(int))
-    error = _Scalar("error")
-    # touching nodes in a world's small system; None: 63, all that a block of threads holds, but 127 on fine
-    # skins
+    # touching nodes in a world's dense small system; None: 63, all that a block of threads holds, but 127 on
+    # fine skins
     contact_capacity = None
 
-    def __init__(self, model: SkinModel, nworld: int = 1, material=None, resident: bool | None = None):
+    def __init__(self, model: SkinModel, nworld: int = 1, material=None, modulus=None, preconditioner=None):
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
-        if any(m.beyond_law != model.material.beyond_law for m in materials):
-            raise ValueError(
-                f"{', '.join(model.material.beyond_law)} are the model's: give the worlds' materials the same"
-            )
+        self.options = model.rubber_options
+        _refuse_other_kinds(materials, self.options)
         self.nworld, self.model = nworld, model
-        self.resident = model.device.is_cuda if resident is None else resident
-        if self.resident and model.extensions:
-            raise ValueError(
-                f"skin with {' and '.join(model.extensions)} is solved on the CPU's full tier only: choose "
-                "device='cpu' and "
-                "resident=False, or leave this out"
-            )
-        if model.device.is_cuda and not self.resident:
-            raise ValueError(
-                "on CUDA the state is always resident: leave resident out, or make the model on the CPU"
-            )
-        second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
-        nsample = len(model.sample)
+        self.rubber = rubber_of_worlds(model, materials, _modulus_of_worlds(model, modulus, nworld))
+        nsample, lawful = len(model.sample), model.options.contact_law is not None
         with wp.ScopedDevice(model.device):
-            self.mu = wp.array([m.mu for m in materials], dtype=real)
-            self.lam = wp.array(second, dtype=real)
             self.x = wp.array(np.repeat(model.geometry.vert[:, None], nworld, 1), dtype=vec3, ndim=2)
             self.x_last = wp.clone(self.x)
             self.velocity = wp.zeros_like(self.x)  # of implicit dynamics, world frame
             self.force = wp.zeros_like(self.x)
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
             self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
-            self.outer = ContactState(model.outer, nsample, model.nvert, nworld)
-            self.core = (
-                ContactState(model.core_surface, nsample, model.nvert, nworld) if model.has_core else None
-            )
+            self.outer = ContactState(model.outer, nsample, model.nvert, nworld, lawful)
+            self.core = None
+            if model.has_core:
+                self.core = ContactState(model.core_surface, nsample, model.nvert, nworld)
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
-        self.laws = world_laws(model, nworld, self.resident, self.outer)
-        self.worlds, self.device_memory, self.device_steps = None, None, {}
-        if self.resident:
-            self._allocate_device()
-        self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
-        self.memory = StressMemory(model, nworld, self.mu, self.lam) if model.material.extensions else None
-        self.stiffness_scale = np.array([m.youngs_modulus for m in materials]) / model.material.youngs_modulus
-        self.core_pos = np.zeros((nworld, 3))
-        self.core_mat = np.tile(np.eye(3), (nworld, 1, 1))
-        self.reset()
-
-    # of steps from the host; never made where the state is resident
-
-    @functools.cached_property
-    def elastic(self):
-        return self.model.elasticity.allocate(self.nworld)
-
-    @functools.cached_property
-    def launch(self):
-        return Launches(self.model.device)
-
-    @functools.cached_property
-    def direction(self):
-        return wp.zeros_like(self.x)
-
-    @functools.cached_property
-    def product(self):
-        return wp.zeros_like(self.x)
-
-    @functools.cached_property
-    def bending(self):
-        return wp.zeros_like(self.x)
-
-    def _allocate_device(self):
-        from .device_worlds import Worlds
-
-        n = self.nworld
-        with wp.ScopedDevice(self.model.device):
+            self.dt = wp.zeros(nworld, dtype=real)
+            self.frame_pos, self.frame_pos_last = (wp.zeros(nworld, dtype=vec3) for _ in range(2))
+            still = np.tile(np.eye(3), (nworld, 1, 1))
+            self.frame_mat, self.frame_mat_last = (wp.array(still, dtype=mat33) for _ in range(2))
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
-                setattr(self.worlds, name, wp.zeros(n, dtype=variable.type.dtype))
-            self.worlds.mu, self.worlds.lam = self.mu, self.lam
-            self.dt = wp.zeros(n, dtype=real)
-            self.frame_pos, self.frame_pos_last = (wp.zeros(n, dtype=vec3) for _ in range(2))
-            self.frame_mat, self.frame_mat_last = (
-                wp.array(np.tile(np.eye(3), (n, 1, 1)), dtype=mat33) for _ in range(2)
-            )
+                setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
+        self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
+        self.laws = WorldLaws(model, nworld)
+        self.worlds.pulls = self.laws.pulls
+        self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
+        remembers = model.material.prony or model.material.mullins or model.material.hysteresis
+        self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
+        self._preconditioner, self._chosen = None, _choose(model, preconditioner)
+        self.steps, self._vectors = {}, None  # see `step`
         self._of_geoms, self._of_groups, self._counts = {}, {}, (0, 0)
+        self.reset()
 
-    def geom_memory(self, count: int, ngroup: int):
-        """What a resident state remembers of geoms: their last motion [geom, world], which of them touch,
-        wrenches on groups."""
+    # --- what a step needs, made when first asked for ---
+
+    @property
+    def mu(self) -> wp.array:
+        """(nworld,) shear moduli [Pa]."""
+        return self.rubber.mu
+
+    @property
+    def lam(self) -> wp.array:
+        """(nworld,) second constants of the law [Pa]."""
+        return self.rubber.lam
+
+    @property
+    def chunk(self) -> int:
+        """Nodes summed by one thread: few worlds need many short sums, many worlds few long ones."""
+        if not self.model.device.is_cuda:
+            return self.model.nvert
+        return 4 if self.nworld < 32 else 8 if self.nworld < 256 else 32
+
+    @property
+    def preconditioner(self):
+        """A `precondition.Preconditioner`."""
+        if self._preconditioner is None:
+            surfaces, m = (self.outer, self.core), self.model
+            if self._chosen is SparsePreconditioner:
+                self._preconditioner = SparsePreconditioner(m, surfaces, self.worlds, self.chunk)
+            else:
+                capacity = self.contact_capacity or (63 if m.nvert <= 8000 else 127)
+                self._preconditioner = DensePreconditioner(m, surfaces, self.worlds, self.chunk, capacity)
+        return self._preconditioner
+
+    @property
+    def precision(self):
+        """Of directions, a `types.Precision`."""
+        return self._chosen.precision
+
+    def element_forces(self) -> ElementForces:
+        """The elements with memory of their own for what they write."""
+        return ElementForces(self.model.elements, self.rubber, self.options, self.precision)
+
+    def geom_memory(self, count: int, ngroup: int) -> tuple[wp.array, wp.array, wp.array]:
+        """What is remembered of geoms: their last motion [geom, world], which of them touch, and the wrenches
+        on groups [group, world, 6]."""
         self._counts = (count, ngroup)
         with wp.ScopedDevice(self.model.device):
             if count not in self._of_geoms:
@@ -213,32 +187,29 @@ class SkinData:
                 self._of_groups[ngroup] = wp.zeros((ngroup, self.nworld, 6), dtype=real)
         return *self._of_geoms[count], self._of_groups[ngroup]
 
-    def reset(self):
+    # --- set by the user ---
+
+    def reset(self) -> None:
         """Puts every world back to rest: the skin on its filling, nothing touching."""
-        rest = np.repeat(self.model.rest.vert[:, None], self.nworld, 1)
-        for array in (self.x, self.x_last):
-            wp.copy(array, wp.array(rest, dtype=vec3, ndim=2, device=array.device))
-        self.velocity.zero_()
-        self.increment.zero_()
-        if self.resident:
-            for arrays in (*self._of_geoms.values(), self._of_groups.values()):
-                for array in arrays:
-                    array.zero_()
-        else:
-            self._motion, self._wrench = np.zeros((self.nworld, 0, 3)), np.zeros((self.nworld, 0, 6))
-        self.force.zero_()
-        self.external = None
+        rest = np.ascontiguousarray(np.repeat(self.model.rest.vert[:, None], self.nworld, 1))
+        self.x.assign(rest)
+        self.x_last.assign(rest)
+        for array in (self.velocity, self.increment, self.force):
+            array.zero_()
+        for arrays in (*self._of_geoms.values(), self._of_groups.values()):
+            for array in arrays:
+                array.zero_()
+        self._counts = (0, 0)
+        self.set_external(None)
         for part in (self.outer, self.core, self.liquid):
             if part:
                 part.reset()
         if self.memory:
-            self.memory.reset(self.x)
-        self.converged = np.ones(self.nworld, bool)
-        self.nonconverged = np.zeros(self.nworld, int)
-        self.iterations = np.zeros(self.nworld, int)
-        self.error = np.zeros(self.nworld)
+            self.memory.forget(self.x)
+        for name in ("reason", "nonconverged", "iterations", "error"):
+            getattr(self.worlds, name).zero_()
 
-    def set_external(self, force):
+    def set_external(self, force) -> None:
         """Loads the nodes in every step from now on, until `reset`.
 
         Args:
@@ -247,22 +218,19 @@ class SkinData:
         Raises:
           ValueError: a wrong shape or NaN.
         """
-        self.device_steps.clear()  # what was recorded knew the old loads
+        self.steps.clear()  # what was recorded knew the old loads
+        self.external = None
         if force is None:
-            self.external = None
             return
-        force = np.asarray(force, float)
-        if force.shape != (self.nworld, self.model.nvert, 3) or not np.isfinite(force).all():
+        force, shape = np.asarray(force, float), (self.nworld, self.model.nvert, 3)
+        if force.shape != shape or not np.isfinite(force).all():
             raise ValueError(
-                f"external forces have shape {force.shape}: pass finite numbers of shape "
-                f"{(self.nworld, self.model.nvert, 3)}"
+                f"external forces have shape {force.shape}: pass finite numbers of shape {shape}"
             )
-        self.external_device = wp.array(
-            np.ascontiguousarray(np.swapaxes(force, 0, 1)), dtype=vec3, ndim=2, device=self.x.device
-        )
-        self.external = view(self.external_device)
+        nodal = np.ascontiguousarray(np.swapaxes(force, 0, 1))
+        self.external = wp.array(nodal, dtype=vec3, ndim=2, device=self.x.device)
 
-    def set_liquid(self, bulk_modulus=None, fill_volume=None):
+    def set_liquid(self, bulk_modulus=None, fill_volume=None) -> None:
         """Gives each world its liquid, from the next step on and through `reset`.
 
         Args:
@@ -275,119 +243,128 @@ class SkinData:
         """
         if not self.model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
-        liquid, rest = self.liquid, self.model.rest
-        bulk = (
-            liquid.bulk_modulus
-            if bulk_modulus is None
-            else np.array(np.broadcast_to(np.asarray(bulk_modulus, float), self.nworld))
-        )
-        extra = (
-            liquid.extra
-            if fill_volume is None
-            else np.array(np.broadcast_to(np.asarray(fill_volume, float), self.nworld))
-        )
-        if not (bulk >= 0).all() or not (np.isfinite(extra) & (rest.natural_volume + extra > 0)).all():
-            raise ValueError(
-                "bulk moduli must be numbers >= 0 (or math.inf), fill volumes finite and not less than "
-                "minus what there is"
-            )
-        liquid.bulk_modulus, liquid.extra = bulk, extra
-        liquid.fill(rest.natural_volume + extra)
-        liquid.last_pressure = np.where(bulk == 0, 0.0, liquid.last_pressure)
+        self.liquid.set(bulk_modulus, fill_volume)
+
+    # --- read by the user ---
 
     @property
-    def motion(self):
+    def converged(self) -> np.ndarray:
+        return self.worlds.reason.numpy() == 0
+
+    @property
+    def nonconverged(self) -> np.ndarray:
+        return self.worlds.nonconverged.numpy().astype(int)
+
+    @property
+    def iterations(self) -> np.ndarray:
+        return self.worlds.iterations.numpy().astype(int)
+
+    @property
+    def error(self) -> np.ndarray:
+        return self.worlds.error.numpy().copy()
+
+    @property
+    def motion(self) -> np.ndarray:
         """Of the geoms in the last step (nworld, ngeom, 3) [m]."""
-        return _leading(self.geom_memory(*self._counts)[0]) if self.resident else self._motion
-
-    @motion.setter
-    def motion(self, value):
-        if not self.resident:
-            self._motion = value
-            return
-        array, *_ = self.geom_memory(value.shape[1], self._counts[1])
-        if array.size:
-            array.assign(np.ascontiguousarray(np.swapaxes(value, 0, 1)))
+        return _leading(self.geom_memory(*self._counts)[0])
 
     @property
-    def wrench(self):
-        return _leading(self.geom_memory(*self._counts)[2]) if self.resident else self._wrench
-
-    @wrench.setter
-    def wrench(self, value):
-        self._wrench = value
+    def wrench(self) -> np.ndarray:
+        return _leading(self.geom_memory(*self._counts)[2])
 
     @property
-    def pressure(self):
-        return (
-            self.liquid.gauge_pressure - self.model.rest.pressure
-            if self.model.has_liquid
-            else np.zeros(self.nworld)
-        )
+    def pressure(self) -> np.ndarray:
+        if not self.model.has_liquid:
+            return np.zeros(self.nworld)
+        return self.liquid.gauge_pressure - self.model.rest.pressure
 
     @property
-    def volume(self):
+    def volume(self) -> np.ndarray:
         return self.liquid.volume if self.liquid else np.zeros(self.nworld)
 
     @property
-    def vert_xpos(self):
+    def vert_xpos(self) -> np.ndarray:
         return _leading(self.x)
 
     @property
-    def contact_force(self):
+    def contact_force(self) -> np.ndarray:
         return _leading(self.outer.node_force)
 
     @property
-    def core_force(self):
-        return _leading(self.core.node_force) if self.core else np.zeros((self.nworld, self.model.nvert, 3))
+    def core_force(self) -> np.ndarray:
+        if self.core is None:
+            return np.zeros((self.nworld, self.model.nvert, 3))
+        return _leading(self.core.node_force)
 
     @property
-    def liquid_force(self):
+    def liquid_force(self) -> np.ndarray:
         if not self.model.has_liquid:
             return np.zeros((self.nworld, self.model.nvert, 3))
         return self.liquid.gauge_pressure[:, None, None] * _leading(self.gradient)
 
     @property
-    def reaction(self):
+    def reaction(self) -> np.ndarray:
         return -self.force.numpy()[self.model.fixed].sum(0)
 
-    def load(self, x, increment, motion, contacts, pressure=0.0):
+    def touching_geoms(self, ngeom: int) -> np.ndarray:
+        """Which geoms touched the outer surface when the last step ended: (nworld, ngeom) bool."""
+        geom = self.outer.anchor_geom.numpy()
+        return np.array([(geom == g).any(0) for g in range(ngeom)], bool).reshape(ngeom, self.nworld).T
+
+    def tangent(self, geoms) -> np.ndarray:
+        """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
+        frame's origin, after a step."""
+        shape = (geoms.ngroup, self.nworld)
+        out = wp.zeros(shape, dtype=wp.spatial_matrixd, device=self.model.device)
+        if geoms.ngroup:
+            self.preconditioner.measure_tangents(Launcher(self.model.device), geoms, self.x, out)
+        return _leading(out)
+
+    def stress(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
+        rubber = self.rubber
+        if self.memory:
+            rubber = self.memory.at_present()
+        cauchy, mises = self.element_forces().stress(self.x, rubber)
+        return _leading(cauchy), _leading(mises)
+
+    # --- saved and set again: a single world ---
+
+    def load(self, x, increment, motion, contacts, pressure=0.0) -> None:
         """Sets the state of a single world; the inverse of reading it.
 
         Args:
           x, increment: (nvert, 3) positions and last increment [m].
           motion: (ngeom, 3) of the geoms in the last step [m].
-          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts`
-            gives them.
+          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts` gives
+            them.
           pressure: of the liquid above the surroundings [Pa], `liquid.last_pressure`.
         """
         for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
-            wp.copy(array, wp.array(value[:, None], dtype=vec3, ndim=2, device=array.device))
-        self.motion = np.array(motion)[None]
+            array.assign(np.ascontiguousarray(value[:, None]))
         if self.liquid:
-            self.liquid.last_pressure = np.array([float(pressure)])
+            self.liquid.last_pressure = pressure
         geom, anchor = self.outer.anchor_geom.numpy().copy(), self.outer.anchor.numpy().copy()
         geom[:] = -1
         sample = contacts[:, 0].astype(int)
         geom[sample, 0], anchor[sample, 0] = contacts[:, 1].astype(np.int32), contacts[:, 2:]
-        wp.copy(self.outer.anchor_geom, wp.array(geom, dtype=int, ndim=2, device=self.x.device))
-        wp.copy(self.outer.anchor, wp.array(anchor, dtype=vec3, ndim=2, device=self.x.device))
-        if self.resident:
-            touched = np.zeros((self._counts[0], 1), np.int32)
+        self.outer.anchor_geom.assign(geom)
+        self.outer.anchor.assign(anchor)
+        kept = geom.reshape(len(self.outer.kept), -1).max(1) >= 0
+        self.outer.kept.assign(kept.astype(np.int32)[:, None])
+        moved, touched_by, _ = self.geom_memory(len(motion), self._counts[1])
+        if len(motion):
+            moved.assign(np.ascontiguousarray(np.asarray(motion, float)[:, None]))
+            touched = np.zeros((len(motion), 1), np.int32)
             touched[contacts[:, 1].astype(int)] = 1
-            self.geom_memory(*self._counts)[1].assign(touched)
-            self.outer.kept.assign(
-                (geom.reshape(len(self.outer.kept), -1).max(1) >= 0).astype(np.int32)[:, None]
-            )
+            touched_by.assign(touched)
 
-    def load_motion(self, velocity, core_pos, core_mat):
+    def load_motion(self, velocity, core_pos, core_mat) -> None:
         """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the
-        core's pose."""
-        wp.copy(self.velocity, wp.array(velocity[:, None], dtype=vec3, ndim=2, device=self.x.device))
-        self.core_pos, self.core_mat = np.array(core_pos)[None], np.array(core_mat)[None]
-        if self.resident:
-            self.frame_pos_last.assign(self.core_pos)
-            self.frame_mat_last.assign(self.core_mat)
+        core's pose (3,), (3, 3) when the last step ended."""
+        self.velocity.assign(np.ascontiguousarray(velocity[:, None]))
+        self.frame_pos_last.assign(np.asarray(core_pos, float)[None])
+        self.frame_mat_last.assign(np.asarray(core_mat, float)[None])
 
     def contacts(self) -> np.ndarray:
         """What touches in the first world: (n, 5) sample, geom and anchor (in the geom's frame) [m]."""
@@ -395,56 +372,50 @@ class SkinData:
         sample = np.flatnonzero(geom >= 0)
         return np.column_stack([sample, geom[sample], self.outer.anchor.numpy()[sample, 0]])
 
-    def touching_geoms(self, ngeom: int):
-        """Which geoms touched the outer surface when the last step ended: (nworld, ngeom) bool."""
-        geom = view(self.outer.anchor_geom)
-        return np.array([_host((geom == g).any(0)) for g in range(ngeom)], bool).reshape(ngeom, self.nworld).T
 
-    def tangent(self, geoms) -> np.ndarray:
-        """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
-        frame's origin, after a step."""
-        face = self.outer.surface.face_np
-        geom = self.outer.trial_geom.numpy().reshape(len(face), -1, self.nworld)
-        x = self.x.numpy()
-        out = np.zeros((self.nworld, geoms.ngroup, 6, 6))
-        solved = self._preconditioner_of_state() if self.resident else self.preconditioner
-        for w in range(self.nworld):
-            active, blocks = self.outer.active(w)
-            group = geoms.groups[geom[active, :, w].max(1)]
-            for g in np.unique(group):
-                mine = group == g
-                out[w, g] = solved.tangent(w, (face[active[mine]], blocks[mine]), x[:, w])
-        return out
+def _refuse_other_kinds(materials, options):
+    """Worlds share the code that is compiled: what they have beyond the law differs in numbers alone."""
+    for m in materials:
+        missing = [name for name in m.extensions if name not in options]
+        if missing:
+            raise ValueError(
+                f"a world's material has {' and '.join(missing)} and the model's has not: give the model's "
+                "material one as well, with a strength of zero if need be"
+            )
+    for name in ("prony", "hysteresis"):
+        counts = {len(getattr(m, name)) for m in materials}
+        if len(counts) > 1:
+            raise ValueError(
+                f"the worlds' materials have {min(counts)} to {max(counts)} terms of {name}: give all the same "
+                "number, with a strength of zero if need be"
+            )
 
-    def _preconditioner_of_state(self):
-        """Made anew: the device step keeps its own, of the last evaluation but one."""
-        from .preconditioner import Preconditioner
 
-        m = self.model
-        mask = view(m.free_mask)[:, None, None]
-        if m.device.is_cuda:
-            from .batch_preconditioner import BatchPreconditioner as Preconditioner  # torch is for CUDA only
-        made = Preconditioner(m, self.stiffness_scale)
-        states = [self.outer] + ([self.core] if self.core else [])
-        kappa = self.liquid.stiffness if m.has_liquid else np.zeros(self.nworld)
-        made.update(
-            states, view(self.force) * mask, view(self.gradient) * mask if m.has_liquid else None, kappa
+def _modulus_of_worlds(model, modulus, nworld):
+    """(nelem, nworld) factors, or None."""
+    if modulus is None:
+        return None if model.modulus is None else np.repeat(model.modulus[:, None], nworld, 1)
+    modulus, shape = np.asarray(modulus, float), (nworld, model.nelem)
+    if model.modulus is None:
+        raise ValueError(
+            "the worlds have a modulus of their own and the model has none: make it with modulus="
         )
-        return made
-
-    def stress(self):
-        """Cauchy stress (nworld, nelem, 3, 3) and von Mises stress (nworld, nelem) of the tetrahedra [Pa]."""
-        cauchy, mises = self.model.elasticity.stress(self.mu, self.lam, self.x)
-        if self.memory:
-            self.memory.add_cauchy(self.x, cauchy, mises)
-        return _leading(cauchy), _leading(mises)
+    if modulus.shape != shape or not (np.isfinite(modulus) & (modulus > 0)).all():
+        raise ValueError(f"modulus has shape {modulus.shape}: pass positive factors of shape {shape}")
+    return np.ascontiguousarray(modulus.T)
 
 
-def _host(array):
-    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+def _choose(model, preconditioner):
+    known = {"sparse": SparsePreconditioner, "dense": DensePreconditioner}
+    if preconditioner is None:
+        preconditioner = "dense" if model.device.is_cuda else "sparse"
+    if preconditioner not in known:
+        raise ValueError(f"unknown preconditioner {preconditioner!r}: choose one of {', '.join(known)}")
+    if preconditioner == "sparse" and model.device.is_cuda:
+        raise ValueError("the sparse preconditioner runs on the CPU: choose 'dense', or make the model there")
+    return known[preconditioner]
 
 
 def _leading(array: wp.array) -> np.ndarray:
-    return np.swapaxes(
-        array.numpy(), 0, 1
-    ).copy()  # never a view: the next step would change what the caller keeps
+    # never a view: the next step would change what the caller keeps
+    return np.swapaxes(array.numpy(), 0, 1).copy()

@@ -4,8 +4,11 @@ import copy
 import dataclasses
 import math
 
+from . import model as skin_model
+from .data import SkinData
 from .geoms import GeomSet
 from .liquid import Rest
+from .step import step
 
 __all__ = ["rest_state"]
 
@@ -28,9 +31,6 @@ def rest_state(model) -> Rest:
         raise ValueError(
             f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
         )
-    from .data import SkinData
-    from .solver import step
-
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
@@ -71,3 +71,6 @@ def rest_state(model) -> Rest:
             filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
         )
     return Rest(data.vert_xpos[0].copy(), pressure, filled, natural)
+
+
+skin_model.solve_rest = rest_state

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from .contact import Geoms
-from .shapes import GEOM_TYPES, DistanceGrid, pack_grids
+from .contact.faces import Geoms
+from .contact.shapes import GEOM_TYPES, DistanceGrid, pack_grids
 from .types import mat33, real, vec3
 
 __all__ = ["GeomSet"]

@@ -19,15 +19,22 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from .launch import Launches
+from .newton.worlds import total_of
 from .types import mat33, real, vec3
 
-__all__ = ["Liquid", "Rest", "cavity_volume", "volume_gradient"]
+__all__ = [
+    "Liquid",
+    "Rest",
+    "cavity_volume",
+    "release_pressure",
+    "settle_pressure",
+    "volume_gradient",
+    "wet_faces",
+]
 
 wp.set_module_options({"enable_backward": False})
 
 WATER = 2.2e9  # [Pa]
-_REFERENCE = 1e3  # [Pa], least pressure that sets over which overlap skin and core part
 
 
 @wp.kernel
@@ -72,8 +79,9 @@ def contact_pressure(i: int, w: int, geom: wp.array2d(dtype=int), force: wp.arra
 
 
 @wp.kernel
-def wetting(
+def wet_faces(
     # In:
+    chunk: int,
     face: wp.array(dtype=wp.vec3i),
     slot: wp.array(dtype=int),
     sample: wp.array(dtype=vec3),
@@ -84,82 +92,74 @@ def wetting(
     geom: wp.array2d(dtype=int),
     force: wp.array2d(dtype=vec3),
     x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
     # Out:
-    volume_out: wp.array2d(dtype=real),
+    volume_out: wp.array3d(dtype=real),
     wet_out: wp.array2d(dtype=vec3),
+    corner_out: wp.array2d(dtype=vec3),
 ):
-    """Share of the liquid's volume under each inner face, and of the face's area that is wet and pushes on
-    each corner (1/3 where all is).
-
-    `slot` is a face's number on the surface that can meet the core, -1 where it cannot; `area` to `force` are
-    of that surface."""
-    f, w = wp.tid()
-    t = face[f]
-    x0 = x[t[0], w]
-    x1 = x[t[1], w]
-    x2 = x[t[2], w]
-    volume = -wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
+    """Volume under every chunk of inner faces, their wet parts, and what they add to the volume's gradient
+    ."""
+    c, w = wp.tid()
+    if on[w] == 0:
+        return
     third = real(1.0) / real(3.0)
-    wet = vec3(third, third, third)
-    c = slot[f]
-    if c >= 0:
-        if touching[c, w] == 1:
-            nsample = sample.shape[0]
-            share = real(1.0) / real(nsample)
-            full = real(2.0) * reference[w]
-            overlap = real(0.0)
-            for s in range(nsample):
-                pressure = contact_pressure(c * nsample + s, w, geom, force, area[c] * share)
-                if pressure < full:
-                    dry = pressure / full
-                    overlap += share * dry * pressure / (real(2.0) * stiffness)
-                else:
+    total = real(0.0)
+    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        total -= wp.dot(x0, wp.cross(x1, x2)) / real(6.0)
+        wet = vec3(third, third, third)
+        normal = wp.cross(x1 - x0, x2 - x0)
+        k = slot[f]
+        if k >= 0:
+            if touching[k, w] == 1:
+                nsample = sample.shape[0]
+                share = real(1.0) / real(nsample)
+                full = real(2.0) * reference[w]
+                overlap = real(0.0)
+                for s in range(nsample):
+                    pressure = contact_pressure(k * nsample + s, w, geom, force, area[k] * share)
                     dry = real(1.0)
-                    overlap += share * (pressure - reference[w]) / stiffness
-                wet -= share * dry * sample[s]
-            volume += overlap * wp.length(wp.cross(x1 - x0, x2 - x0)) / real(2.0)
-    volume_out[f, w] = volume
-    wet_out[f, w] = wet
+                    if pressure < full:
+                        dry = pressure / full
+                        overlap += share * dry * pressure / (real(2.0) * stiffness)
+                    else:
+                        overlap += share * (pressure - reference[w]) / stiffness
+                    wet -= share * dry * sample[s]
+                total += overlap * wp.length(normal) / real(2.0)
+        wet_out[f, w] = wet
+        g = real(-0.5) * normal
+        for a in range(3):
+            corner_out[3 * f + a, w] = wet[a] * g
+    volume_out[0, c, w] = total
 
 
 @wp.kernel
-def wet_gradient(
+def settle_pressure(
     # In:
-    face: wp.array(dtype=wp.vec3i),
-    wet: wp.array2d(dtype=vec3),
-    x: wp.array2d(dtype=vec3),
+    enclosed: real,
+    share: wp.array3d(dtype=real),
+    offset: wp.array(dtype=real),
+    kappa: wp.array(dtype=real),
+    natural: wp.array(dtype=real),
+    on: wp.array(dtype=int),
     # Out:
-    corner_out: wp.array2d(dtype=vec3),
+    volume_out: wp.array(dtype=real),
+    pressure_out: wp.array(dtype=real),
 ):
-    """dV/dx: the wet part of each face's area vector to its corners."""
-    f, w = wp.tid()
-    t = face[f]
-    g = -wp.cross(x[t[1], w] - x[t[0], w], x[t[2], w] - x[t[0], w]) / real(2.0)
-    for k in range(3):
-        corner_out[3 * f + k, w] = wet[f, w][k] * g
-
-
-@wp.kernel
-def gradient_derivative(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    wet: wp.array2d(dtype=vec3),
-    x: wp.array2d(dtype=vec3),
-    p: wp.array2d(dtype=vec3),
-    # Out:
-    corner_out: wp.array2d(dtype=vec3),
-):
-    """Derivative of `wet_gradient` along p, the wet parts held; its sum over a closed surface is
-    symmetric."""
-    f, w = wp.tid()
-    t = face[f]
-    e1 = x[t[1], w] - x[t[0], w]
-    e2 = x[t[2], w] - x[t[0], w]
-    d1 = p[t[1], w] - p[t[0], w]
-    d2 = p[t[2], w] - p[t[0], w]
-    g = -(wp.cross(d1, e2) + wp.cross(e1, d2)) / real(2.0)
-    for k in range(3):
-        corner_out[3 * f + k, w] = wet[f, w][k] * g
+    """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's
+    volume."""
+    w, t = wp.tid()
+    if on[w] == 0:
+        return
+    volume = enclosed + total_of(share, 0, w, t)
+    if t > 0:
+        return
+    volume_out[w] = volume
+    pressure_out[w] = offset[w] - kappa[w] * (volume - natural[w])
 
 
 @wp.func
@@ -198,7 +198,7 @@ def soften_face(
 
 
 @wp.kernel
-def soften_contact(
+def release_pressure(
     # In:
     sample: wp.array(dtype=vec3),
     area: wp.array(dtype=real),
@@ -208,12 +208,16 @@ def soften_contact(
     touching: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
     force: wp.array2d(dtype=vec3),
+    near: wp.array2d(dtype=int),
+    on: wp.array(dtype=int),
     # In, out:
     block: wp.array2d(dtype=mat33),
 ):
-    """See `soften_face`."""
+    """See `soften_face`; only where the tangent was made anew."""
     f, w = wp.tid()
-    if touching[f, w] == 1 and pressure[w] > real(0.0):
+    if on[w] == 0:
+        return
+    if near[f, w] == 1 and touching[f, w] == 1 and pressure[w] > real(0.0):
         soften_face(f, w, sample, area, stiffness, reference[w], pressure[w], geom, force, block)
 
 
@@ -233,148 +237,94 @@ class Rest:
     natural_volume: float
 
 
-class _PerWorld:
-    """An attribute (nworld,) that numpy holds, or a field of `Worlds` on the device."""
-
-    def __init__(self, field):
-        self._field = field
-
-    def __set_name__(self, owner, name):
-        self._name = "_" + name
-
-    def __get__(self, liquid, owner=None):
-        return (
-            getattr(liquid, self._name)
-            if liquid.worlds is None
-            else getattr(liquid.worlds, self._field).numpy()
-        )
-
-    def __set__(self, liquid, value):
-        value = np.array(np.broadcast_to(np.asarray(value, float), (liquid.nworld,)))
-        if liquid.worlds is None:
-            setattr(liquid, self._name, value)
-        else:
-            getattr(liquid.worlds, self._field).assign(value)
-
-
 class Liquid:
-    """The liquid of one SkinData: `evaluate` after the contact forces, then `force`; `product` is its share
-    of the tangent.
+    """The liquid of one SkinData: how much of it there is in every world, and what it did in the last step.
 
     Args:
-      worlds: `device_worlds.Worlds` where the state lives on the device, which then also evaluates; else
-        None.
+      model: SkinModel; worlds: `newton.worlds.Worlds`, which hold the numbers on the device.
 
-    Attributes (nworld,):
+    Attributes (nworld,), copies on the host:
       bulk_modulus: K [Pa]. extra: liquid beyond the model's fill [m^3].
       natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V
         [Pa/m^3].
-      offset: pressure at the natural volume [Pa]: zero, but the last step's pressure where the liquid is
-        incompressible.
       last_pressure: above the surroundings, of the last step [Pa].
       gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
 
-    natural_volume = _PerWorld("natural")
-    stiffness = _PerWorld("kappa")
-    last_pressure = _PerWorld("last_pressure")
-    gauge_pressure = _PerWorld("pressure")
-    volume = _PerWorld("volume")
-
-    def __init__(self, model, nworld, worlds=None):
-        self.m, self.nworld, self.worlds = model, nworld, worlds
+    def __init__(self, model, nworld: int, worlds):
+        self._model, self._worlds, self.nworld = model, worlds, nworld
         self.bulk_modulus, self.extra = np.full(nworld, model.options.bulk_modulus), np.zeros(nworld)
-        if worlds is None:
-            self._allocate(len(model.inner.face))
         self.reset()
 
-    def _allocate(self, nface):
-        self._launch = Launches(self.m.device)
-        with wp.ScopedDevice(self.m.device):
-            self._share = wp.zeros((nface, self.nworld), dtype=real)
-            self._wet = wp.zeros((nface, self.nworld), dtype=vec3)
-            self._corner = wp.zeros((3 * nface, self.nworld), dtype=vec3)
-            self._none = wp.zeros((0, self.nworld), dtype=int), wp.zeros((0, self.nworld), dtype=vec3)
-            self._no_area = wp.zeros(0, dtype=real)
-            self._reference, self._pressure = (wp.zeros(self.nworld, dtype=real) for _ in range(2))
+    @property
+    def natural_volume(self) -> np.ndarray:
+        return self._worlds.natural.numpy().copy()
 
-    def reset(self):
-        rest = self.m.rest
+    @property
+    def stiffness(self) -> np.ndarray:
+        return self._worlds.kappa.numpy().copy()
+
+    @property
+    def gauge_pressure(self) -> np.ndarray:
+        return self._worlds.pressure.numpy().copy()
+
+    @property
+    def volume(self) -> np.ndarray:
+        return self._worlds.volume.numpy().copy()
+
+    @property
+    def last_pressure(self) -> np.ndarray:
+        return self._worlds.last_pressure.numpy().copy()
+
+    @last_pressure.setter
+    def last_pressure(self, value):
+        self._write("last_pressure", value)
+
+    def reset(self) -> None:
+        """Puts every world back to rest on its filling."""
+        rest = self._model.rest
         self.fill(rest.natural_volume + self.extra)
-        self.last_pressure = np.where(self.bulk_modulus == 0, 0.0, rest.pressure)
-        self.gauge_pressure = self.last_pressure.copy()
-        self.volume = rest.volume
+        pressure = np.where(self.bulk_modulus == 0, 0.0, rest.pressure)
+        self._write("last_pressure", pressure)
+        self._write("pressure", pressure)
+        self._write("volume", rest.volume)
 
-    def fill(self, natural_volume):
+    def fill(self, natural_volume) -> None:
         """Takes as much liquid as has this volume without pressure [m^3]."""
         # an incompressible liquid: the pressure of the last step is what the next starts from, and this
         # stiffness only finds the change
         K = self.bulk_modulus
-        self.natural_volume = natural_volume
-        self.stiffness = np.where(np.isfinite(K), K, WATER) / natural_volume if self.m.has_liquid else 0.0
-        self._tell_device()
+        kappa = np.where(np.isfinite(K), K, WATER) / natural_volume if self._model.has_liquid else 0.0
+        self._write("natural", natural_volume)
+        self._write("kappa", kappa)
+        self._write("holds", (np.asarray(kappa) == 0) | np.isinf(K))
 
-    def keep_pressure(self, pressure):
+    def keep_pressure(self, pressure) -> None:
         """Takes liquid in and out so that its pressure above the surroundings stays this [Pa]."""
-        self.stiffness, self.last_pressure = 0.0, pressure
-        self._tell_device()
+        self._write("kappa", 0.0)
+        self._write("holds", 1)
+        self._write("last_pressure", pressure)
 
-    def _tell_device(self):
-        if self.worlds is not None:
-            self.worlds.holds.assign(self._holds().astype(np.int32))
-
-    def _holds(self):
-        return (self.stiffness == 0) | np.isinf(self.bulk_modulus)
-
-    def begin(self):
-        """Starts a step."""
-        self.offset = np.where(self._holds(), self.last_pressure, 0.0)
-        _view(self._reference)[...] = np.maximum(np.abs(self.last_pressure), _REFERENCE)
-
-    def evaluate(self, x, core):
-        """Volume, wet faces and pressure of the skin at x [nvert, nworld]; `core` is the contact with the
-        core there, or None."""
-        m = self.m
-        if core is None:
-            area, touching, geom, force = self._no_area, self._none[0], self._none[0], self._none[1]
-        else:
-            area, touching, geom, force = core.surface.area, core.touching, core.trial_geom, core.sample_force
-        contact = [m.sample, area, m.contact_stiffness, self._reference]
-        inputs = [m.inner.face, m.core_slot, *contact, touching, geom, force, x]
-        self._launch(wetting, self._share.shape, inputs, [self._share, self._wet])
-        self.volume = m.liquid_volume + _host(_view(self._share).sum(0)) - m.rest_volume
-        if not m.has_liquid:
-            return
-        self.gauge_pressure = self.offset - self.stiffness * (self.volume - self.natural_volume)
-        if core is not None:
-            _view(self._pressure)[...] = self.gauge_pressure
-            self._launch(
-                soften_contact,
-                touching.shape,
-                [*contact, self._pressure, touching, geom, force],
-                [core.block],
+    def set(self, bulk_modulus=None, fill_volume=None) -> None:
+        """See `SkinData.set_liquid`."""
+        if not self._model.has_liquid:
+            raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
+        natural, n = self._model.rest.natural_volume, self.nworld
+        bulk, extra = self.bulk_modulus, self.extra
+        if bulk_modulus is not None:
+            bulk = np.array(np.broadcast_to(np.asarray(bulk_modulus, float), n))
+        if fill_volume is not None:
+            extra = np.array(np.broadcast_to(np.asarray(fill_volume, float), n))
+        if not (bulk >= 0).all() or not (np.isfinite(extra) & (natural + extra > 0)).all():
+            raise ValueError(
+                "bulk moduli must be numbers >= 0 (or math.inf), fill volumes finite and not less than minus "
+                "what there is"
             )
+        self.bulk_modulus, self.extra = bulk, extra
+        self.fill(natural + extra)
+        self._write("last_pressure", np.where(bulk == 0, 0.0, self.last_pressure))
 
-    def gradient(self, x):
-        """dV/dx by corners of the inner faces, for `elasticity.gather`."""
-        self._launch(wet_gradient, self._share.shape, [self.m.inner.face, self._wet, x], [self._corner])
-        return self._corner
-
-    def gradient_derivative(self, x, p):
-        """The same of the derivative of dV/dx along p."""
-        self._launch(
-            gradient_derivative, self._share.shape, [self.m.inner.face, self._wet, x, p], [self._corner]
-        )
-        return self._corner
-
-    def commit(self, good):
-        """Ends a step; worlds that are not good keep their last pressure."""
-        self.last_pressure = np.where(good, self.gauge_pressure, self.last_pressure)
-
-
-def _view(array):
-    return wp.to_torch(array) if array.device.is_cuda else array.numpy()
-
-
-def _host(array):
-    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+    def _write(self, field, value):
+        array = getattr(self._worlds, field)
+        dtype = np.int32 if array.dtype is wp.int32 else np.float64
+        array.assign(np.array(np.broadcast_to(np.asarray(value), self.nworld), dtype))

@@ -9,17 +9,23 @@ import warp as wp
 
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
-from . import clearance, contact, elasticity, liquid
-from .contact_law import ContactLaw, contact_law
-from .factor import DenseFactor, SparseFactor
-from .fill import rest_state
+from . import liquid
+from .contact.faces import face_samples
+from .contact.law import ContactLaw, contact_law
+from .contact.limits import rest_gap
+from .contact.shapes import bake_distance_grid
 from .geoms import GeomSet
-from .material import ELEMENTS, LAWS, Material, material
-from .quadratic import QuadraticTetrahedra
-from .shapes import bake_distance_grid
+from .precondition.dense import DenseInverse
+from .precondition.sparse import SparseFactor
+from .rubber.law import LAWS
+from .rubber.material import ELEMENTS, Material, material
+from .rubber.tetrahedra import Tetrahedra, incidence
 from .types import real, vec3
 
 __all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
+
+# (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
+solve_rest = None
 
 _CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
 
@@ -48,7 +54,7 @@ class SkinOptions:
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
       contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's
-        law. On the CPU's full tier.
+        law. On the full tier.
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
       tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below
         this fraction of the energy norm of the load.
@@ -139,7 +145,7 @@ class Surface:
     def create(cls, vert, face, device):
         edge = vert[face[:, 1:]] - vert[face[:, :1]]
         area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
-        start, slot = elasticity.incidence(len(vert), face)
+        start, slot = incidence(len(vert), face)
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
             wp.array(area, dtype=real, device=device),
@@ -166,14 +172,15 @@ class SkinModel:
         clear of it.
       modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each
         element of the given geometry, or a function of rest positions (n, 3) [m] that gives (n,), asked at
-        the centroids of the elements that are solved. CPU, full tier.
+        the centroids of the elements that are solved. Full tier.
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.
+      elements: Tetrahedra. stiffness: at rest, over the free coordinates, sparse [N/m].
 
     Raises:
       ValueError: NaN, inverted tetrahedra, unknown material, nothing fixed, a modulus of another shape or not
-        positive, or on CUDA.
+        positive.
     """
 
     def __init__(
@@ -189,7 +196,7 @@ class SkinModel:
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
         self.device = wp.get_device(device)
-        self._cores = {}
+        self._cores, self._rest = {}, None
         self._elimination = None
         self.law = LAWS[self.material.law]
         vert = geometry.vert
@@ -218,15 +225,14 @@ class SkinModel:
         self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
         self.crushed_depth = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness  # [m]
 
-        formulation = QuadraticTetrahedra if self.element == "quadratic" else elasticity.LinearTetrahedra
         self.modulus = None if modulus is None else self._moduli(modulus, given)
-        self.elasticity = formulation(vert, elem, self.law, self.device, modulus=self.modulus)
+        self.elements = Tetrahedra(vert, elem, self.law, self.device, self.modulus)
         mask = np.zeros(self.nvert)
         mask[self.free] = 1
         with wp.ScopedDevice(self.device):
             self.vert = wp.array(vert[:, None], dtype=vec3)
             self.free_mask = wp.array(mask, dtype=real)
-            self.sample = wp.array(contact.face_samples(self.options.samples), dtype=vec3)
+            self.sample = wp.array(face_samples(self.options.samples), dtype=vec3)
             self.outer = Surface.create(vert, geometry.outer_face, self.device)
             self.inner = (
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
@@ -240,20 +246,15 @@ class SkinModel:
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
-        self._stiffness = self._of_free(self.elasticity.rest_stiffness(self.material.mu, self.material.lame))
+        self.stiffness = self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
     @property
-    def extensions(self) -> tuple[str, ...]:
-        """Names of the options in use that the CPU's full tier alone has."""
-        return (*self.material.extensions, *([] if self.modulus is None else ["modulus"]))
+    def rubber_options(self) -> tuple[str, ...]:
+        """What the rubber has beyond its law, see `rubber.points.point_functions`."""
+        return (*([] if self.modulus is None else ["modulus"]), *self.material.extensions)
 
     def _moduli(self, modulus, given):
         """(nelem,) factors on Young's modulus of the elements that are solved."""
-        if self.device.is_cuda:
-            raise ValueError(
-                "skin with a modulus of its own in every element is solved on the CPU's full tier only: "
-                "choose device='cpu'"
-            )
         if callable(modulus):
             at = self.geometry.vert[self._elem[:, :4]].mean(1)
             factor, n, what = np.asarray(modulus(at), float), self.nelem, f"{self.nelem} positions"
@@ -288,7 +289,7 @@ class SkinModel:
         face = self.geometry.inner_face
         gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
         wp.launch(
-            clearance.rest_gap,
+            rest_gap,
             dim=(len(face), len(self.sample)),
             inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert],
             outputs=[gap],
@@ -326,26 +327,35 @@ class SkinModel:
             )
         return cavity, cavity - core
 
-    @functools.cached_property
+    @property
     def rest(self) -> liquid.Rest:
-        """The skin and its liquid without touching geoms: inflated where the options say so, solved when
-        first asked for."""
-        return rest_state(self)
+        """The skin and its liquid without touching geoms: inflated where the options say so, solved when first
+        asked for."""
+        if self._rest is None:
+            self._rest = solve_rest(self)
+        return self._rest
+
+    @rest.setter
+    def rest(self, value: liquid.Rest):
+        self._rest = value
 
     @functools.cached_property
-    def factor(self):
-        """Inverse of the rest stiffness of the free nodes, as an operator."""
-        return self._invert(self._stiffness)
+    def factor(self) -> SparseFactor | DenseInverse:
+        """Inverse of the rest stiffness of the free nodes, as the device's preconditioner has it."""
+        return self.dense_inverse if self.device.is_cuda else self._factor_of(self.stiffness)
 
-    def factor_at(self, vert_xpos):
-        """The same for the skin in a deformed shape: its stiffness had it been made so, always positive
-        definite.
+    @functools.cached_property
+    def dense_inverse(self) -> DenseInverse:
+        """Inverse of the rest stiffness of the free nodes as a matrix."""
+        return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > 0.45)
+
+    def factor_at(self, vert_xpos) -> SparseFactor:
+        """The factor of the skin in a deformed shape: of its stiffness had it been made so, always positive
+        definite. On the CPU.
 
         Nearly incompressible rubber that has turned and strained resists volume change along other directions
-        than at rest, which the
-        factor at rest does not know: preconditioned by it, conjugate gradients need hundreds of iterations at
-          nu 0.4999 where this one
-        needs a few.
+        than at rest, which the factor at rest does not know: preconditioned by it, conjugate gradients need
+        hundreds of iterations at nu 0.4999 where this one needs a few.
 
         Args:
           vert_xpos: (nvert, 3) [m].
@@ -353,15 +363,12 @@ class SkinModel:
         Raises:
           ValueError: a tetrahedron is inverted there.
         """
-        formulation = type(self.elasticity)(
-            vert_xpos, self._elem, self.law, self.device, modulus=self.modulus
-        )
-        return self._invert(self._of_free(formulation.rest_stiffness(self.material.mu, self.material.lame)))
+        there = Tetrahedra(vert_xpos, self._elem, self.law, self.device, self.modulus)
+        stiffness = there.rest_stiffness(self.material.mu, self.material.lame)
+        return self._factor_of(self._of_free(stiffness))
 
-    def _invert(self, stiffness):
-        if self.device.is_cuda:
-            return DenseFactor(stiffness, self.free, self.geometry.vert, self.device)
-        made = SparseFactor(stiffness, self.free, self.geometry.vert, self.device, self._elimination)
+    def _factor_of(self, stiffness):
+        made = SparseFactor(stiffness, self.free, self.geometry.vert, self._elimination)
         self._elimination = made.elimination
         return made
 

@@ -1,10 +1,78 @@
-"""Scalar and small tensor types of the kernels: double precision, so that CPU and CUDA give the same
-answers."""
+"""Scalar and small tensor types of the kernels, and all casts between them.
+
+Positions and forces are in double precision on every device. Directions (of Newton's method, of conjugate
+gradients, of the preconditioner) are double on the CPU and single on CUDA, where they only steer the method;
+kernels that know such a direction are made for one `Precision`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import warp as wp
 
-__all__ = ["mat33", "real", "vec3"]
+__all__ = ["DOUBLE", "SINGLE", "Precision", "double", "mat33", "narrow", "real", "single", "vec3", "widen"]
 
 real = wp.float64
 vec3 = wp.vec3d
 mat33 = wp.mat33d
+
+
+@wp.func
+def double(p: wp.vec3):
+    return vec3(real(p[0]), real(p[1]), real(p[2]))
+
+
+@wp.func
+def single(p: vec3):
+    return wp.vec3(float(p[0]), float(p[1]), float(p[2]))
+
+
+@wp.func
+def widen(A: wp.mat33):
+    return mat33(
+        real(A[0, 0]), real(A[0, 1]), real(A[0, 2]),
+        real(A[1, 0]), real(A[1, 1]), real(A[1, 2]),
+        real(A[2, 0]), real(A[2, 1]), real(A[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def narrow(A: mat33):
+    return wp.mat33(
+        float(A[0, 0]), float(A[0, 1]), float(A[0, 2]),
+        float(A[1, 0]), float(A[1, 1]), float(A[1, 2]),
+        float(A[2, 0]), float(A[2, 1]), float(A[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def same_vector(p: vec3):
+    return p
+
+
+@wp.func
+def same_matrix(A: mat33):
+    return A
+
+
+class Precision(NamedTuple):
+    """Types of directions, and the casts between them and what is always double.
+
+    Attributes:
+      name: "single" or "double".
+      scalar, vec, mat: Warp types.
+      lower, raised: casts of a vector from and to double. narrow, widen: of a matrix.
+    """
+
+    name: str
+    scalar: Any
+    vec: Any
+    mat: Any
+    lower: Callable
+    raised: Callable
+    narrow: Callable
+    widen: Callable
+
+
+SINGLE = Precision("single", wp.float32, wp.vec3, wp.mat33, single, double, narrow, widen)
+DOUBLE = Precision("double", real, vec3, mat33, same_vector, same_vector, same_matrix, same_matrix)

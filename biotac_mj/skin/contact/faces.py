@@ -1,0 +1,636 @@
+"""Contact of a skin surface with geoms, sampled inside the faces: pressure over overclosure, friction, adhesion.
+
+Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too
+(as surface-to-surface contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an
+elastic stick of k * stick_ratio about an anchor that stays put on the geom, returned radially to mu times the
+normal force where it slips. Surfaces with a `law.ContactLaw` have kernels of their own, in which friction
+depends on pressure and surfaces stick together; Coulomb's law is the case without.
+
+Far faces are left out by one distance of their centre. Few worlds are evaluated sample by sample, many face by
+face; on the CPU always face by face.
+"""
+
+import functools
+import types
+
+import numpy as np
+import warp as wp
+
+from ..types import mat33, real, vec3
+from .shapes import Grids, distance, distance_bound
+
+__all__ = [
+    "FaceSum",
+    "Geoms",
+    "Laws",
+    "block_index",
+    "commit_contacts",
+    "contact_kernels",
+    "cull_faces",
+    "face_samples",
+    "partial_wrench",
+    "push",
+    "stick_or_slip",
+    "sum_pushes",
+    "sum_samples",
+    "sum_wrench",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+_LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
+
+
+@wp.struct
+class Geoms:
+    """Touching geoms in the BioTac frame, at the end and at the start of the step; arrays over worlds are
+    [geom, world]."""
+
+    count: int
+    kind: wp.array(dtype=int)
+    size: wp.array(dtype=vec3)
+    rounding: wp.array(dtype=real)
+    grid: wp.array(dtype=int)
+    group: wp.array(dtype=int)
+    friction: wp.array2d(dtype=real)
+    pos: wp.array2d(dtype=vec3)
+    mat: wp.array2d(dtype=mat33)
+    pos_last: wp.array2d(dtype=vec3)
+    mat_last: wp.array2d(dtype=mat33)
+    grids: Grids
+
+
+@wp.struct
+class Laws:
+    """What a `ContactLaw` is in every world (nworld,); of a surface without one all arrays are empty."""
+
+    exponent: wp.array(dtype=real)  # n
+    pressure: wp.array(dtype=real)  # p0 [Pa]
+    work: wp.array(dtype=real)  # W of coming together [J/m^2]
+    parting: wp.array(dtype=real)  # of parting
+    reach: wp.array(dtype=real)  # range of adhesion [m]
+    node_area: wp.array(dtype=real)  # of the surface [nvert] [m^2]
+    node_push: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
+
+
+def face_samples(order: int) -> np.ndarray:
+    """Barycentric coordinates (order^2, 3) of the centroids of the order^2 equal triangles that subdivide a
+    face."""
+    points = []
+    for i in range(order):
+        for j in range(order - i):
+            points.append((i + 1 / 3, j + 1 / 3))
+            if j < order - i - 1:
+                points.append((i + 2 / 3, j + 2 / 3))
+    ab = np.array(points) / order
+    return np.column_stack([ab, 1 - ab.sum(axis=1)])
+
+
+@wp.func
+def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
+    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`:
+    force, its tangent, anchor."""
+    slip = local - stick
+    slip = slip - wp.dot(slip, normal) * normal
+    length = wp.length(slip)
+    tangent = wp.identity(n=3, dtype=real) - wp.outer(normal, normal)
+    force = -kt * slip
+    K = kt * tangent
+    anchor = stick
+    if kt * length > most:
+        along = slip / length
+        force = -most * along
+        K = most / length * (tangent - wp.outer(along, along))
+        anchor = local - most / kt * along
+    return force, K, anchor
+
+
+@wp.func
+def normal_traction(k: real, peak: real, reach: real, gap: real):
+    """Push (negative: pull) per area and its slope where it is not softening, for contact springs k; all
+    three in one unit of area."""
+    if k * gap <= peak:
+        return wp.vec2d(-k * gap, k)
+    return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
+
+
+@wp.struct
+class FaceSum:
+    """Force on the corners of a face, and the six blocks of its tangent between them, of the samples so
+    far."""
+
+    f0: vec3
+    f1: vec3
+    f2: vec3
+    b00: mat33
+    b01: mat33
+    b02: mat33
+    b11: mat33
+    b12: mat33
+    b22: mat33
+
+
+@wp.func
+def with_sample(total: FaceSum, b: vec3, force: vec3, K: mat33):
+    """The sum with a sample at barycentric b."""
+    total.f0 += b[0] * force
+    total.f1 += b[1] * force
+    total.f2 += b[2] * force
+    total.b00 += (b[0] * b[0]) * K
+    total.b01 += (b[0] * b[1]) * K
+    total.b02 += (b[0] * b[2]) * K
+    total.b11 += (b[1] * b[1]) * K
+    total.b12 += (b[1] * b[2]) * K
+    total.b22 += (b[2] * b[2]) * K
+    return total
+
+
+@wp.func
+def write_face(
+    f: int,
+    w: int,
+    touching: int,
+    total: FaceSum,
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+):
+    touching_out[f, w] = touching
+    corner_out[3 * f, w] = total.f0
+    corner_out[3 * f + 1, w] = total.f1
+    corner_out[3 * f + 2, w] = total.f2
+    if touching == 1:
+        block_out[6 * f, w] = total.b00
+        block_out[6 * f + 1, w] = total.b01
+        block_out[6 * f + 2, w] = total.b02
+        block_out[6 * f + 3, w] = total.b11
+        block_out[6 * f + 4, w] = total.b12
+        block_out[6 * f + 5, w] = total.b22
+
+
+@wp.func
+def block_index(a: int, b: int):
+    """Which of the six stored blocks of a face couples corners a <= b: 00 01 02 11 12 22."""
+    return a * (5 - a) // 2 + b
+
+
+@wp.func
+def known_clearance(x0: vec3, x1: vec3, x2: vec3, free: real):
+    """Nothing is known of a face without a place: it is looked at again, wherever it goes."""
+    if wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
+        return free
+    return real(-1.0)
+
+
+@wp.kernel
+def cull_faces(
+    # In:
+    still: int,
+    nsample: int,
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # In and out:
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
+    touching: wp.array2d(dtype=int),
+    # Out:
+    near_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    bond_out: wp.array2d(dtype=int),
+):
+    """Which faces may touch: by one distance of their centre. Where the geoms are still, a face that has
+    moved less than its clearance, since that was last seen, needs not even that; what was said of it
+    holds."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = face[f]
+    x0 = x[t[0], w]
+    x1 = x[t[1], w]
+    x2 = x[t[2], w]
+    if still == 1:
+        a = wp.length_sq(x0 - seen[3 * f, w])
+        b = wp.length_sq(x1 - seen[3 * f + 1, w])
+        c = wp.length_sq(x2 - seen[3 * f + 2, w])
+        if wp.sqrt(wp.max(a, wp.max(b, c))) < clearance[f, w]:
+            near_out[f, w] = 0
+            return
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
+    near = int(0)
+    free = real(1.0)
+    reach = real(0.0)
+    if laws.reach.shape[0] > 0:
+        reach = laws.reach[w]
+    for g in range(geoms.count):
+        y = wp.transpose(geoms.mat[g, w]) * (center - geoms.pos[g, w])
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        free = wp.min(free, bound - radius)
+        if bound < radius + reach:
+            near = 1
+    near_out[f, w] = near
+    if near == 0:
+        if touching[f, w] == 1:
+            touching[f, w] = 0
+            for s in range(nsample):
+                geom_out[f * nsample + s, w] = -1
+                bond_out[f * nsample + s, w] = -1
+        if still == 1:
+            clearance[f, w] = known_clearance(x0, x1, x2, free)
+            seen[3 * f, w] = x0
+            seen[3 * f + 1, w] = x1
+            seen[3 * f + 2, w] = x2
+
+
+@functools.cache
+def contact_kernels(lawful: bool) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without."""
+    module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
+
+    @wp.func
+    def touch_sample(
+        i: int,
+        w: int,
+        b: vec3,
+        t: wp.vec3i,
+        x0: vec3,
+        x1: vec3,
+        x2: vec3,
+        k: real,
+        kt: real,
+        share: real,
+        laws: Laws,
+        geoms: Geoms,
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+    ):
+        """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the geom
+        that it has touched, least distance [m], force [N], its tangent [N/m], anchor."""
+        p = b[0] * x0 + b[1] * x1 + b[2] * x2
+        touched = int(-1)
+        clearance = real(1.0)
+        gap = real(0.0)
+        if wp.static(lawful):
+            gap = laws.reach[w]
+        normal = vec3()
+        local = vec3()
+        for g in range(geoms.count):
+            R = geoms.mat[g, w]
+            y = wp.transpose(R) * (p - geoms.pos[g, w])
+            dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            clearance = wp.min(clearance, dn[3])
+            if dn[3] < gap:
+                gap = dn[3]
+                touched = g
+                normal = vec3(dn[0], dn[1], dn[2])
+                local = y
+        force = vec3()
+        K = mat33()
+        stick = local
+        bond = touched
+        if touched >= 0:
+            mu = geoms.friction[touched, w]
+            fn = -k * gap
+            if wp.static(lawful):
+                joined = real(2.0) * laws.work[w] * share  # peak force times range
+                work = joined
+                bond = int(-1)
+                if anchor_geom[i, w] == touched:
+                    work = real(2.0) * laws.parting[w] * share
+                    bond = touched
+                peak = real(0.0)
+                if laws.reach[w] > real(0.0):
+                    peak = work / laws.reach[w]
+                    joined = joined / laws.reach[w]
+                if k * gap <= joined:
+                    bond = touched
+                traction = normal_traction(k, peak, laws.reach[w], gap)
+                fn = traction[0]
+                K = traction[1] * wp.outer(normal, normal)
+                if laws.exponent[w] != real(0.0):
+                    pressure = real(0.0)
+                    for c in range(3):
+                        pressure += b[c] * laws.node_push[t[c], w] / laws.node_area[t[c]]
+                    pressure = wp.max(pressure, real(_LEAST) * laws.pressure[w])
+                    mu = mu * wp.pow(pressure / laws.pressure[w], -laws.exponent[w])
+            else:
+                K = k * wp.outer(normal, normal)
+            force = fn * normal
+            if mu > real(0.0) and fn > real(0.0):
+                if anchor_geom[i, w] == touched:
+                    stick = anchor[i, w]
+                else:
+                    # touched within this step: slip counts from where the sample was on the geom when the
+                    # step began
+                    last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
+                    stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+                ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
+                force = force + ft
+                K = K + Kt
+            R = geoms.mat[touched, w]
+            force = R * force
+            K = R * K * wp.transpose(R)
+        return touched, bond, clearance, force, K, stick
+
+    @wp.kernel(module=module, enable_backward=False)
+    def by_face(
+        # In:
+        still: int,
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: real,
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        near: wp.array2d(dtype=int),
+        # In and out:
+        seen: wp.array2d(dtype=vec3),
+        clearance: wp.array2d(dtype=real),
+        # Out:
+        corner_out: wp.array2d(dtype=vec3),
+        block_out: wp.array2d(dtype=mat33),
+        touching_out: wp.array2d(dtype=int),
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+    ):
+        """Contact of the near faces."""
+        f, w = wp.tid()
+        if on[w] == 0:
+            return
+        if near[f, w] == 0:
+            return
+        nsample = sample.shape[0]
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        free = real(1.0)
+        touching = int(0)
+        total = FaceSum()
+        share = area[f] / real(nsample)
+        k = stiffness * share
+        for s in range(nsample):
+            i = f * nsample + s
+            b = sample[s]
+            touched, bond, gap, force, K, stick = touch_sample(
+                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor
+            )
+            free = wp.min(free, gap)
+            geom_out[i, w] = touched
+            bond_out[i, w] = bond
+            if touched >= 0:
+                touching = 1
+                anchor_out[i, w] = stick
+                force_out[i, w] = force
+                total = with_sample(total, b, force, K)
+        write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        if still == 1:
+            clearance[f, w] = known_clearance(x0, x1, x2, free)
+            seen[3 * f, w] = x0
+            seen[3 * f + 1, w] = x1
+            seen[3 * f + 2, w] = x2
+
+    @wp.kernel(module=module, enable_backward=False)
+    def by_sample(
+        # In:
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: real,
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        near: wp.array2d(dtype=int),
+        # Out:
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+        gap_out: wp.array2d(dtype=real),
+        tangent_out: wp.array2d(dtype=mat33),
+    ):
+        """The same by samples, for few worlds: `sum_samples` then adds up the faces."""
+        i, w = wp.tid()
+        f = i // sample.shape[0]
+        if on[w] == 0:
+            return
+        if near[f, w] == 0:
+            return
+        t = face[f]
+        share = area[f] / real(sample.shape[0])
+        k = stiffness * share
+        touched, bond, gap, force, K, stick = touch_sample(
+            i, w, sample[i % sample.shape[0]], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share,
+            laws, geoms, x_last, anchor_geom, anchor,
+        )  # fmt: skip
+        geom_out[i, w] = touched
+        bond_out[i, w] = bond
+        gap_out[i, w] = gap
+        if touched >= 0:
+            anchor_out[i, w] = stick
+            force_out[i, w] = force
+            tangent_out[i, w] = K
+
+    return types.SimpleNamespace(by_face=by_face, by_sample=by_sample)
+
+
+@wp.kernel
+def push(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    near: wp.array2d(dtype=int),
+    # Out:
+    corner_out: wp.array2d(dtype=real),
+):
+    """Size of the normal push on the corners of every face [N]."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    total = vec3()
+    if near[f, w] == 1:
+        t = face[f]
+        k = stiffness * area[f] / real(sample.shape[0])
+        for g in range(geoms.count):
+            R = wp.transpose(geoms.mat[g, w])
+            for s in range(sample.shape[0]):
+                b = sample[s]
+                p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+                y = R * (p - geoms.pos[g, w])
+                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                total += wp.max(-k * dn[3], real(0.0)) * b
+    for c in range(3):
+        corner_out[3 * f + c, w] = total[c]
+
+
+@wp.kernel
+def sum_pushes(
+    # In:
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    corner: wp.array2d(dtype=real),
+    on: wp.array(dtype=int),
+    # Out:
+    laws: Laws,
+):
+    i, w = wp.tid()
+    if on[w] == 0:
+        return
+    total = real(0.0)
+    for k in range(start[i], start[i + 1]):
+        total += corner[slot[k], w]
+    laws.node_push[i, w] = total
+
+
+@wp.kernel
+def sum_samples(
+    # In:
+    still: int,
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    near: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    gap: wp.array2d(dtype=real),
+    tangent: wp.array2d(dtype=mat33),
+    # Out:
+    corner_out: wp.array2d(dtype=vec3),
+    block_out: wp.array2d(dtype=mat33),
+    touching_out: wp.array2d(dtype=int),
+    seen: wp.array2d(dtype=vec3),
+    clearance: wp.array2d(dtype=real),
+):
+    """Corner c of a face adds up its force, and two of the six blocks of the tangent."""
+    f, c, w = wp.tid()
+    if on[w] == 0:
+        return
+    if near[f, w] == 0:
+        return
+    nsample = sample.shape[0]
+    touching = int(0)
+    total = vec3()
+    first = mat33()  # block c c
+    second = mat33()  # block c (c + 1)
+    free = real(1.0)
+    d = (c + 1) % 3
+    for s in range(nsample):
+        i = f * nsample + s
+        free = wp.min(free, gap[i, w])
+        if geom[i, w] >= 0:
+            touching = 1
+            b = sample[s]
+            total += b[c] * force[i, w]
+            K = tangent[i, w]
+            first += (b[c] * b[c]) * K
+            second += (b[c] * b[d]) * K
+    corner_out[3 * f + c, w] = total
+    if touching == 1:
+        block_out[6 * f + block_index(c, c), w] = first
+        block_out[6 * f + block_index(wp.min(c, d), wp.max(c, d)), w] = second
+    if c == 0:
+        touching_out[f, w] = touching
+        if still == 1:
+            t = face[f]
+            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
+    if still == 1:
+        seen[3 * f + c, w] = x[face[f][c], w]
+
+
+@wp.kernel
+def partial_wrench(
+    # In:
+    chunk: int,
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    part_out: wp.array3d(dtype=vec3),
+    touched_by: wp.array2d(dtype=int),
+):
+    """Force and torque of a chunk of faces ON each group of geoms [2 group + (0, 1), chunk, world]; marks
+    geoms that touch."""
+    c, w = wp.tid()
+    for k in range(part_out.shape[0]):
+        part_out[k, c, w] = vec3()
+    nsample = sample.shape[0]
+    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
+        if touching[f, w] == 1:
+            t = face[f]
+            for s in range(nsample):
+                i = f * nsample + s
+                g = geom[i, w]
+                if g >= 0:
+                    b = sample[s]
+                    p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+                    k = 2 * geoms.group[g]
+                    part_out[k, c, w] = part_out[k, c, w] - force[i, w]
+                    part_out[k + 1, c, w] = part_out[k + 1, c, w] - wp.cross(p, force[i, w])
+                    touched_by[g, w] = 1
+
+
+@wp.kernel
+def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
+    """Wrench on each group of geoms [group, world, 6]."""
+    k, w = wp.tid()
+    total = vec3()
+    for c in range(part.shape[1]):
+        total += part[k, c, w]
+    for a in range(3):
+        wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]
+
+
+@wp.kernel
+def commit_contacts(
+    # In:
+    nsample: int,
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    # In and out:
+    kept: wp.array2d(dtype=int),
+    # Out:
+    geom_out: wp.array2d(dtype=int),
+    anchor_out: wp.array2d(dtype=vec3),
+):
+    """Anchors of the faces that touch, and that touched when the last step ended, become those that the next
+    step starts from."""
+    f, w = wp.tid()
+    if touching[f, w] == 0 and kept[f, w] == 0:
+        return
+    kept[f, w] = touching[f, w]
+    for s in range(nsample):
+        i = f * nsample + s
+        geom_out[i, w] = -1
+        if touching[f, w] == 1:
+            geom_out[i, w] = geom[i, w]
+            anchor_out[i, w] = anchor[i, w]

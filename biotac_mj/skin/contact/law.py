@@ -1,0 +1,199 @@
+"""Contact beyond Coulomb and push: friction whose coefficient falls with pressure, and adhesion with
+hysteresis.
+
+Both act at the samples inside the faces, as contact itself does (`contact`), each on its share of the face's
+area:
+
+- mu = friction (p / friction_pressure)^-friction_exponent, p the push on a node over its area, linear between
+  nodes (flat faces touch round bodies in spots, whose pressure is the mesh's). With exponent 1 the shear
+  stress is one number whatever the pressure (smooth rubber: Sahli et al., PNAS 2018); Hertz's contact turns
+  p^-n into N^(-n/3).
+- traction t(g) at the gap g: the contact's own spring k carries on into tension up to the peak 2 W / range,
+  then the traction falls in a straight line to zero at `adhesion_range`. The area under it is W, the work of
+  adhesion, whatever k. A sample that has touched is parted by `adhesion_hysteresis` times W until it is out
+  of range: both laws have one branch where it touches, so that within a step traction has a potential and
+  energy is lost only by parting.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+import warp as wp
+
+from ..types import real
+from .faces import Laws
+
+__all__ = ["ContactLaw", "WorldLaws", "contact_law"]
+
+# range^2 = this W h / E*: softening then takes half of the stiffness E* / h of a patch as wide as a face
+_RESOLVED = 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactLaw:
+    """Friction and adhesion of a skin with what touches it; the defaults are Coulomb's law and none.
+
+    Attributes:
+      friction_exponent: n in mu = friction (p / friction_pressure)^-n; the geoms' `friction` is the
+        coefficient at that pressure.
+      friction_pressure: [Pa]; the default is what a sphere of 7 mm presses with at 1 N (Hertz: 0.24 MPa on
+        the average). Below a hundredth of it mu stays.
+      adhesion: work of adhesion W [J/m^2] of surfaces that come together. Rubber: 0.02-0.1.
+      adhesion_hysteresis: factor on W once surfaces have touched.
+      adhesion_range: gap at which adhesion ends [m]; None takes the shortest that the mesh resolves, sqrt(4 W
+        h / E*) with the work that parts the surfaces and h the length of the outer faces' edges. A shorter
+        one snaps face by face.
+
+    Raises:
+      ValueError: a value is out of its range.
+    """
+
+    friction_exponent: float = 0.0
+    friction_pressure: float = 3e5
+    adhesion: float = 0.0
+    adhesion_hysteresis: float = 1.0
+    adhesion_range: float | None = None
+
+    def __post_init__(self):
+        if not -1 <= self.friction_exponent <= 2:
+            raise ValueError(
+                f"friction_exponent is {self.friction_exponent}: pass a number from -1 to 2; 0 is Coulomb's "
+                "law"
+            )
+        if not (math.isfinite(self.friction_pressure) and self.friction_pressure > 0):
+            raise ValueError(f"friction_pressure is {self.friction_pressure}: pass a positive number of Pa")
+        if not (math.isfinite(self.adhesion) and self.adhesion >= 0):
+            raise ValueError(f"adhesion is {self.adhesion}: pass a work >= 0 in J/m^2")
+        if not (math.isfinite(self.adhesion_hysteresis) and self.adhesion_hysteresis >= 1):
+            raise ValueError(
+                f"adhesion_hysteresis is {self.adhesion_hysteresis}: parting takes at least the work of "
+                "joining, pass >= 1"
+            )
+        if self.adhesion_range is not None and not (
+            math.isfinite(self.adhesion_range) and self.adhesion_range > 0
+        ):
+            raise ValueError(f"adhesion_range is {self.adhesion_range}: pass a positive length in m, or None")
+
+
+def contact_law(choice) -> ContactLaw | None:
+    """A ContactLaw, a dict of its fields or None, as a ContactLaw or None.
+
+    Raises:
+      ValueError: anything else, or an unknown field.
+    """
+    if choice is None or isinstance(choice, ContactLaw):
+        return choice
+    fields = [f.name for f in dataclasses.fields(ContactLaw)]
+    if not isinstance(choice, dict) or set(choice) - set(fields):
+        raise ValueError(
+            f"contact_law is {choice!r}: pass a ContactLaw, or a dict with some of {', '.join(fields)}"
+        )
+    return ContactLaw(**choice)
+
+
+class WorldLaws:
+    """A surface's ContactLaw in every world; worlds may have laws of their own, see `set`.
+
+    Args:
+      model: SkinModel, perhaps with a contact law; nworld: number of worlds.
+
+    Attributes:
+      struct: `faces.Laws`, empty where the model has no contact law.
+      pulls: (nworld,) Warp array, 1 where there is adhesion.
+      range: (nworld,) at which adhesion ends [m].
+    """
+
+    def __init__(self, model, nworld: int):
+        self.law, self.nworld, self.device = model.options.contact_law, nworld, model.device
+        n, nvert = (nworld, model.nvert) if self.law else (0, 0)
+        self.struct = Laws()
+        with wp.ScopedDevice(self.device):
+            for name in ("exponent", "pressure", "work", "parting", "reach"):
+                setattr(self.struct, name, wp.zeros(n, dtype=real))
+            self.struct.node_area = wp.zeros(nvert, dtype=real)
+            self.struct.node_push = wp.zeros((nvert, nworld), dtype=real)
+            self.pulls = wp.zeros(nworld, dtype=int)
+        if self.law is None:
+            return
+        self.stiffness = model.contact_stiffness
+        face, vert = model.outer.face_np, model.geometry.vert
+        self.edge = float(np.linalg.norm(vert[face] - vert[np.roll(face, 1, 1)], axis=2).mean())
+        self.modulus = model.material.youngs_modulus / (1 - model.material.poissons_ratio**2)
+        area = np.bincount(face.ravel(), np.repeat(model.outer.area.numpy() / 3, 3), nvert)
+        self.struct.node_area.assign(area)
+        self._values = {}
+        law = self.law
+        self.set(law.friction_exponent, law.adhesion, law.friction_pressure, law.adhesion_hysteresis)
+
+    @property
+    def range(self) -> np.ndarray:
+        return self.struct.reach.numpy().copy()
+
+    def set(
+        self, friction_exponent=None, adhesion=None, friction_pressure=None, adhesion_hysteresis=None
+    ) -> None:
+        """Gives each world its law, from the next step on.
+
+        Args:
+          friction_exponent, adhesion, friction_pressure, adhesion_hysteresis: (nworld,) or a number; see
+            `ContactLaw`. None leaves them.
+
+        Raises:
+          ValueError: a value out of its range, adhesion whose range is too short for the contact's stiffness,
+            or a model without a contact law.
+        """
+        if self.law is None:
+            raise ValueError(
+                "this model has no contact law: make it with SkinOptions(contact_law=ContactLaw())"
+            )
+        given = dict(
+            friction_exponent=friction_exponent,
+            adhesion=adhesion,
+            friction_pressure=friction_pressure,
+            adhesion_hysteresis=adhesion_hysteresis,
+        )
+        values = dict(self._values)
+        for name, value in given.items():
+            if value is None:
+                continue
+            value = np.asarray(value, float)
+            if value.shape not in ((), (self.nworld,)):
+                raise ValueError(f"{name} has shape {value.shape}: pass one number or ({self.nworld},)")
+            for one in np.unique(value):
+                dataclasses.replace(self.law, **{name: float(one)})  # refuses what no law can have
+            values[name] = np.broadcast_to(value, self.nworld).copy()
+        parting = values["adhesion"] * values["adhesion_hysteresis"]
+        reach = self.law.adhesion_range
+        if reach is None:
+            reach = np.sqrt(_RESOLVED * parting * self.edge / self.modulus)
+        reach = np.where(parting > 0, reach, 0.0)
+        if (4 * parting > self.stiffness * reach**2).any():
+            most = np.max(parting)
+            raise ValueError(
+                f"adhesion_range {np.max(reach):g} m is too short for a work of {most:g} J/m^2: the contact's "
+                f"own springs of {self.stiffness:g} Pa/m stretch by half of it; take a range above "
+                f"{2 * np.sqrt(most / self.stiffness):.1e} m"
+            )
+        self._values, s = values, self.struct
+        for array, value in (
+            (s.exponent, values["friction_exponent"]),
+            (s.pressure, values["friction_pressure"]),
+            (s.work, values["adhesion"]),
+            (s.parting, parting),
+            (s.reach, reach),
+            (self.pulls, (parting > 0).astype(np.int32)),
+        ):
+            array.assign(value)
+
+    def refuse_coarse_grids(self, geoms) -> None:
+        """Refuses meshes whose distance is not exact as far as adhesion reaches (ValueError)."""
+        if self.law is None:
+            return
+        spacing = geoms.struct.grids.spacing.numpy()
+        reach = self.struct.reach.numpy().max()
+        if len(spacing) and reach > 0.4 * spacing.min():
+            raise ValueError(
+                f"adhesion reaches {reach * 1e6:.0f} um, and the distance to a mesh geom is exact within "
+                f"{0.4e6 * spacing.min():.0f} um: bake its grid with a larger spacing, or shorten adhesion_range"
+            )

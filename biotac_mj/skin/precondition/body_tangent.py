@@ -1,0 +1,161 @@
+"""Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the BioTac frame's origin.
+
+The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its
+corrected compliance C = (A0 + U D U^T)^-1: R' (D - D C D) R with the body's rigid motions R, translations
+first. The rest stiffness stands for the tangent here, as in the preconditioners.
+
+`body_tangent` is that in double precision for one body. The kernels have G = (I + D W)^-1 D over all touching
+nodes from the linear solves of many worlds, and that is D - D C D; nodes that two bodies touch count for one
+of them.
+"""
+
+import numpy as np
+import warp as wp
+
+from ..types import mat33, real, vec3
+
+__all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+def body_tangent(nodes, compliance, solver, blocks, x, nvert):
+    """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin
+    (translation, rotation vector).
+
+    The body drags the contact springs D_g; the skin behind them gives way by the corrected compliance C = (A0
+    + U D U^T)^-1 over
+    T: G^T (D_g - D_g C D_g) G, with the body's rigid motions G at the touching nodes. The rest stiffness
+      stands for the tangent
+    here, as in the preconditioner.
+
+    Args:
+      nodes: (m,) touching free nodes.
+      compliance: (3m [+ 1], ...) W over them (and the liquid).
+      solver: u -> (I + D W)^-1 D u.
+      blocks: (faces (n, 3), stiffness (n, 6, 3, 3)) of the body's contact alone.
+      x: (nvert, 3) nodal positions.
+      nvert: number of nodes.
+    """
+    if not len(blocks[0]):
+        return np.zeros((6, 6))
+    size, m = len(compliance), 3 * len(nodes)
+    springs = np.zeros((size, size))
+    springs[:m, :m] = assemble(nodes, *blocks, nvert)
+    rigid = np.zeros((size, 6))
+    rigid[:m].reshape(-1, 3, 6)[:, :, :3] = np.eye(3)
+    rigid[:m].reshape(-1, 3, 6)[:, :, 3:] = -_skew(x[nodes])
+    pull = springs @ rigid
+    give = compliance @ pull
+    give -= compliance @ solver(give)
+    stiffness = rigid.T @ pull - pull.T @ give
+    values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+    return (vectors * np.maximum(values, 0)) @ vectors.T
+
+
+def assemble(nodes, faces, blocks, nvert):
+    """Contact stiffness (3m, 3m) over `nodes` from the blocks (n, 6, 3, 3) of faces (n, 3)."""
+    position = np.full(nvert, len(nodes))
+    position[nodes] = np.arange(len(nodes))
+    dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
+    for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+        pa, pb = position[faces[:, a]], position[faces[:, b]]
+        np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
+        if a != b:
+            np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
+    return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
+
+
+def _skew(v):
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+@wp.kernel
+def group_rows(
+    # In:
+    size: wp.array(dtype=int),
+    node: wp.array2d(dtype=int),
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    nsample: int,
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    group: wp.array(dtype=int),
+    # Out:
+    group_out: wp.array2d(dtype=int),
+):
+    """Which body touches each node of the small systems from outside [row, world]; -1: none."""
+    s, w = wp.tid()
+    found = int(-1)
+    if s < size[w]:
+        i = node[s, w]
+        for k in range(start[i], start[i + 1]):
+            f = slot[k] / 3
+            if touching[f, w] == 1:
+                for j in range(nsample):
+                    g = geom[f * nsample + j, w]
+                    if g >= 0:
+                        found = wp.max(found, group[g])
+    group_out[s, w] = found
+
+
+@wp.kernel
+def drag_rows(
+    # In:
+    liquid: int,
+    size: wp.array(dtype=int),
+    node: wp.array2d(dtype=int),
+    G: wp.array3d(dtype=float),
+    x: wp.array2d(dtype=vec3),
+    group: wp.array2d(dtype=int),
+    # Out:
+    part_out: wp.array2d(dtype=wp.spatial_matrixd),
+):
+    """Each row's part R_s' sum_t G_st R_t of its body's tangent [row, world]."""
+    s, w = wp.tid()
+    if s >= size[w]:
+        return
+    mine = group[s, w]
+    if mine < 0:
+        return
+    move = mat33()  # forces on node s of the body's unit translations, and rotations
+    turn = mat33()
+    for t in range(size[w]):
+        if group[t, w] == mine:
+            g = mat33()
+            for a in range(3):
+                for b in range(3):
+                    # stored transposed; G is symmetric but for rounding
+                    g[a, b] = real(G[w, liquid + 3 * t + b, liquid + 3 * s + a])
+            move += g
+            turn -= g * wp.skew(x[node[t, w], w])
+    arm = wp.skew(x[node[s, w], w])
+    bend = arm * move
+    wind = arm * turn
+    part = wp.spatial_matrixd()
+    for a in range(3):
+        for b in range(3):
+            part[a, b] = move[a, b]
+            part[a, 3 + b] = turn[a, b]
+            part[3 + a, b] = bend[a, b]
+            part[3 + a, 3 + b] = wind[a, b]
+    part_out[s, w] = part
+
+
+@wp.kernel
+def sum_rows(
+    # In:
+    size: wp.array(dtype=int),
+    group: wp.array2d(dtype=int),
+    part: wp.array2d(dtype=wp.spatial_matrixd),
+    # Out:
+    tangent_out: wp.array2d(dtype=wp.spatial_matrixd),
+):
+    g, w = wp.tid()
+    total = wp.spatial_matrixd()
+    for s in range(size[w]):
+        if group[s, w] == g:
+            total += part[s, w]
+    tangent_out[g, w] = real(0.5) * (total + wp.transpose(total))

@@ -1,0 +1,350 @@
+"""The small systems of the dense preconditioner: over the liquid and the touching nodes of each world.
+
+The liquid comes first, then three rows for each touching node. D is sparse and kept by blocks: a node's links
+and their springs."""
+
+import warp as wp
+
+from ..contact.faces import block_index
+from ..newton.worlds import Worlds, total_of
+from ..types import mat33, narrow, real
+from .sides import STIFF, entry, pull_of_liquid
+
+__all__ = [
+    "LINKS",
+    "invert_serial",
+    "small_answer",
+    "small_compliance",
+    "small_forces",
+    "small_stiffness",
+    "small_system",
+    "sum_liquid",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+LINKS = wp.constant(
+    24
+)  # touching nodes that a touching node's faces can have; more are left to conjugate gradients
+
+
+@wp.kernel
+def sum_liquid(
+    part: wp.array3d(dtype=real),
+    on: wp.array(dtype=int),
+    first: int,
+    W_out: wp.array3d(dtype=float),
+    u_out: wp.array2d(dtype=float),
+):
+    w, t = wp.tid()
+    if on[w] == 0:
+        return
+    gy = total_of(part, 0, w, t)
+    gg = total_of(part, 1, w, t)
+    if t == 0:
+        u_out[w, 0] = float(gy)
+        if first == 1:
+            W_out[w, 0, 0] = float(gg)
+
+
+@wp.kernel
+def small_compliance(
+    # In:
+    inverse: wp.array2d(dtype=wp.float16),
+    rest: wp.array2d(dtype=wp.float16),
+    scale: float,
+    free_index: wp.array(dtype=int),
+    node: wp.array2d(dtype=int),
+    size: wp.array(dtype=int),
+    has_liquid: int,
+    along: wp.array2d(dtype=wp.vec3),
+    st: Worlds,
+    # Out:
+    W_out: wp.array3d(dtype=float),
+):
+    """W over the liquid's direction and the touching nodes, by blocks."""
+    w, i, j = wp.tid()
+    if st.active[w] == 0:
+        return
+    n = size[w]
+    if i >= n or j >= n:
+        return
+    soft = scale * float(st.softness[w])
+    a = 3 * free_index[node[i, w]]
+    b = 3 * free_index[node[j, w]]
+    row = has_liquid + 3 * i
+    column = has_liquid + 3 * j
+    for k in range(3):
+        for l in range(3):
+            W_out[w, row + k, column + l] = entry(inverse, rest, a + k, b + l) * soft
+    if j == 0 and has_liquid == 1:
+        v = along[node[i, w], w]
+        for k in range(3):
+            W_out[w, 0, row + k] = v[k]
+            W_out[w, row + k, 0] = v[k]
+
+
+@wp.func
+def add_links(
+    i: int,
+    s: int,
+    w: int,
+    count: int,
+    start: wp.array(dtype=int),
+    slots: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    touching: wp.array2d(dtype=int),
+    block: wp.array2d(dtype=mat33),
+    slot: wp.array2d(dtype=int),
+    link: wp.array3d(dtype=int),
+    spring: wp.array3d(dtype=wp.mat33),
+):
+    for k in range(start[i], start[i + 1]):
+        f = slots[k] // 3
+        if touching[f, w] == 1:
+            a = slots[k] % 3
+            for b in range(3):
+                j = slot[face[f][b], w]
+                if j >= 0:
+                    at = int(0)
+                    for l in range(count):
+                        if link[w, s, l] == j:
+                            break
+                        at += 1
+                    K = narrow(block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w])
+                    if at < count:
+                        spring[w, s, at] = spring[w, s, at] + K
+                    elif count < LINKS:
+                        link[w, s, count] = j
+                        spring[w, s, count] = K
+                        count += 1
+    return count
+
+
+@wp.kernel
+def small_stiffness(
+    # In:
+    outer_face: wp.array(dtype=wp.vec3i),
+    outer_start: wp.array(dtype=int),
+    outer_slot: wp.array(dtype=int),
+    outer_touching: wp.array2d(dtype=int),
+    outer_block: wp.array2d(dtype=mat33),
+    core_face: wp.array(dtype=wp.vec3i),
+    core_start: wp.array(dtype=int),
+    core_slot: wp.array(dtype=int),
+    core_touching: wp.array2d(dtype=int),
+    core_block: wp.array2d(dtype=mat33),
+    slot: wp.array2d(dtype=int),
+    node: wp.array2d(dtype=int),
+    size: wp.array(dtype=int),
+    on: wp.array(dtype=int),
+    # Out:
+    count_out: wp.array2d(dtype=int),
+    link_out: wp.array3d(dtype=int),
+    spring_out: wp.array3d(dtype=wp.mat33),
+):
+    """D by its blocks: with which touching nodes the contact couples each, and how stiffly."""
+    s, w = wp.tid()
+    if on[w] == 0 or s >= size[w]:
+        return
+    i = node[s, w]
+    count = add_links(
+        i,
+        s,
+        w,
+        0,
+        outer_start,
+        outer_slot,
+        outer_face,
+        outer_touching,
+        outer_block,
+        slot,
+        link_out,
+        spring_out,
+    )
+    if core_start.shape[0] > 0:
+        count = add_links(
+            i,
+            s,
+            w,
+            count,
+            core_start,
+            core_slot,
+            core_face,
+            core_touching,
+            core_block,
+            slot,
+            link_out,
+            spring_out,
+        )
+    count_out[w, s] = count
+
+
+@wp.func
+def read_block(A: wp.array3d(dtype=float), w: int, row: int, column: int):
+    return wp.mat33(
+        A[w, row, column], A[w, row, column + 1], A[w, row, column + 2],
+        A[w, row + 1, column], A[w, row + 1, column + 1], A[w, row + 1, column + 2],
+        A[w, row + 2, column], A[w, row + 2, column + 1], A[w, row + 2, column + 2],
+    )  # fmt: skip
+
+
+@wp.kernel
+def small_system(
+    # In:
+    has_liquid: int,
+    size: wp.array(dtype=int),
+    count: wp.array2d(dtype=int),
+    link: wp.array3d(dtype=int),
+    spring: wp.array3d(dtype=wp.mat33),
+    W: wp.array3d(dtype=float),
+    on: wp.array(dtype=int),
+    # Out:
+    A_out: wp.array3d(dtype=float),
+):
+    """A = I + D W by blocks."""
+    w, i, j = wp.tid()
+    if on[w] == 0:
+        return
+    n = size[w]
+    if i == 0 and j == 0 and has_liquid == 1:
+        A_out[w, 0, 0] = 1.0 + STIFF * W[w, 0, 0]
+    if i >= n or j >= n:
+        return
+    total = wp.mat33()
+    if i == j:
+        total = wp.identity(n=3, dtype=float)
+    for k in range(count[w, i]):
+        total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * link[w, i, k], has_liquid + 3 * j)
+    row = has_liquid + 3 * i
+    column = has_liquid + 3 * j
+    for a in range(3):
+        for b in range(3):
+            A_out[w, row + a, column + b] = total[a, b]
+    if has_liquid == 1 and i == 0:
+        for b in range(3):
+            A_out[w, 0, column + b] = STIFF * W[w, 0, column + b]
+    if has_liquid == 1 and j == 0:
+        v = wp.vec3()
+        for k in range(count[w, i]):
+            at = 1 + 3 * link[w, i, k]
+            v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
+        for a in range(3):
+            A_out[w, row + a, 0] = v[a]
+
+
+@wp.kernel
+def invert_serial(
+    has_liquid: int,
+    size: wp.array(dtype=int),
+    on: wp.array(dtype=int),
+    A: wp.array3d(dtype=float),
+    pivot: wp.array2d(dtype=int),
+    B_out: wp.array3d(dtype=float),
+):
+    """Inverse by Gauss-Jordan exchange with row pivots, one thread for each world: for the CPU."""
+    w = wp.tid()
+    if on[w] == 0:
+        return
+    n = has_liquid + 3 * size[w]
+    for i in range(n):
+        pivot[w, i] = -1  # of row i: the column that it was exchanged with
+    for k in range(n):
+        p = int(-1)
+        best = float(-1.0)
+        for i in range(n):
+            if pivot[w, i] < 0 and wp.abs(A[w, i, k]) > best:
+                best = wp.abs(A[w, i, k])
+                p = i
+        pivot[w, p] = k
+        d = 1.0 / A[w, p, k]
+        for j in range(n):
+            if j != k:
+                A[w, p, j] = A[w, p, j] * d
+        A[w, p, k] = d
+        for i in range(n):
+            if i != p:
+                f = A[w, i, k]
+                if f != 0.0:
+                    for j in range(n):
+                        if j != k:
+                            A[w, i, j] = A[w, i, j] - f * A[w, p, j]
+                    A[w, i, k] = -f * d
+    # row i of the exchanged matrix gives unknown pivot[i]; its column k belongs to the right-hand side of the
+    # row with pivot k
+    for i in range(n):
+        for j in range(n):
+            B_out[w, pivot[w, i], j] = A[w, i, pivot[w, j]]
+
+
+@wp.kernel
+def small_answer(
+    # In:
+    has_liquid: int,
+    size: wp.array(dtype=int),
+    count: wp.array2d(dtype=int),
+    link: wp.array3d(dtype=int),
+    spring: wp.array3d(dtype=wp.mat33),
+    B: wp.array3d(dtype=float),
+    on: wp.array(dtype=int),
+    # Out:
+    G_out: wp.array3d(dtype=float),
+):
+    """G = B D, stored transposed: threads that sum one entry each then read side by side. D is symmetric."""
+    w, j, i = wp.tid()
+    if on[w] == 0:
+        return
+    n = size[w]
+    if i == 0 and j == 0 and has_liquid == 1:
+        G_out[w, 0, 0] = STIFF * B[w, 0, 0]
+    if i >= n or j >= n:
+        return
+    row = has_liquid + 3 * i
+    column = has_liquid + 3 * j
+    total = wp.mat33()
+    for k in range(count[w, j]):
+        total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * wp.transpose(spring[w, j, k])
+    for a in range(3):
+        for b in range(3):
+            G_out[w, column + b, row + a] = total[a, b]
+    if has_liquid == 1 and j == 0:
+        for a in range(3):
+            G_out[w, 0, row + a] = STIFF * B[w, row + a, 0]
+    if has_liquid == 1 and i == 0:
+        v = wp.vec3()
+        for k in range(count[w, j]):
+            at = 1 + 3 * link[w, j, k]
+            v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
+        for b in range(3):
+            G_out[w, column + b, 0] = v[b]
+
+
+@wp.kernel
+def small_forces(
+    # In:
+    has_liquid: int,
+    size: wp.array(dtype=int),
+    G: wp.array3d(dtype=float),
+    u: wp.array2d(dtype=float),
+    norm: wp.array2d(dtype=float),
+    st: Worlds,
+    on: wp.array(dtype=int),
+    # Out:
+    q_out: wp.array2d(dtype=float),
+    largest_out: wp.array(dtype=float),
+):
+    """q = G u, and a bound of what it pushes with."""
+    w, i = wp.tid()
+    if on[w] == 0:
+        return
+    n = has_liquid + 3 * size[w]
+    if i >= n:
+        return
+    total = float(0.0)
+    for k in range(n):
+        total += G[w, k, i] * u[w, k]
+    q_out[w, i] = total
+    bound = wp.abs(total)
+    if i < has_liquid:
+        bound *= norm[1, w] * pull_of_liquid(st, w)
+    wp.atomic_max(largest_out, w, bound)

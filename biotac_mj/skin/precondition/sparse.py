@@ -1,0 +1,285 @@
+"""Preconditioner of the linear solves on the CPU: the rest stiffness' sparse factor, corrected exactly for
+contact and liquid.
+
+Contact adds stiffness only between the touching nodes T, the liquid only along the gradient g of its volume.
+With U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's
+identity gives
+
+  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T and g).
+"""
+
+import contextlib
+
+import numpy as np
+from scipy.linalg import lu_factor, lu_solve
+
+from ..newton.worlds import BALANCED
+from ..program import Launcher
+from ..types import DOUBLE
+from .body_tangent import assemble, body_tangent
+from .supernodal import Elimination, SupernodalFactor
+
+__all__ = ["SparseFactor", "SparsePreconditioner"]
+
+_CLUSTER = 4  # nodes whose rows are computed together
+_FACTOR = 25  # products of the tangent: about what a factor costs
+
+
+class SparseFactor:
+    """A sparse factor on the CPU, see `supernodal`.
+
+    Args:
+      elimination: of a matrix with the same pattern; None: made here, and kept as the attribute.
+    """
+
+    def __init__(self, stiffness, free, vert, elimination=None):
+        self.elimination = elimination or Elimination(stiffness, vert[free])
+        self._solver = SupernodalFactor(stiffness, self.elimination, free)
+        self.size = stiffness.shape[0]
+        self._free = free
+        self._index = np.full(len(vert), -1)
+        self._index[free] = np.arange(len(free))
+        # clusters of neighbours: what touches together is computed together
+        order = _bisection_order(vert[free])
+        self._cluster_nodes = np.array_split(order, max(1, len(order) // _CLUSTER))
+        self._cluster = np.empty(len(free), int)
+        self._member = np.empty(len(free), int)
+        for number, members in enumerate(self._cluster_nodes):
+            self._cluster[members], self._member[members] = number, np.arange(len(members))
+        self._rows = {}
+
+    def solve(self, rhs):
+        """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""
+        return self._solver.solve(rhs)
+
+    def rows(self, nodes) -> np.ndarray:
+        """Rows of the inverse that belong to free nodes: (3 len(nodes), size) float32.
+
+        A row is computed with the rest of its cluster of nodes, always the same one, so that it does not
+        depend on the order of requests."""
+        local = self._index[nodes]
+        out = np.empty((len(nodes), 3, self.size), np.float32)
+        for cluster in np.unique(self._cluster[local]):
+            if cluster not in self._rows:
+                members = self._free[self._cluster_nodes[cluster]]
+                unit = np.zeros((len(self._index), len(members), 3, 3))
+                unit[members, np.arange(len(members))] = np.eye(3)
+                rows = self._solver.solve(unit.reshape(len(unit), -1, 3))[self._free]
+                self._rows[cluster] = np.moveaxis(rows, 1, 0).astype(np.float32).reshape(-1, 3, self.size)
+            here = self._cluster[local] == cluster
+            out[here] = self._rows[cluster][self._member[local[here]]]
+        return out.reshape(-1, self.size)
+
+    def dof(self, nodes) -> np.ndarray:
+        """Positions of the nodes' coordinates in a row (3 len(nodes),)."""
+        return (3 * self._index[nodes][:, None] + np.arange(3)).ravel()
+
+
+# rows of whole nodes (3) that fill the tensor cores' tiles (64): ragged sizes run at a third of the speed
+
+
+def _bisection_order(points: np.ndarray) -> np.ndarray:
+    """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and
+    again."""
+    order = np.arange(len(points))
+    stack, out = [order], []
+    while stack:
+        part = stack.pop()
+        if len(part) <= _CLUSTER:
+            out.append(part)
+            continue
+        axis = np.ptp(points[part], axis=0).argmax()
+        part = part[np.argsort(points[part, axis], kind="stable")]
+        stack += [part[len(part) // 2 :], part[: len(part) // 2]]
+    return np.concatenate(out)
+
+
+class SparsePreconditioner:
+    """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
+
+    Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose solve
+    takes many products gets the factor of its present shape, for this step alone, so that a step remains a
+    function of the state it starts from. Worlds share a factor: not where there are many.
+    """
+
+    precision = DOUBLE
+
+    def __init__(self, model, surfaces, st, chunk: int):
+        self._model, self._surfaces = model, [s for s in surfaces if s]
+        self._rest = self.factor = model.factor
+        self._free = model.free
+        self._is_free = np.zeros(model.nvert, bool)
+        self._is_free[model.free] = True
+        nworld = st.softness.shape[0]
+        self._softness, self._kappa = st.softness.numpy(), st.kappa.numpy()
+        self._products, self._iterations = 0, st.iterations_cg.numpy()
+        self._rows = self._rest_rows = {}
+        self._small = [None] * nworld
+        self._gradient = self._along = None
+        self.any_touch = st.touched
+
+    # --- the factor of a step ---
+
+    def begin_step(self, program: Launcher) -> None:
+        program.call(self._begin)
+
+    def _begin(self):
+        self._products = 0
+        self.factor, self._rows = self._rest, self._rest_rows
+
+    def watch_products(self, program: Launcher, x) -> None:
+        """After a linear solve: renews the factor where solves take too long."""
+        x = x.numpy()
+
+        def watch():
+            self._products += int(self._iterations[0])
+            if self._products > _FACTOR:
+                self._renew(x)
+
+        if self._renews:
+            program.call(watch)
+
+    def renew(self, program: Launcher, x) -> None:
+        """Takes the factor of the shape x."""
+        x = x.numpy()
+        if self._renews:
+            program.call(lambda: self._renew(x))
+
+    @property
+    def _renews(self):
+        return self._model.material.poissons_ratio > 0.45 and len(self._small) == 1
+
+    def _renew(self, x):
+        self._products = -np.inf  # once is enough until the next step
+        with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
+            self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
+
+    # --- solves ---
+
+    def update(self, program: Launcher, st, worth, r, gradient, z_out, part_out, beside) -> None:
+        """See `precondition.Preconditioner`."""
+        on, square, r, z, part = (a.numpy() for a in (st.active, worth, r, z_out, part_out))
+        gradient = gradient.numpy() if len(gradient) else None
+        touched, touching = self.any_touch.numpy(), [s.touching.numpy() for s in self._surfaces]
+
+        def update():
+            worlds = np.flatnonzero(on)
+            z[:, worlds], part[:, :, worlds] = 0, 0
+            for w in worlds:
+                touched[w] = any(t[:, w].any() for t in touching)
+                self._small[w] = None
+            rest = (touched[worlds] == 0) & (square[0].sum(0)[worlds] < BALANCED**2)
+            worlds = worlds[~rest]
+            if not len(worlds):
+                return
+            if gradient is None:
+                y = self.factor.solve(r[:, worlds])
+            else:  # two right-hand sides take little longer than one
+                both = self.factor.solve(np.concatenate([r[:, worlds], gradient[:, worlds]], 1))
+                y, along = np.split(both, 2, axis=1)
+                if self._along is None:
+                    self._along = np.zeros(gradient.shape)
+                self._gradient, self._along[:, worlds] = gradient, along
+            for w in worlds:
+                self._small[w] = self._small_system(w)
+            self._correct(worlds, y, r, z, part)
+
+        program.call(update)
+
+    def apply(self, program: Launcher, st, part, r, gradient, z_out, part_out) -> None:
+        """See `precondition.Preconditioner`."""
+        on, r, z, out = (a.numpy() for a in (st.running, r, z_out, part_out))
+
+        def apply():
+            worlds = np.flatnonzero(on)
+            if len(worlds):
+                self._correct(worlds, self.factor.solve(r[:, worlds]), r, z, out)
+
+        program.call(apply)
+
+    def _small_system(self, w):
+        faces, blocks = [], []
+        for state in self._surfaces:
+            active, block = state.active(w)
+            faces.append(state.surface.face_np[active])
+            blocks.append(block)
+        faces, blocks = np.concatenate(faces), np.concatenate(blocks)
+        nodes = np.unique(faces)
+        nodes = nodes[self._is_free[nodes]]
+        m = 3 * len(nodes)
+        size = m + (self._gradient is not None)
+        if size == 0:
+            return None
+        D = np.zeros((size, size))
+        D[:m, :m] = assemble(nodes, faces, blocks, len(self._is_free))
+        rows, W = self._compliance(w, nodes)
+        compliance, soft = np.zeros((size, size)), self._softness[w]
+        compliance[:m, :m] = W * soft
+        if self._gradient is not None:
+            D[m, m] = self._kappa[w]
+            along = self._along[:, w] * soft
+            compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
+            compliance[m, m] = np.vdot(self._gradient[:, w], along)
+        return nodes, rows, _Solver(np.eye(size) + D @ compliance, D), compliance
+
+    def _compliance(self, w, nodes):
+        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes stays
+        the same."""
+        key = nodes.tobytes()
+        if w not in self._rows or self._rows[w][0] != key:
+            rows = self.factor.rows(nodes)
+            self._rows[w] = key, rows, rows[:, self.factor.dof(nodes)].astype(float)
+        return self._rows[w][1:]
+
+    def _correct(self, worlds, y, r, z, part):
+        """From A0^-1 r of some worlds to z, r . z and gradient . z."""
+        for k, w in enumerate(worlds):
+            soft, small = self._softness[w], self._small[w]
+            v = y[:, k] * soft
+            if small is not None:
+                nodes, rows, solver, _ = small
+                m = 3 * len(nodes)
+                u = v[nodes].reshape(-1)
+                if self._gradient is not None:
+                    u = np.append(u, np.vdot(self._gradient[:, w], v))
+                q = solver(u) * soft
+                if m:
+                    v[self._free] -= (rows.T @ q[:m].astype(np.float32)).reshape(-1, 3)
+                if self._gradient is not None:
+                    v -= q[m] * self._along[:, w]
+            z[:, w] = v
+            part[0, 0, w] = np.vdot(r[:, w], v)
+            if self._gradient is not None:
+                part[1, 0, w] = np.vdot(self._gradient[:, w], v)
+
+    # --- tangents of touching bodies ---
+
+    def measure_tangents(self, program: Launcher, geoms, x, tangent_out) -> None:
+        """See `precondition.Preconditioner`."""
+        outer, nvert = self._surfaces[0], len(self._is_free)
+        face, x, out = outer.surface.face_np, x.numpy(), tangent_out.numpy()
+        geom = outer.trial_geom.numpy().reshape(len(face), -1, len(self._small))
+
+        def measure():
+            out[...] = 0
+            for w, small in enumerate(self._small):
+                active, blocks = outer.active(w)
+                if small is None or not len(active):
+                    continue
+                nodes, _, solver, compliance = small
+                group = geoms.groups[geom[active, :, w].max(1)]
+                for g in np.unique(group):
+                    mine = face[active[group == g]], blocks[group == g]
+                    out[g, w] = body_tangent(nodes, compliance, solver, mine, x[:, w], nvert)
+
+        program.call(measure)
+
+
+class _Solver:
+    """q = (I + D W)^-1 D u."""
+
+    def __init__(self, matrix, D):
+        self._lu, self._D = lu_factor(matrix, check_finite=False), D
+
+    def __call__(self, u):
+        return lu_solve(self._lu, self._D @ u, check_finite=False)

@@ -1,0 +1,135 @@
+"""Which nodes touch: numbered for each world, and listed for all of them together."""
+
+import warp as wp
+
+from ..newton.worlds import Worlds, total_of
+from ..types import real
+from .sides import TINY
+
+__all__ = ["copy_rows", "find_touched", "list_wanted", "survey"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def find_touched(
+    # In:
+    free_index: wp.array(dtype=int),
+    outer_start: wp.array(dtype=int),
+    outer_slot: wp.array(dtype=int),
+    outer_touching: wp.array2d(dtype=int),
+    core_start: wp.array(dtype=int),
+    core_slot: wp.array(dtype=int),
+    core_touching: wp.array2d(dtype=int),
+    on: wp.array(dtype=int),
+    # Out:
+    slot_out: wp.array2d(dtype=int),
+    any_out: wp.array(dtype=int),
+    wanted_out: wp.array(dtype=int),
+):
+    """Marks the free nodes of touching faces, for each world and for all."""
+    i, w = wp.tid()
+    if on[w] == 0:
+        return
+    here = int(0)
+    for k in range(outer_start[i], outer_start[i + 1]):
+        here = wp.max(here, outer_touching[outer_slot[k] // 3, w])
+    if core_start.shape[0] > 0:
+        for k in range(core_start[i], core_start[i + 1]):
+            here = wp.max(here, core_touching[core_slot[k] // 3, w])
+    if here == 1:
+        any_out[w] = 1
+    if free_index[i] < 0:
+        here = 0
+    if here == 1:
+        wanted_out[i] = 1
+    slot_out[i, w] = here
+
+
+@wp.kernel
+def survey(
+    # In:
+    capacity: int,
+    part: wp.array3d(dtype=real),
+    st: Worlds,
+    # In and out:
+    slot: wp.array2d(dtype=int),
+    # Out:
+    node_out: wp.array2d(dtype=int),
+    size_out: wp.array(dtype=int),
+    norm_out: wp.array2d(dtype=float),
+    full_out: wp.array(dtype=int),
+):
+    """Numbers the touching nodes of each world; norms of the residual and of the liquid's gradient."""
+    w, t = wp.tid()
+    if st.active[w] == 0:
+        return
+    rr = total_of(part, 0, w, t)
+    gg = total_of(part, 2, w, t)
+    n = slot.shape[0]
+    share = (n + wp.block_dim() - 1) // wp.block_dim()
+    mine = int(0)
+    for i in range(t * share, wp.min((t + 1) * share, n)):
+        mine += slot[i, w]
+    at = wp.untile(wp.tile_scan_exclusive(wp.tile(mine)))
+    for i in range(t * share, wp.min((t + 1) * share, n)):
+        here = int(-1)
+        if slot[i, w] == 1:
+            if at < capacity:
+                here = at
+                node_out[at, w] = i
+            at += 1
+        slot[i, w] = here
+    if t == wp.block_dim() - 1:
+        size_out[w] = wp.min(at, capacity)
+        if at > capacity:  # the rest is left to conjugate gradients
+            full_out[0] = wp.max(full_out[0], at)
+        norm_out[0, w] = wp.max(float(wp.sqrt(rr)), TINY)
+        norm_out[1, w] = wp.max(float(wp.sqrt(gg)), TINY)
+
+
+@wp.kernel
+def list_wanted(
+    # In and out:
+    wanted: wp.array(dtype=int),
+    # Out:
+    place_out: wp.array(dtype=int),
+    node_out: wp.array(dtype=int),
+    count_out: wp.array(dtype=int),
+    fits_out: wp.array(dtype=int),
+):
+    """Numbers the nodes that touch in any world, and forgets them."""
+    _w, t = wp.tid()
+    n = wanted.shape[0]
+    share = (n + wp.block_dim() - 1) // wp.block_dim()
+    mine = int(0)
+    for i in range(t * share, wp.min((t + 1) * share, n)):
+        mine += wanted[i]
+    at = wp.untile(wp.tile_scan_exclusive(wp.tile(mine)))
+    for i in range(t * share, wp.min((t + 1) * share, n)):
+        place_out[i] = at
+        if wanted[i] == 1:
+            if at < node_out.shape[0]:
+                node_out[at] = i
+            at += 1
+        wanted[i] = 0
+    if t == wp.block_dim() - 1:
+        count_out[0] = wp.min(at, node_out.shape[0])
+        fits_out[0] = 0
+        if at <= node_out.shape[0]:
+            fits_out[0] = 1
+
+
+@wp.kernel
+def copy_rows(
+    inverse: wp.array2d(dtype=wp.float16),
+    free_index: wp.array(dtype=int),
+    node: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    rows_out: wp.array2d(dtype=wp.float16),
+):
+    """Rows of the inverse of the listed nodes."""
+    r, c = wp.tid()
+    s = r // 3
+    if s < count[0]:
+        rows_out[r, c] = inverse[3 * free_index[node[s]] + r % 3, c]

@@ -1,0 +1,136 @@
+"""Launches of kernels with loops and branches between them, made once and run many times.
+
+On CUDA they are launched as they come, so that a caller's capture makes them nodes of its graph, loops and
+branches conditional ones (CUDA 12.4 and later). On the CPU a `Program` records them and plays the record:
+packing a launch's arguments takes Warp longer than many of the kernels run.
+"""
+
+import ctypes
+from collections.abc import Callable
+
+import warp as wp
+
+__all__ = ["Launcher", "Program"]
+
+
+class Launcher:
+    """Launches at once, on one device."""
+
+    def __init__(self, device):
+        self.device = wp.get_device(device)
+
+    def launch(self, kernel, dim, inputs, outputs=(), block_dim: int = 256) -> None:
+        """A kernel over dim."""
+        wp.launch(kernel, dim, inputs, list(outputs), device=self.device, block_dim=block_dim)
+
+    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim: int = 128) -> None:
+        """A block of threads for each item of dim."""
+        wp.launch_tiled(
+            kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device
+        )
+
+    def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
+        """body again and again while flag[0] is not zero."""
+        wp.capture_while(flag, body)
+
+    def branch(self, flag: wp.array, body: Callable[[], None], otherwise=None) -> None:
+        """body if flag[0] is not zero, else `otherwise`."""
+        wp.capture_if(flag, body, otherwise)
+
+    def call(self, function: Callable[[], None]) -> None:
+        """A function of the host: on the CPU only, where arrays are its memory."""
+        if self.device.is_cuda:
+            raise ValueError("a function of the host cannot be part of a program on CUDA")
+        function()
+
+
+class Program(Launcher):
+    """What record(program) launches.
+
+    Args:
+      device: Warp device.
+      record: is called with the program, once on the CPU and at every `run` on CUDA; calls its methods.
+
+    What the arrays hold may change between runs; which arrays, and numbers given as such, may not.
+    """
+
+    def __init__(self, device, record: Callable[["Program"], None]):
+        super().__init__(device)
+        self._record, self._commands, self._open = record, None, None
+        self._arguments = []  # kept, so that their memory stays theirs
+        if not self.device.is_cuda:
+            self._commands = self._recorded(lambda: record(self))
+
+    def run(self) -> None:
+        """Runs it on the device's current stream."""
+        if self._commands is None:
+            self._record(self)
+        else:
+            for command in self._commands:
+                command()
+
+    def _recorded(self, body):
+        outer, self._open = self._open, []
+        body()
+        commands, self._open = self._open, outer
+        return commands
+
+    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
+        if self.device.is_cuda:
+            super().launch(kernel, dim, inputs, outputs, block_dim)
+        elif all(dim) if isinstance(dim, (tuple, list)) else dim:
+            command = wp.launch(kernel, dim, inputs, list(outputs), device=self.device, record_cmd=True)
+            self._open.append(command.launch)
+            self._arguments.append((inputs, outputs))
+
+    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim=128):
+        if self.device.is_cuda:
+            super().launch_blocks(kernel, dim, inputs, outputs, block_dim)
+        else:
+            command = wp.launch_tiled(
+                kernel,
+                dim=dim,
+                inputs=inputs,
+                outputs=list(outputs),
+                block_dim=1,
+                device=self.device,
+                record_cmd=True,
+            )
+            self._open.append(command.launch)
+            self._arguments.append((inputs, outputs))
+
+    def loop(self, flag, body):
+        if self.device.is_cuda:
+            super().loop(flag, body)
+            return
+        on, commands = _value(flag), self._recorded(body)
+
+        def repeat():
+            while on[0]:
+                for command in commands:
+                    command()
+
+        self._open.append(repeat)
+
+    def branch(self, flag, body, otherwise=None):
+        if self.device.is_cuda:
+            super().branch(flag, body, otherwise)
+            return
+        on, commands = _value(flag), self._recorded(body)
+        others = self._recorded(otherwise) if otherwise else []
+
+        def choose():
+            for command in commands if on[0] else others:
+                command()
+
+        self._open.append(choose)
+
+    def call(self, function):
+        if self.device.is_cuda:
+            super().call(function)
+        self._open.append(function)
+
+
+def _value(flag):
+    """The first entry of an int array on the CPU, read faster than through numpy."""
+    return ctypes.cast(flag.ptr, ctypes.POINTER(ctypes.c_int32))

@@ -1,0 +1,637 @@
+"""Forces of the elements' corners, their tangent times a direction, stress and energy.
+
+Positions and forces are double to the end: an inflated skin that is hardly touched balances forces far larger
+than its load, and their rounding would be felt. Tangents have the precision of directions. In double, deformation
+gradients and rotations are kept from force to product; in single, on CUDA, reading them back would cost more
+than computing them again.
+
+On CUDA the four integration points of an element are four threads of a warp, which exchange what they know:
+the mean dilatation, and their stresses, of which each thread makes the forces of its share of the ten nodes.
+Elsewhere one thread has an element.
+"""
+
+import functools
+import types
+
+import numpy as np
+import warp as wp
+
+from ..program import Launcher
+from ..types import Precision, mat33, narrow, real, vec3
+from .law import (
+    dilatation,
+    dilatation_gradient,
+    dilatation_hessian,
+    energy_density,
+    polar,
+    polar_single,
+    stress,
+    stress_derivative,
+)
+from .points import Mesh, Rubber, deformation, point_functions
+
+__all__ = ["ElementForces"]
+
+wp.set_module_options({"enable_backward": False})
+
+# det F below which a step of the line search is refused where the law cannot recover from inversion
+_INVERTED = 0.02
+_ABREAST = 8  # worlds whose threads lie side by side: what they read does too
+
+# the threads of an element's points are `group` lanes apart
+_LANES = """
+    const int lane = threadIdx.x & 31;
+    const int base = lane - ((lane / group) & 3) * group;
+    const unsigned mask = ((1u | 1u << group | 1u << (2 * group) | 1u << (3 * group))) << base;
+"""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_LANES}
+    double total = 0.0;
+    for (int k = 0; k < 4; ++k) total += __shfl_sync(mask, value, base + k * group);
+    return total;
+#else
+    return value;
+#endif
+""")
+def sum_of_points(value: real, group: int) -> real: ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_LANES}
+    float total = 0.0f;
+    for (int k = 0; k < 4; ++k) total += __shfl_sync(mask, value, base + k * group);
+    return total;
+#else
+    return value;
+#endif
+""")
+def sum_of_points_single(value: float, group: int) -> float: ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_LANES}
+    wp::mat_t<3, 3, float> B;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(mask, A.data[i][j], base + q * group);
+    return B;
+#else
+    return A;
+#endif
+""")
+def of_point(A: wp.mat33, q: int, group: int) -> wp.mat33: ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_LANES}
+    wp::mat_t<3, 3, double> B;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(mask, A.data[i][j], base + q * group);
+    return B;
+#else
+    return A;
+#endif
+""")
+def of_point_double(A: mat33, q: int, group: int) -> mat33: ...
+
+
+@wp.func
+def place(t: int, group: int, nworld: int):
+    """Element, point and world of a thread."""
+    blocks = (nworld + group - 1) // group
+    rest = t // (4 * group)
+    return wp.vec3i(rest // blocks, (t // group) % 4, (rest % blocks) * group + t % group)
+
+
+@functools.cache
+def _kernels(corners: int, corotational: bool, precision: Precision, options: tuple) -> types.SimpleNamespace:
+    """Kernels of one kind of element, law and rubber. The corotational law has its own: what the others need
+    would take registers from it."""
+    law_name = "corotational" if corotational else "laws"
+    module = f"{__name__}.{corners}_{law_name}_{precision.name}_{'_'.join(options)}"
+    npoint = 1 if corners == 4 else 4
+    averaged = corners == 10
+    scalar, vec, mat = precision.scalar, precision.vec, precision.mat
+    thin, wide = precision.narrow, precision.widen
+    is_single = precision.name == "single"
+    positions = wp.types.matrix(shape=(3, corners), dtype=real)
+    directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
+    gradients = wp.types.matrix(shape=(corners, 3), dtype=real)
+    thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
+    beyond = [name for name in options if name != "modulus"]
+    uneven = "modulus" in options
+    at = point_functions(options)
+    beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
+
+    @wp.func
+    def rotation(F: mat33):
+        if wp.static(corotational):
+            return polar(F)
+        return mat33()
+
+    @wp.func
+    def rotation_thin(F: mat):
+        if wp.static(corotational and is_single):
+            return polar_single(F)
+        if wp.static(corotational):
+            return polar(F)
+        return mat()
+
+    @wp.func
+    def theta(law: int, F: mat33, R: mat33):
+        if wp.static(corotational):
+            return wp.ddot(R, F) - real(3.0)
+        return dilatation(law, F, R)
+
+    @wp.func
+    def stress_of(
+        rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat33, R: mat33
+    ):
+        """First Piola stress, of the mean dilatation too."""
+        if wp.static(corotational):
+            P = (mu + mu) * (F - R) + (lam * (wp.ddot(R, F) - real(3.0)) + pressure) * R
+        else:
+            P = stress(rubber.law, mu, lam, F, R)
+            if wp.static(averaged):
+                P += pressure * dilatation_gradient(rubber.law, F, R)
+        if wp.static(len(beyond) > 0):
+            P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
+        return P
+
+    @wp.func
+    def direction_of(law: int, F: mat, R: mat):
+        """Derivative of the dilatation."""
+        if wp.static(corotational):
+            return R
+        return thin(dilatation_gradient(law, wide(F), wide(R)))
+
+    @wp.func
+    def change_of(
+        rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, pressure: real, F: mat, R: mat, dF: mat
+    ):
+        """Derivative of the stress along dF at this point's pressure."""
+        if wp.static(corotational):
+            m = scalar(mu)
+            l = scalar(lam)
+            Rt = wp.transpose(R)
+            S = Rt * F
+            A = Rt * dF
+            trace_s = wp.trace(S)
+            turn = vec(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+            dR = R * wp.skew(wp.inverse(trace_s * wp.identity(n=3, dtype=scalar) - S) * turn)
+            dP = (
+                scalar(2.0) * m * (dF - dR)
+                + l * wp.trace(A) * R
+                + (l * (trace_s - scalar(3.0)) + scalar(pressure)) * dR
+            )
+            if wp.static(len(beyond) > 0):
+                dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
+            return dP
+        D = wide(dF)
+        Q = wide(R)
+        G = wide(F)
+        total = stress_derivative(rubber.law, mu, lam, G, Q, D)
+        if wp.static(averaged):
+            total += pressure * dilatation_hessian(rubber.law, G, Q, D)
+        if wp.static(len(beyond) > 0):
+            total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
+        return thin(total)
+
+    @wp.func
+    def share(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
+        """Volume of a point, times the factor on the rubber's modulus there."""
+        if wp.static(uneven):
+            return mesh.weight[e, q] * rubber.modulus[e, w]
+        return mesh.weight[e, q]
+
+    @wp.func
+    def local_lame(mu: real, lam: real, cap: real):
+        if wp.static(averaged):
+            return wp.min(lam, cap * mu)
+        return lam
+
+    @wp.func
+    def narrow_gradients(g: gradients):
+        if wp.static(is_single):
+            out = thin_gradients()
+            for a in range(wp.static(corners)):
+                for c in range(3):
+                    out[a, c] = scalar(g[a, c])
+            return out
+        return g
+
+    if averaged:
+
+        @wp.kernel(module=module, enable_backward=False)
+        def force(
+            # In:
+            group: int,
+            nworld: int,
+            cap: real,
+            rubber: Rubber,
+            mesh: Mesh,
+            x: wp.array2d(dtype=vec3),
+            on: wp.array(dtype=int),
+            # Out:
+            pressure_out: wp.array2d(dtype=real),
+            corner_out: wp.array2d(dtype=vec3),
+            inverted_out: wp.array(dtype=int),
+        ):
+            at = place(wp.tid(), group, nworld)
+            e = at[0]
+            q = at[1]
+            w = at[2]
+            if w >= nworld:
+                return
+            if on[w] == 0:
+                return
+            F = deformation(mesh, e, q, x, w)
+            R = rotation(F)
+            if not wp.static(corotational):
+                if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
+                    inverted_out[w] = 1
+            mu = rubber.mu[w]
+            lam = rubber.lam[w]
+            local = wp.min(lam, cap * mu)
+            pressure = real(0.0)
+            if lam > local:
+                mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
+                pressure = (lam - local) * mean / mesh.volume[e]
+                if q == 0:
+                    pressure_out[e, w] = pressure
+            back = -share(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
+            H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
+            first, second, third = vec3(), vec3(), vec3()
+            for k in range(4):
+                K = of_point_double(H, k, group)
+                first += K * mesh.shape[k, q]
+                second += K * mesh.shape[k, q + 4]
+                third += K * mesh.shape[k, wp.min(q + 8, 9)]
+            corner_out[10 * e + q, w] = first
+            corner_out[10 * e + q + 4, w] = second
+            if q < 2:
+                corner_out[10 * e + q + 8, w] = third
+
+        @wp.func
+        def gradient(mesh: Mesh, e: int, q: int, p: wp.array2d(dtype=wp.vec3), w: int):
+            F = wp.mat33()
+            first = p[mesh.elem[0, e], w]
+            for a in range(1, 10):
+                g = mesh.shape[q, a]
+                F += wp.outer(p[mesh.elem[a, e], w] - first, wp.vec3(float(g[0]), float(g[1]), float(g[2])))
+            return F * narrow(mesh.inverse[e, q])
+
+        @wp.func
+        def corner_force(H: wp.mat33, mesh: Mesh, q: int, a: int):
+            g = mesh.shape[q, a]
+            return H * wp.vec3(float(g[0]), float(g[1]), float(g[2]))
+
+    if averaged and is_single:
+
+        @wp.kernel(module=module, enable_backward=False)
+        def product(
+            # In:
+            group: int,
+            nworld: int,
+            cap: real,
+            rubber: Rubber,
+            mesh: Mesh,
+            x: wp.array2d(dtype=vec3),
+            p: wp.array2d(dtype=wp.vec3),
+            on: wp.array(dtype=int),
+            pressure: wp.array2d(dtype=real),
+            # Out:
+            corner_out: wp.array2d(dtype=wp.vec3),
+        ):
+            at = place(wp.tid(), group, nworld)
+            e = at[0]
+            q = at[1]
+            w = at[2]
+            if w >= nworld:
+                return
+            if on[w] == 0:
+                return
+            F = narrow(deformation(mesh, e, q, x, w))
+            dF = gradient(mesh, e, q, p, w)
+            R = rotation_thin(F)
+            mu = rubber.mu[w]
+            lam = rubber.lam[w]
+            local = wp.min(lam, cap * mu)
+            felt = real(0.0)
+            if lam > local:
+                felt = pressure[e, w]
+            dP = change_of(rubber, e, 4 * e + q, w, mu, local, felt, F, R, dF)
+            if lam > local:
+                G = direction_of(rubber.law, F, R)
+                mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
+                dP += float((lam - local) / mesh.volume[e]) * mean * G
+            H = float(share(rubber, mesh, e, q, w)) * dP * wp.transpose(narrow(mesh.inverse[e, q]))
+            first, second, third = wp.vec3(), wp.vec3(), wp.vec3()
+            for k in range(4):
+                K = of_point(H, k, group)
+                first += corner_force(K, mesh, k, q)
+                second += corner_force(K, mesh, k, q + 4)
+                third += corner_force(K, mesh, k, wp.min(q + 8, 9))
+            corner_out[10 * e + q, w] = first
+            corner_out[10 * e + q + 4, w] = second
+            if q < 2:
+                corner_out[10 * e + q + 8, w] = third
+
+    @wp.kernel(module=module, enable_backward=False)
+    def force_serial(
+        # In:
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        shape: wp.array(dtype=gradients),
+        x: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        # Out:
+        pressure_out: wp.array2d(dtype=real),
+        deformation_out: wp.array2d(dtype=mat33),
+        rotation_out: wp.array2d(dtype=mat33),
+        corner_out: wp.array2d(dtype=vec3),
+        inverted_out: wp.array(dtype=int),
+    ):
+        e, w = wp.tid()
+        if on[w] == 0:
+            return
+        X = positions()
+        for a in range(wp.static(corners)):
+            v = x[mesh.elem[a, e], w]
+            for c in range(3):
+                X[c, a] = v[c]
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        pressure = real(0.0)
+        if wp.static(averaged):
+            if lam > local:
+                mean = real(0.0)
+                for q in range(wp.static(npoint)):
+                    F = X * shape[q] * mesh.inverse[e, q]
+                    mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
+                pressure = (lam - local) * mean / mesh.volume[e]
+                pressure_out[e, w] = pressure
+        C = positions()
+        for q in range(wp.static(npoint)):
+            F = X * shape[q] * mesh.inverse[e, q]
+            if not wp.static(corotational):
+                if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
+                    inverted_out[w] = 1
+            R = rotation(F)
+            if wp.static(not is_single):
+                deformation_out[wp.static(npoint) * e + q, w] = F
+                if wp.static(corotational):
+                    rotation_out[wp.static(npoint) * e + q, w] = R
+            P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, R)
+            C -= (share(rubber, mesh, e, q, w) * P * wp.transpose(mesh.inverse[e, q])) * wp.transpose(
+                shape[q]
+            )
+        for a in range(wp.static(corners)):
+            corner_out[wp.static(corners) * e + a, w] = vec3(C[0, a], C[1, a], C[2, a])
+
+    @wp.func
+    def point_state(
+        e: int,
+        q: int,
+        w: int,
+        X: positions,
+        shape: wp.array(dtype=gradients),
+        mesh: Mesh,
+        kept_deformation: wp.array2d(dtype=mat33),
+        kept_rotation: wp.array2d(dtype=mat33),
+    ):
+        """Deformation gradient and rotation of a point."""
+        i = wp.static(npoint) * e + q
+        if wp.static(is_single):
+            F = thin(X * shape[q] * mesh.inverse[e, q])
+            return F, rotation_thin(F)
+        if wp.static(corotational):
+            return kept_deformation[i, w], kept_rotation[i, w]
+        return kept_deformation[i, w], mat33()
+
+    @wp.kernel(module=module, enable_backward=False)
+    def product_serial(
+        # In:
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        shape: wp.array(dtype=gradients),
+        x: wp.array2d(dtype=vec3),
+        p: wp.array2d(dtype=vec),
+        on: wp.array(dtype=int),
+        pressure: wp.array2d(dtype=real),
+        kept_deformation: wp.array2d(dtype=mat33),
+        kept_rotation: wp.array2d(dtype=mat33),
+        # Out:
+        corner_out: wp.array2d(dtype=vec),
+    ):
+        e, w = wp.tid()
+        if on[w] == 0:
+            return
+        X = positions()
+        D = directions()
+        p0 = p[mesh.elem[0, e], w]
+        for a in range(wp.static(corners)):
+            n = mesh.elem[a, e]
+            d = p[n, w] - p0
+            for c in range(3):
+                D[c, a] = d[c]
+            if wp.static(is_single):
+                v = x[n, w]
+                for c in range(3):
+                    X[c, a] = v[c]
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        felt = real(0.0)
+        stiff = scalar(0.0)
+        if wp.static(averaged):
+            if lam > local:
+                felt = pressure[e, w]
+                mean = scalar(0.0)
+                for q in range(wp.static(npoint)):
+                    B = thin(mesh.inverse[e, q])
+                    F, R = point_state(e, q, w, X, shape, mesh, kept_deformation, kept_rotation)
+                    dF = D * narrow_gradients(shape[q]) * B
+                    mean += scalar(mesh.weight[e, q]) * wp.ddot(direction_of(rubber.law, F, R), dF)
+                stiff = scalar((lam - local) / mesh.volume[e]) * mean
+        C = directions()
+        for q in range(wp.static(npoint)):
+            B = thin(mesh.inverse[e, q])
+            g = narrow_gradients(shape[q])
+            F, R = point_state(e, q, w, X, shape, mesh, kept_deformation, kept_rotation)
+            dF = D * g * B
+            dP = change_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, felt, F, R, dF)
+            if wp.static(averaged):
+                if lam > local:
+                    dP += stiff * direction_of(rubber.law, F, R)
+            C += (scalar(share(rubber, mesh, e, q, w)) * dP * wp.transpose(B)) * wp.transpose(g)
+        for a in range(wp.static(corners)):
+            corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
+
+    @wp.kernel(module=f"{module}.read", enable_backward=False)
+    def cauchy(
+        # In:
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        # Out:
+        cauchy_out: wp.array2d(dtype=mat33),
+        von_mises_out: wp.array2d(dtype=real),
+    ):
+        """Mean Cauchy stress of each element, and the von Mises stress of this mean."""
+        e, w = wp.tid()
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        mean = real(0.0)
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
+        pressure = (lam - local) * mean / mesh.volume[e]
+        sigma = mat33()
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            P = stress_of(rubber, e, wp.static(npoint) * e + q, w, mu, local, pressure, F, rotation(F))
+            part = share(rubber, mesh, e, q, w) / mesh.volume[e] / wp.determinant(F)
+            sigma += part * (P * wp.transpose(F))
+        deviator = sigma - wp.trace(sigma) / real(3.0) * wp.identity(n=3, dtype=real)
+        cauchy_out[e, w] = sigma
+        von_mises_out[e, w] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
+
+    @wp.kernel(module=f"{module}.read", enable_backward=False)
+    def energy(
+        # In:
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        # Out:
+        energy_out: wp.array2d(dtype=real),
+    ):
+        """Elastic energy of each element by its law."""
+        e, w = wp.tid()
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        mean = real(0.0)
+        total = real(0.0)
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            R = rotation(F)
+            mean += mesh.weight[e, q] * theta(rubber.law, F, R)
+            total += share(rubber, mesh, e, q, w) * energy_density(rubber.law, mu, local, F, R)
+        factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
+        energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
+
+    found = {
+        "force_serial": force_serial,
+        "product_serial": product_serial,
+        "cauchy": cauchy,
+        "energy": energy,
+    }
+    if averaged and is_single:
+        found |= {"force": force, "product": product}
+    return types.SimpleNamespace(gradients=gradients, **found)
+
+
+@wp.kernel
+def flag_inside_out(
+    # In:
+    mesh: Mesh,
+    x: wp.array2d(dtype=vec3),
+    asked: wp.array(dtype=int),
+    # Out:
+    failed_out: wp.array(dtype=int),
+):
+    """Marks worlds with an integration point whose determinant is not positive."""
+    e, q, w = wp.tid()
+    if asked[w] == 1 and not (wp.determinant(deformation(mesh, e, q, x, w)) > real(0.0)):
+        failed_out[w] = 1
+
+
+class ElementForces:
+    """The elements of all worlds: their forces by corners, and tangent times a direction.
+
+    Args:
+      elements: Tetrahedra.
+      rubber: `points.Rubber` of all worlds.
+      options: what the rubber has beyond its law, see `points.point_functions`.
+      precision: of directions.
+
+    Attributes:
+      start, slot: CSR lists of the corners of each node.
+      corner_force, corner: what `push_corners` and `multiply_corners` wrote last [slot, world] [N].
+    """
+
+    def __init__(self, elements, rubber: Rubber, options: tuple[str, ...], precision: Precision):
+        self._elements, self._rubber, self.device = elements, rubber, elements.device
+        self._nworld, self._count = len(rubber.mu), elements.nelem
+        self.start, self.slot = elements.start, elements.slot
+        self._by_point = elements.npoint == 4 and self.device.is_cuda
+        self._kernels = _kernels(elements.corners, elements.law == 0, precision, options)
+        group = _ABREAST if self._nworld >= _ABREAST else 1
+        self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
+        self._block_dim = 256 if self._nworld >= _ABREAST else 64
+        corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
+        with wp.ScopedDevice(self.device):
+            shape = np.ascontiguousarray(elements.mesh.shape.numpy())
+            self._shape = wp.array(shape, dtype=self._kernels.gradients)
+            self._pressure = wp.zeros((self._count if averaged else 0, self._nworld), dtype=real)
+            kept = elements.npoint * self._count if precision.name == "double" else 0
+            self._deformation = wp.zeros((kept, self._nworld), dtype=mat33)
+            self._rotation = wp.zeros((kept if elements.law == 0 else 0, self._nworld), dtype=mat33)
+            self.corner_force = wp.zeros(corners, dtype=vec3)
+            self.corner = wp.zeros(corners, dtype=precision.vec)
+
+    def push_corners(self, program: Launcher, x, on, inverted) -> None:
+        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
+        bear the deformation."""
+        kept = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
+
+    def multiply_corners(self, program: Launcher, x, p, on) -> None:
+        """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
+        kept = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
+
+    def refuse_inverted(self, program: Launcher, x, asked, failed) -> None:
+        """Marks worlds with an inverted element at x."""
+        dim = (self._count, self._elements.npoint, self._nworld)
+        program.launch(flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
+
+    def stress(self, x, rubber: Rubber) -> tuple[wp.array, wp.array]:
+        """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
+        dim = (self._count, self._nworld)
+        outputs = [
+            wp.zeros(dim, dtype=mat33, device=self.device),
+            wp.zeros(dim, dtype=real, device=self.device),
+        ]
+        inputs = [self._elements.cap, rubber, self._elements.mesh, x]
+        wp.launch(self._kernels.cauchy, dim, inputs, outputs, device=self.device)
+        return outputs[0], outputs[1]
+
+    def energy(self, x) -> np.ndarray:
+        """(nelem, nworld) elastic energy of each element by its law [J]."""
+        out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
+        wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
+        return out.numpy()
+
+    def _launch(self, program, which, inputs, outputs):
+        constants = [self._elements.cap, self._rubber, self._elements.mesh]
+        if self._by_point:
+            inputs = [self._group, self._nworld, *constants, *inputs]
+            program.launch(getattr(self._kernels, which), self._threads, inputs, outputs, self._block_dim)
+        else:
+            kernel = getattr(self._kernels, which + "_serial")
+            inputs = [*constants, self._shape, *inputs]
+            program.launch(kernel, (self._count, self._nworld), inputs, outputs)

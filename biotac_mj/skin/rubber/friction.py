@@ -1,0 +1,93 @@
+"""Rubber with internal friction: loading and unloading differ at any speed, as Prandtl and Ishlinskii's
+friction elements beside the law.
+
+Every branch is a spring (shear modulus g mu) in series with a friction element that slips when the spring's
+von Mises equivalent strain is `strain`. Within a step it has the potential
+
+    min over E'  of   g mu |dev(A - E')|^2  +  2 g mu r |E' - E_p|,         r = sqrt(3/2) strain
+
+of the strain A, with E_p the slip when the last step ended (Simo and Hughes 1998, ch. 1-3: radial return is
+its minimum). So its stress Q = 2 g mu dev(A - E') has at most the size 2 g mu r, its tangent is symmetric and
+exact, slip only dissipates, and nothing depends on time. A is the strain of Green and Lagrange, of
+neo_hookean the isochoric one, (J^(-2/3) F^T F - I) / 2, of linear the small strain; Q is the second Piola
+stress that belongs to it and turns with the body."""
+
+import warp as wp
+
+from ..types import mat33, real
+
+__all__ = ["deviator", "held", "push_forward", "push_forward_change", "strain", "strain_change"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def deviator(A: mat33):
+    return A - wp.trace(A) / real(3.0) * wp.identity(n=3, dtype=real)
+
+
+@wp.func
+def symmetric(A: mat33):
+    return real(0.5) * (A + wp.transpose(A))
+
+
+@wp.func
+def strain(law: int, F: mat33):
+    """The strain A, whose deviator counts."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 3:
+        return symmetric(F) - eye
+    C = wp.transpose(F) * F
+    if law == 2:
+        C = wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * C
+    return real(0.5) * (C - eye)
+
+
+@wp.func
+def strain_change(law: int, F: mat33, dF: mat33):
+    """Directional derivative of `strain`."""
+    if law == 3:
+        return symmetric(dF)
+    dE = symmetric(wp.transpose(F) * dF)
+    if law == 2:
+        third = wp.ddot(wp.transpose(wp.inverse(F)), dF) / real(3.0)
+        return wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * (dE - third * wp.transpose(F) * F)
+    return dE
+
+
+@wp.func
+def push_forward(law: int, F: mat33, Q: mat33):
+    """First Piola stress P of Q: P : dF = Q : dA."""
+    if law == 3:
+        return Q
+    P = F * Q
+    if law == 2:
+        third = wp.ddot(F, P) / real(3.0)  # Q : C
+        return wp.pow(wp.determinant(F), -real(2.0) / real(3.0)) * (P - third * wp.transpose(wp.inverse(F)))
+    return P
+
+
+@wp.func
+def push_forward_change(law: int, F: mat33, Q: mat33, dF: mat33, dQ: mat33):
+    """Directional derivative of `push_forward`."""
+    if law == 3:
+        return dQ
+    dP = dF * Q + F * dQ
+    if law == 2:
+        G = wp.transpose(wp.inverse(F))
+        P = F * Q
+        third = wp.ddot(F, P) / real(3.0)
+        change = (wp.ddot(dF, P) + wp.ddot(F, dP)) / real(3.0)
+        a = wp.pow(wp.determinant(F), -real(2.0) / real(3.0))
+        da = -real(2.0) / real(3.0) * a * wp.ddot(G, dF)
+        return a * (dP - change * G + third * G * wp.transpose(dF) * G) + da * (P - third * G)
+    return dP
+
+
+@wp.func
+def held(T: mat33, most: real):
+    """Share of a trial strain T that does not slip: radial return to the size `most`."""
+    size = wp.sqrt(wp.ddot(T, T))
+    if size > most:
+        return most / size
+    return real(1.0)

@@ -1,0 +1,207 @@
+"""Hyperelastic laws: energy density, first Piola-Kirchhoff stress, its directional derivative; rotations.
+
+The four laws take the same two Lame-like constants and differ in the energy W(F):
+
+  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar decomposition
+  svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2       Saint Venant-Kirchhoff
+  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and CalculiX
+  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not invariant to rotation
+"""
+
+import warp as wp
+
+from ..types import mat33, narrow, real, vec3, widen
+
+__all__ = [
+    "LAWS",
+    "dilatation",
+    "dilatation_gradient",
+    "dilatation_hessian",
+    "energy_density",
+    "polar",
+    "polar_single",
+    "stress",
+    "stress_derivative",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
+
+
+@wp.func
+def axial(A: mat33):
+    """Twice the axial vector of the skew part of A."""
+    return wp.vec3d(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+
+
+@wp.func
+def turn_towards(F: wp.mat33):
+    """The rotation with the largest trace of R^T F, turned there step by step (Mueller et al. 2016): F may be
+    inverted or flat.
+
+    In few registers: the rare case must not slow the usual one.
+    """
+    q = wp.quat_identity(float)
+    for _ in range(60):
+        R = wp.quat_to_matrix(q)
+        turn = wp.vec3()
+        along = float(1.0e-9)
+        for c in range(3):
+            r = wp.vec3(R[0, c], R[1, c], R[2, c])
+            f = wp.vec3(F[0, c], F[1, c], F[2, c])
+            turn += wp.cross(r, f)
+            along += wp.dot(r, f)
+        turn = turn / wp.abs(along)
+        angle = wp.length(turn)
+        if angle < 1.0e-7:
+            break
+        q = wp.normalize(wp.quat_from_axis_angle(turn / angle, angle) * q)
+    return wp.quat_to_matrix(q)
+
+
+@wp.func
+def polar_single(F: wp.mat33):
+    """Rotation of the polar decomposition in single precision, by Newton's iteration where that is safe."""
+    if wp.determinant(F) < 1.0e-3:
+        return turn_towards(F)
+    X = F
+    for _ in range(12):
+        Y = 0.5 * (X + wp.transpose(wp.inverse(X)))
+        change = wp.ddot(Y - X, Y - X)
+        X = Y
+        if change < 1.0e-8:  # the next error is the square of this one
+            break
+    return X
+
+
+@wp.func
+def polar(F: mat33):
+    """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal, then turned by what is
+    left (error squared)."""
+    R = widen(polar_single(narrow(F)))
+    eye = wp.identity(n=3, dtype=real)
+    R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
+    S = wp.transpose(R) * F
+    # what is left is 1e-7: single precision gives the rest of its digits
+    s = narrow(S)
+    a = axial(S)
+    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * wp.vec3(
+        float(a[0]), float(a[1]), float(a[2])
+    )
+    return R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
+
+
+@wp.func
+def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
+    """W(F) [J/m^3]; for neo_hookean `lam` is the bulk modulus."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        tr = wp.trace(wp.transpose(R) * F) - real(3.0)
+        return mu * wp.ddot(F - R, F - R) + real(0.5) * lam * tr * tr
+    if law == 1:
+        E = real(0.5) * (wp.transpose(F) * F - eye)
+        return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
+    if law == 2:
+        J = wp.determinant(F)
+        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(
+            0.5
+        ) * lam * (J - real(1.0)) * (J - real(1.0))
+    e = real(0.5) * (F + wp.transpose(F)) - eye
+    return real(0.5) * lam * wp.trace(e) * wp.trace(e) + mu * wp.ddot(e, e)
+
+
+@wp.func
+def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
+    """First Piola-Kirchhoff stress P = dW/dF [Pa]."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        return real(2.0) * mu * (F - R) + lam * (wp.trace(wp.transpose(R) * F) - real(3.0)) * R
+    if law == 1:
+        E = real(0.5) * (wp.transpose(F) * F - eye)
+        return F * (lam * wp.trace(E) * eye + real(2.0) * mu * E)
+    if law == 2:
+        J = wp.determinant(F)
+        G = wp.transpose(wp.inverse(F))
+        return (
+            mu * wp.pow(J, -real(2.0) / real(3.0)) * (F - wp.ddot(F, F) / real(3.0) * G)
+            + lam * (J - real(1.0)) * J * G
+        )
+    e = real(0.5) * (F + wp.transpose(F)) - eye
+    return lam * wp.trace(e) * eye + real(2.0) * mu * e
+
+
+@wp.func
+def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33):
+    """Directional derivative of the stress, dP = (d2W/dF2) : dF [Pa]."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        Rt = wp.transpose(R)
+        S = Rt * F
+        A = Rt * dF
+        trace_s = wp.trace(S)
+        w = wp.inverse(trace_s * eye - S) * axial(A)
+        dR = R * wp.skew(w)
+        return real(2.0) * mu * (dF - dR) + lam * (wp.trace(A) * R + (trace_s - real(3.0)) * dR)
+    if law == 1:
+        Ft = wp.transpose(F)
+        E = real(0.5) * (Ft * F - eye)
+        A = Ft * dF
+        dE = real(0.5) * (A + wp.transpose(A))
+        return dF * (lam * wp.trace(E) * eye + real(2.0) * mu * E) + F * (
+            lam * wp.trace(dE) * eye + real(2.0) * mu * dE
+        )
+    if law == 2:
+        J = wp.determinant(F)
+        G = wp.transpose(wp.inverse(F))
+        a = wp.pow(J, -real(2.0) / real(3.0))
+        GdF = wp.ddot(G, dF)
+        dG = -G * wp.transpose(dF) * G
+        I1 = wp.ddot(F, F) / real(3.0)
+        iso = a * (dF - real(2.0) / real(3.0) * wp.ddot(F, dF) * G - I1 * dG) - real(2.0) / real(
+            3.0
+        ) * a * GdF * (F - I1 * G)
+        return mu * iso + lam * J * ((real(2.0) * J - real(1.0)) * GdF * G + (J - real(1.0)) * dG)
+    de = real(0.5) * (dF + wp.transpose(dF))
+    return lam * wp.trace(de) * eye + real(2.0) * mu * de
+
+
+@wp.func
+def dilatation(law: int, F: mat33, R: mat33):
+    """The measure theta of volume change that multiplies `lam` in the energy: W = W(lam = 0) + lam/2
+    theta^2."""
+    eye = wp.identity(n=3, dtype=real)
+    if law == 0:
+        return wp.trace(wp.transpose(R) * F) - real(3.0)
+    if law == 1:
+        return real(0.5) * (wp.ddot(F, F) - real(3.0))
+    if law == 2:
+        return wp.determinant(F) - real(1.0)
+    return wp.trace(F - eye)
+
+
+@wp.func
+def dilatation_gradient(law: int, F: mat33, R: mat33):
+    """d theta / dF."""
+    if law == 0:
+        return R
+    if law == 1:
+        return F
+    if law == 2:
+        return wp.determinant(F) * wp.transpose(wp.inverse(F))
+    return wp.identity(n=3, dtype=real)
+
+
+@wp.func
+def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
+    """Directional derivative of `dilatation_gradient`, (d2 theta / dF2) : dF."""
+    if law == 0:
+        Rt = wp.transpose(R)
+        S = Rt * F
+        return R * wp.skew(wp.inverse(wp.trace(S) * wp.identity(n=3, dtype=real) - S) * axial(Rt * dF))
+    if law == 1:
+        return dF
+    if law == 2:
+        G = wp.transpose(wp.inverse(F))
+        return wp.determinant(F) * (wp.ddot(G, dF) * G - G * wp.transpose(dF) * G)
+    return mat33()

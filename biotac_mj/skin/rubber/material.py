@@ -1,0 +1,163 @@
+"""What the skin is made of: constants of its rubber, presets."""
+
+import dataclasses
+import math
+
+from .law import LAWS
+
+__all__ = ["ELEMENTS", "PRESETS", "Material", "material"]
+
+ELEMENTS = ("linear", "quadratic")
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """What the skin is made of.
+
+    Attributes:
+      law: "corotational", "svk", "neo_hookean" or "linear".
+      youngs_modulus: E [Pa].
+      poissons_ratio: nu, inside (-1, 0.5).
+      friction: Coulomb coefficient against the touching geoms.
+      density: [kg/m^3]; used by implicit dynamics only.
+      liquid: whether the preset fills the space between skin and core with the liquid.
+      element: what the preset is solved with, "linear" or "quadratic"; None: what the geometry has, see
+        `SkinOptions`.
+      prony: ((g, tau [s]), ...) of stress relaxation, G(t) = G (1 + sum g exp(-t / tau)): E is the long-term
+        modulus. Steps need their dt.
+      mullins: (r, m [J/m^3], beta) of Ogden and Roxburgh's softening, or None; see `points`.
+      hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus
+        that slips at this von Mises strain, see `friction`.
+      stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four:
+        CPU, full tier.
+
+    Raises:
+      ValueError: unknown law, or a constant out of its range or not finite.
+    """
+
+    law: str = "corotational"
+    youngs_modulus: float = 1.55223093e6
+    poissons_ratio: float = 0.31645428
+    friction: float = 0.783414394
+    density: float = 1000.0
+    liquid: bool = True
+    element: str | None = None
+    prony: tuple = ()
+    mullins: tuple | None = None
+    hysteresis: tuple = ()
+    stiffening: float = 0.0
+
+    def __post_init__(self):
+        self._check_memory()
+        self._check_hysteresis()
+        if self.law not in LAWS:
+            raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
+        if self.element not in (None, *ELEMENTS):
+            raise ValueError(
+                f"unknown element {self.element!r}: choose one of {', '.join(ELEMENTS)}, or None for the "
+                "geometry's"
+            )
+        for name in ("youngs_modulus", "poissons_ratio", "friction", "density", "stiffening"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
+        if self.youngs_modulus <= 0 or self.density <= 0:
+            raise ValueError(
+                f"Young's modulus {self.youngs_modulus} Pa and density {self.density} kg/m^3 must be positive"
+            )
+        if not -1 < self.poissons_ratio < 0.5:
+            raise ValueError(
+                f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber "
+                "needs nu below 0.5, "
+                "the liquid's volume constraint does the rest"
+            )
+        if self.friction < 0:
+            raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
+
+    def _check_memory(self):
+        try:  # lists, as YAML and JSON give them, become tuples: a material is a key
+            object.__setattr__(self, "prony", tuple((float(g), float(tau)) for g, tau in self.prony))
+            if self.mullins is not None:
+                r, m, beta = (float(v) for v in self.mullins)
+                object.__setattr__(self, "mullins", (r, m, beta))
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and (r, m, "
+                "beta) or None"
+            ) from None  # noqa: E501
+        for g, tau in self.prony:
+            if not (math.isfinite(g) and g >= 0 and math.isfinite(tau) and tau > 0):
+                raise ValueError(
+                    f"a Prony term of g {g} and tau {tau} s: g must be >= 0 and tau positive, else energy "
+                    "would come from nothing"
+                )  # noqa: E501
+        if self.mullins is not None and not (r > 1 and m > 0 and beta >= 0 and math.isfinite(r + m + beta)):
+            raise ValueError(
+                f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0"
+            )
+
+    def _check_hysteresis(self):
+        try:
+            object.__setattr__(
+                self, "hysteresis", tuple((float(g), float(strain)) for g, strain in self.hysteresis)
+            )
+        except (TypeError, ValueError):
+            raise ValueError(f"hysteresis is {self.hysteresis!r}: pass ((g, strain), ...)") from None
+        for g, strain in self.hysteresis:
+            if not (math.isfinite(g) and g >= 0 and math.isfinite(strain) and strain > 0):
+                raise ValueError(
+                    f"a friction element of g {g} and strain {strain}: g must be >= 0 and the strain at "
+                    "which it slips positive"
+                )
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the stress depends on the past."""
+        return bool(self.prony or self.hysteresis) or self.mullins is not None
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """Names of what is in use beyond the law, of prony, mullins, hysteresis, stiffening."""
+        names = ("prony", "mullins", "hysteresis", "stiffening")
+        return tuple(name for name in names if getattr(self, name) not in ((), None, 0.0))
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poissons_ratio))
+
+    @property
+    def lame(self) -> float:
+        """Lame's first constant lambda [Pa]."""
+        return (
+            self.youngs_modulus
+            * self.poissons_ratio
+            / ((1 + self.poissons_ratio) * (1 - 2 * self.poissons_ratio))
+        )
+
+    @property
+    def bulk(self) -> float:
+        """Bulk modulus kappa [Pa]."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poissons_ratio))
+
+
+# Narang et al., ICRA 2021: the constants that they fitted for Isaac Gym ("paper") and for ANSYS ("ansys", on
+# elements that do not lock: nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is
+# squeezed on the core; "rubber": nu 0.45, as the reference solutions). "paper" keeps to linear tetrahedra:
+# the stiffness of its mesh is in the fitted modulus.
+PRESETS = {
+    "default": Material(),
+    "paper": Material(liquid=False, element="linear"),
+    "rubber": Material("neo_hookean", 2.80e5, 0.45, 0.186),
+    "ansys": Material("neo_hookean", 2.80e5, 0.499, 0.186, element="quadratic"),
+}
+
+
+def material(choice) -> Material:
+    """A preset's name or a Material, as a Material; ValueError names the presets."""
+    if isinstance(choice, Material):
+        return choice
+    if choice not in PRESETS:
+        raise ValueError(
+            f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, or pass a Material"
+        )
+    return PRESETS[choice]

@@ -1,0 +1,280 @@
+"""What the points of a skin remember from step to step: overstresses, the largest energy so far, the slip of
+friction elements. See `points` for the equations."""
+
+import functools
+import types
+
+import numpy as np
+import warp as wp
+
+from ..types import mat33, real, vec3
+from .friction import deviator, held, strain
+from .law import polar
+from .points import Mesh, Rubber, deformation, point_functions
+
+__all__ = ["RubberMemory", "rubber_of_worlds"]
+
+wp.set_module_options({"enable_backward": False})
+
+# six numbers of a symmetric 3 x 3, and back
+_ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
+
+@wp.func
+def pull_back(law: int, F: mat33, P: mat33):
+    """Second Piola stress of the first."""
+    if law == 3:
+        return P
+    S = wp.inverse(F) * P
+    return real(0.5) * (S + wp.transpose(S))
+
+
+@wp.func
+def share_of_term(term: wp.vec2d, dt: real):
+    """g h of a term of the series: what a step of the stress adds to its overstress."""
+    a = dt / term[1]
+    if a < real(1.0e-4):  # where the difference would lose digits, its series
+        return term[0] * (real(1.0) - a * (real(0.5) - a / real(6.0)))
+    return term[0] * (real(1.0) - wp.exp(-a)) / a
+
+
+@wp.kernel
+def begin_worlds(
+    # In:
+    rubber: Rubber,
+    dt: wp.array(dtype=real),
+    # In and out:
+    softness: wp.array(dtype=real),
+):
+    """The gain of this step; what is as stiff as the rubber before its history counts."""
+    w = wp.tid()
+    stiff = real(1.0)
+    if rubber.prony.shape[0] > 0:
+        gain = real(0.0)
+        for k in range(rubber.prony.shape[0]):
+            gain += share_of_term(rubber.prony[k, w], dt[w])
+        rubber.gain[w] = gain
+        stiff += gain
+    for b in range(rubber.branch.shape[0]):
+        stiff += rubber.branch[b, w][0]
+    softness[w] = softness[w] / stiff
+
+
+@wp.kernel
+def begin_points(rubber: Rubber, dt: wp.array(dtype=real)):
+    i, w = wp.tid()
+    H = -rubber.gain[w] * rubber.last[i, w]
+    for k in range(rubber.prony.shape[0]):
+        H += wp.exp(-dt[w] / rubber.prony[k, w][1]) * rubber.overstress[k, i, w]
+    rubber.past[i, w] = H
+
+
+@functools.cache
+def _kernels(options) -> types.SimpleNamespace:
+    module = f"{__name__}.{'_'.join(options)}"
+    at = point_functions(options)
+    has = {name: name in options for name in ("prony", "mullins", "hysteresis")}
+
+    @wp.func
+    def settled(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+        """Second Piola stress that relaxes, of a point that has borne this much."""
+        R = mat33()
+        if rubber.law == 0:
+            R = polar(F)
+        S = pull_back(rubber.law, F, at.remembered(rubber, e, w, mu, lam, F, R))
+        if wp.static(has["mullins"]):
+            W = at.remembered_energy(rubber, e, w, mu, lam, F, R)
+            S *= at.softening(rubber, e, w, W, worst)[0]
+        return S
+
+    @wp.func
+    def borne(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, worst: real):
+        """The largest energy density with the present one."""
+        if wp.static(not has["mullins"]):
+            return worst
+        R = mat33()
+        if rubber.law == 0:
+            R = polar(F)
+        return wp.max(worst, at.remembered_energy(rubber, e, w, mu, lam, F, R))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def commit(
+        # In:
+        cap: real,
+        mesh: Mesh,
+        rubber: Rubber,
+        x: wp.array2d(dtype=vec3),
+        dt: wp.array(dtype=real),
+        failed: wp.array(dtype=int),
+    ):
+        """Takes over the step that has ended at x; worlds that failed keep their past."""
+        e, q, w = wp.tid()
+        if failed[w] == 1:
+            return
+        i = mesh.weight.shape[1] * e + q
+        F = deformation(mesh, e, q, x, w)
+        mu = rubber.mu[w]
+        lam = wp.min(rubber.lam[w], cap * mu)
+        if wp.static(has["prony"] or has["mullins"]):
+            worst = borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
+            S = settled(rubber, e, w, mu, lam, F, worst)
+            for k in range(rubber.prony.shape[0]):
+                term = rubber.prony[k, w]
+                Q = wp.exp(-dt[w] / term[1]) * rubber.overstress[k, i, w]
+                rubber.overstress[k, i, w] = Q + share_of_term(term, dt[w]) * (S - rubber.last[i, w])
+            rubber.last[i, w] = S
+            rubber.worst[i, w] = worst
+        if wp.static(has["hysteresis"]):
+            A = strain(rubber.law, F)
+            for b in range(rubber.branch.shape[0]):
+                E = rubber.slip[b, i, w]
+                T = deviator(A - E)
+                rubber.slip[b, i, w] = E + (real(1.0) - held(T, rubber.branch[b, w][1])) * T
+
+    @wp.kernel(module=module, enable_backward=False)
+    def forget(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3), mask: wp.array(dtype=bool)):
+        """Makes x the relaxed and virgin state, friction without stress there."""
+        e, q, w = wp.tid()
+        if not mask[w]:
+            return
+        i = mesh.weight.shape[1] * e + q
+        F = deformation(mesh, e, q, x, w)
+        mu = rubber.mu[w]
+        lam = wp.min(rubber.lam[w], cap * mu)
+        if wp.static(has["prony"] or has["mullins"]):
+            worst = borne(rubber, e, w, mu, lam, F, real(0.0))
+            rubber.worst[i, w] = worst
+            rubber.last[i, w] = settled(rubber, e, w, mu, lam, F, worst)
+            for k in range(rubber.prony.shape[0]):
+                rubber.overstress[k, i, w] = mat33()
+        for b in range(rubber.branch.shape[0]):
+            rubber.slip[b, i, w] = deviator(strain(rubber.law, F))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def recall(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3)):
+        """The stress that relaxes, at x, where the last step ended."""
+        e, q, w = wp.tid()
+        i = mesh.weight.shape[1] * e + q
+        F = deformation(mesh, e, q, x, w)
+        mu = rubber.mu[w]
+        lam = wp.min(rubber.lam[w], cap * mu)
+        rubber.last[i, w] = settled(
+            rubber, e, w, mu, lam, F, borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
+        )
+
+    return types.SimpleNamespace(commit=commit, forget=forget, recall=recall)
+
+
+def rubber_of_worlds(model, materials, modulus) -> Rubber:
+    """The constants of `materials`, one for each world, as `Rubber` on the model's device, without memory.
+
+    Args:
+      modulus: (nelem, nworld) factors on Young's modulus, or None.
+    """
+    n = len(materials)
+    second = [m.bulk if m.law == "neo_hookean" else m.lame for m in materials]
+    rubber = Rubber()
+    rubber.law = model.law
+    with wp.ScopedDevice(model.device):
+        rubber.mu = wp.array([m.mu for m in materials], dtype=real)
+        rubber.lam = wp.array(second, dtype=real)
+        none = np.zeros((0, n))
+        rubber.modulus = wp.array(none if modulus is None else modulus, dtype=real, ndim=2)
+        prony = np.array([m.prony for m in materials], float).reshape(n, -1, 2)
+        branch = np.array([m.hysteresis for m in materials], float).reshape(n, -1, 2) * [1, 1.5**0.5]
+        rubber.prony = _by_world(prony, wp.vec2d)
+        rubber.branch = _by_world(branch, wp.vec2d)
+        mullins = [m.mullins or (0.0, 0.0, 0.0) for m in materials]
+        rubber.mullins = wp.array(mullins, dtype=vec3)
+        rubber.stiffening = wp.array([m.stiffening for m in materials], dtype=real)
+    return rubber
+
+
+def _by_world(table, dtype):
+    """(nworld, k, 2) as [k, world] of vectors."""
+    if not table.shape[1]:
+        return wp.zeros((0, len(table)), dtype=dtype)
+    return wp.array(np.ascontiguousarray(np.swapaxes(table, 0, 1)), dtype=dtype, ndim=2)
+
+
+class RubberMemory:
+    """Memory of the points of every world.
+
+    Made by `SkinData` where the model's material has `prony`, `mullins` or `hysteresis`.
+
+    Args:
+      model: SkinModel; rubber: its constants, to which the arrays of memory are added.
+    """
+
+    def __init__(self, model, rubber: Rubber, options: tuple[str, ...]):
+        self._model, self.rubber, self.options = model, rubber, options
+        elements, nworld = model.elements, len(rubber.mu)
+        self.npoint, self._dim = elements.npoint * elements.nelem, (elements.nelem, elements.npoint, nworld)
+        timed, soft = rubber.prony.shape[0], "mullins" in options
+        points = (self.npoint, nworld)
+        settles = points if timed or soft else (0, nworld)
+        with wp.ScopedDevice(model.device):
+            rubber.gain = wp.zeros(nworld, dtype=real)
+            rubber.past = wp.zeros(points if timed else (0, nworld), dtype=mat33)
+            rubber.overstress = wp.zeros((timed, *points), dtype=mat33)
+            rubber.last, rubber.worst = wp.zeros(settles, dtype=mat33), wp.zeros(settles, dtype=real)
+            rubber.slip = wp.zeros((rubber.branch.shape[0], *points), dtype=mat33)
+            self._all = wp.full(nworld, True, dtype=bool)
+        self._kernels = _kernels(options)
+
+    def begin_step(self, program, dt, softness):
+        """Prepares a step; softness (nworld,) of the preconditioner becomes that of this step."""
+        program.launch(begin_worlds, len(softness), [self.rubber, dt], [softness])
+        if self.rubber.prony.shape[0]:
+            program.launch(begin_points, self.rubber.past.shape, [self.rubber, dt])
+
+    def commit_step(self, program, x, dt, failed):
+        """Takes over the step that has ended at x in the worlds that did not fail."""
+        program.launch(self._kernels.commit, self._dim, [*self._constants, x, dt, failed])
+
+    def forget(self, x, mask=None):
+        """Makes x [nvert, nworld] the relaxed and virgin state, of the worlds of mask (nworld,) bool."""
+        self._launch(self._kernels.forget, [x, self._all if mask is None else mask])
+
+    def at_present(self) -> Rubber:
+        """The rubber between steps: what it remembers is a stress, and time stands still."""
+        now, rubber = Rubber(), self.rubber
+        for name in Rubber.vars:
+            setattr(now, name, getattr(rubber, name))
+        now.gain = wp.zeros_like(rubber.gain)
+        if len(rubber.past):
+            now.past = wp.clone(rubber.past)
+            now.past.assign(rubber.overstress.numpy().sum(0))
+        return now
+
+    @staticmethod
+    def size(material, npoint: int) -> int:
+        """Doubles of one world's memory."""
+        return (6 * len(material.prony) + 6 * len(material.hysteresis) + 1) * npoint
+
+    def state(self) -> np.ndarray:
+        """(size,) memory of the first world, to be saved."""
+        parts = [
+            a.numpy()[:, :, 0][..., _ROW, _COLUMN].ravel() for a in (self.rubber.overstress, self.rubber.slip)
+        ]
+        worst = self.rubber.worst.numpy()[:, 0] if len(self.rubber.worst) else np.zeros(self.npoint)
+        return np.concatenate([*parts, worst])
+
+    def load(self, state, x):
+        """Sets the memory of a single world that is at x (Warp, [nvert, 1]); the inverse of `state`."""
+        n, rubber = self.npoint, self.rubber
+        parts = np.asarray(state[:-n]).reshape(-1, n, 6)[..., _WHOLE].reshape(-1, n, 1, 3, 3)
+        timed = rubber.overstress.shape[0]
+        for array, value in ((rubber.overstress, parts[:timed]), (rubber.slip, parts[timed:])):
+            if array.size:
+                array.assign(np.ascontiguousarray(value))
+        if rubber.worst.size:
+            rubber.worst.assign(np.ascontiguousarray(state[-n:, None]))
+            self._launch(self._kernels.recall, [x])
+
+    @property
+    def _constants(self):
+        return [self._model.elements.cap, self._model.elements.mesh, self.rubber]
+
+    def _launch(self, kernel, inputs):
+        wp.launch(kernel, self._dim, [*self._constants, *inputs], device=self._model.device)

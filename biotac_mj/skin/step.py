@@ -1,0 +1,579 @@
+"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate
+gradients.
+
+    step(model, data, geoms, dt)               # poses that were set in, positions and wrenches out
+
+A step is launches alone, with loops and branches between them that look at flags on the device (`program`): a
+recorded list on the CPU, one captured graph on CUDA, alone or inside the caller's own graph:
+
+    prepare_step(model, data, geoms)           # allocates and compiles; then, inside a capture or without one:
+    launch_step(model, data, geoms)
+
+Everything that changes between steps is read from device arrays: poses and frictions `geoms.struct.pos, .mat,
+.friction` [geom, world], materials `data.rubber`, laws of contact `data.laws.struct`, the liquids
+`data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos, .frame_mat`
+(implicit dynamics). Overwrite them, then step.
+
+A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its last
+good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do not
+notice. Worlds that are done idle inside the loops.
+"""
+
+import functools
+import weakref
+
+import numpy as np
+import warp as wp
+from threadpoolctl import ThreadpoolController
+
+from . import liquid
+from .contact import faces, limits
+from .data import SkinData
+from .geoms import GeomSet
+from .model import SkinModel
+from .newton import krylov, nodes, worlds
+from .precondition.dense import FEW, THREADS_FEW
+from .program import Launcher, Program
+from .types import mat33, real, vec3
+
+__all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
+
+_WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
+
+
+@functools.cache
+def _blas():
+    return ThreadpoolController()
+
+
+def step(
+    model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None
+) -> None:
+    """Advances every world to the balance of forces with the geoms where they are now.
+
+    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted
+    in `data.nonconverged` and flagged in `data.converged`.
+
+    Args:
+      model, data: the skin.
+      geoms: touching geoms, poses in the BioTac frame at the end of the step.
+      dt: time step [s]; needed by implicit dynamics and by skin with a Prony series.
+      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of the
+        step, for the inertia of implicit dynamics; None means that it does not move.
+
+    Raises:
+      ValueError: a geom deep inside the rigid core, geoms of another number of worlds, adhesion that reaches
+        further than a mesh geom's distance is known, or a time step that is missing or not positive.
+    """
+    ready = prepare_step(model, data, geoms)
+    _set_time(model, data, dt, core_pos, core_mat)
+    data.laws.refuse_coarse_grids(geoms)
+    # matrices of a few hundred rows: more threads of BLAS only wait for each other
+    with _blas().limit(limits=1, user_api="blas"):
+        ready.run()
+    if model.has_core and geoms.count and (data.worlds.reason.numpy() == worlds.INSIDE_CORE).any():
+        _refuse_core(model, geoms)
+
+
+def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep":
+    """Allocates and compiles what `launch_step` needs; again only where the model's options or the geoms are
+    others.
+
+    Raises:
+      ValueError: geoms of another number of worlds, or called first while a graph is captured.
+    """
+    if geoms.nworld != data.nworld:
+        raise ValueError(
+            f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number"
+        )
+    key = (id(geoms), model.options)
+    if key not in data.steps:
+        if model.device.is_cuda and model.device.is_capturing:
+            raise ValueError(
+                "the step is not ready: call prepare_step(model, data, geoms) before the capture begins"
+            )
+        data.steps[key] = SkinStep(model, data, geoms)
+    return data.steps[key]
+
+
+def launch_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> None:
+    """Launches a step of every world on the device's current stream: for use inside a captured graph, or without
+    one.
+
+    Takes the poses from `geoms.struct` as they are when it runs. Raises what `prepare_step` raises.
+    """
+    prepare_step(model, data, geoms).launch()
+
+
+def _set_time(model, data, dt, core_pos, core_mat):
+    implicit = model.options.dynamics == "implicit"
+    if implicit or model.material.prony:
+        if dt is None or not (np.isfinite(dt) and dt > 0):
+            what = "implicit dynamics" if implicit else "skin with a Prony series, which relaxes in time,"
+            raise ValueError(f"{what} needs the time step: pass dt > 0")
+        data.dt.fill_(dt)
+    if implicit:
+        for array, last, value in (
+            (data.frame_pos, data.frame_pos_last, core_pos),
+            (data.frame_mat, data.frame_mat_last, core_mat),
+        ):
+            if value is None:
+                wp.copy(array, last)
+            else:
+                array.assign(np.asarray(value, float))
+
+
+def _refuse_core(model, geoms):
+    depth = wp.zeros((geoms.count, geoms.nworld), dtype=real, device=model.device)
+    wp.launch(
+        limits.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device
+    )
+    depth = depth.numpy()
+    geom, world = np.unravel_index(depth.argmax(), depth.shape)
+    raise ValueError(
+        f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: "
+        "no skin fits between them; move it out, press less deep or take smaller steps"
+    )
+
+
+class _Vectors:
+    """Vectors of all worlds, shared by the recorded steps of one SkinData."""
+
+    def __init__(self, model, data):
+        n, w, vec = model.nvert, data.nworld, data.precision.vec
+        self.chunk = data.chunk
+        self.nchunk = -(-n // self.chunk)
+        inner = 0 if model.inner is None else len(model.inner.face)
+        implicit = model.options.dynamics == "implicit"
+        lawful = model.options.contact_law is not None
+        surfaces = [s for s in (data.outer, data.core) if s]
+        self.by_sample = None
+        with wp.ScopedDevice(model.device):
+            self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
+            self.base = wp.zeros((n, w), dtype=vec3)
+            self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
+            self.part = wp.zeros((2, self.nchunk, w), dtype=real)
+            self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
+            self.flags = wp.zeros(5, dtype=int)
+            if w <= FEW and model.device.is_cuda:
+                shapes = [s.trial_geom.shape for s in surfaces]
+                self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
+            self.no_vector, self.no_direction = (wp.zeros((0, w), dtype=kind) for kind in (vec3, vec))
+            self.no_list = wp.zeros(0, dtype=int)
+            self.no_flag = wp.zeros((0, w), dtype=int)
+            self.no_face = wp.zeros(0, dtype=wp.vec3i)
+            self.no_block = wp.zeros((0, w), dtype=mat33)
+            self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
+            self.face_chunks = -(-inner // self.chunk)
+            self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
+            self.wet = wp.zeros((inner, w), dtype=vec3)
+            self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
+            self.world, self.target = (wp.zeros((n if implicit else 0, w), dtype=vec3) for _ in range(2))
+            self.inertial = wp.zeros((n if implicit else 0, w), dtype=vec)
+            self.node_volume = wp.array(model.elements.node_volume, dtype=real)
+        self.elements = data.element_forces()
+        damped = implicit and model.options.stiffness_damping
+        self.damped = data.element_forces() if damped else None
+
+
+class SkinStep:
+    """A step of the worlds of `data` under `geoms`, see the module's docstring.
+
+    Raises:
+      ValueError: `data` and `geoms` do not fit, see `prepare_step`.
+    """
+
+    def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet):
+        # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
+        self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
+        if data._vectors is None:
+            data._vectors = _Vectors(model, data)
+        self.k, self.st, self.M = data._vectors, data.worlds, data.preconditioner
+        self._of_nodes = nodes.nodes_kernels(data.precision)
+        self._of_krylov = krylov.krylov_kernels(data.precision)
+        self.implicit = model.options.dynamics == "implicit"
+        w = data.nworld
+        self._wrench_chunks = -(-len(model.outer.face) // _WRENCH_CHUNK)
+        with wp.ScopedDevice(model.device):
+            self._held_pos = wp.zeros((geoms.count, w), dtype=vec3)
+            self._held_mat = wp.zeros((geoms.count, w), dtype=mat33)
+            self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, w), dtype=vec3)
+            self._lawless = faces.Laws()
+            for name, variable in faces.Laws.vars.items():
+                shape = (0,) * variable.type.ndim
+                setattr(self._lawless, name, wp.zeros(shape, dtype=variable.type.dtype))
+        self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
+        flags = self.k.flags
+        self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (
+            flags[i : i + 1] for i in range(5)
+        )
+        self._graph = None
+        few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
+        self._streams = [wp.Stream(model.device) for _ in range(2 if few else 0)]
+        self._events = [wp.Event(model.device) for _ in range(3 if few else 0)]
+        if model.device.is_cuda:
+            self._warm_up()
+        self._program = Program(model.device, self._record)
+
+    def run(self) -> None:
+        """One step, on the current stream."""
+        self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # its outputs are now the data's
+        if not self.m.device.is_cuda:
+            self._program.run()
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(self.m.device) as capture:
+                self._program.run()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def launch(self) -> None:
+        """Launches a step, for the caller's capture."""
+        self._program.run()
+
+    # --- for looking at a skin where it is: forces and tangent, without a step ---
+
+    def evaluate_forces(self) -> None:
+        """Writes the forces at `data.x` and what belongs to them, in all worlds."""
+        self._once(lambda: self._evaluate(self.st.moving))
+
+    def multiply_tangent(self, p: np.ndarray) -> np.ndarray:
+        """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed nodes.
+
+        The liquid's part is in it.
+        """
+        k, st = self.k, self.st
+        k.p.assign(np.ascontiguousarray(p))
+        st.running.fill_(1)
+        self._once(self._multiply)
+        q = k.q.numpy().astype(float)
+        if self.m.has_liquid:
+            free = self.m.free_mask.numpy()[:, None, None]
+            gradient = self.d.gradient.numpy() * free
+            swell = st.kappa.numpy() * (gradient * p).sum((0, 2))
+            q += swell[:, None] * gradient
+        return q
+
+    def _once(self, body):
+        self.st.moving.fill_(1)
+        self._launcher = Launcher(self.m.device)
+        body()
+
+    # --- the step ---
+
+    def _record(self, program):
+        """Puts one step into a program."""
+        self._launcher = program
+        m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
+        n, w = m.nvert, d.nworld
+        if m.has_core and g.count:
+            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if w < 32 else 64
+            dim = (g.count, -(-len(m.core_vert) // chunk), w)
+            constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
+            self._launch(limits.contact_inside_core, dim, constants, [st.deep])
+        motion, touched_by, wrench = self._of_geoms
+        self.M.begin_step(program)
+        E = m.material.youngs_modulus
+        self._launch(worlds.begin_worlds, w, [m.law, E, g.struct, motion, st, touched_by], [k.flags])
+        if d.memory:
+            d.memory.begin_step(program, d.dt, st.softness)
+        if self.implicit:
+            frames = [d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt]
+            self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
+        self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x])
+        self._newton()
+        self._launch(worlds.retry_worlds, w, [st, self._again])
+        program.branch(self._again, self._second_try)
+        self._launch(
+            worlds.hold_geoms, w, [g.struct, st], [self._held_pos, self._held_mat, motion, self._any_failed]
+        )
+        program.branch(self._any_failed, self._stay)
+        self._finish(touched_by, wrench)
+
+    def _second_try(self):
+        """From where the step began: the guess may have been the trouble."""
+        self._launch(nodes.retry_nodes, self.d.x.shape, [self.d.x_last, self.st.active, self.d.x])
+        self.M.renew(self._launcher, self.d.x)
+        self._newton()
+
+    def _stay(self):
+        self._launch(nodes.retry_nodes, self.d.x.shape, [self.d.x_last, self.st.failed, self.d.x])
+        self._evaluate(self.st.failed)
+
+    def _newton(self):
+        self._evaluate(self.st.active)
+        self._check()
+        self._launcher.loop(self._newton_on, self._iterate)
+        self._refuse_impossible()
+
+    def _refuse_impossible(self):
+        """Balance of an inverted element, or of skin that went through the core, is none."""
+        m, d, st = self.m, self.d, self.st
+        if m.material.law != "linear":  # small strain: its determinant means nothing
+            self.k.elements.refuse_inverted(self._launcher, d.x, st.asked, st.failed)
+        if d.core:
+            face, core = d.core.surface.face, m.core(d.nworld).struct
+            dim = (len(face), d.nworld)
+            self._launch(
+                limits.crushed_on_core, dim, [m.crushed_depth, face, core, d.x, st.asked], [st.failed]
+            )
+
+    def _iterate(self):
+        self._solve()
+        self._launcher.loop(self._solve_on, self._continue_solve)
+        self._search()
+        self._launcher.loop(self._search_on, self._continue_search)
+        self.M.watch_products(self._launcher, self.d.x)
+        self._check()
+
+    def _check(self):
+        """Residual, preconditioner and the first direction; which worlds are in balance."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        core = d.core.node_force if d.core else k.no_vector
+        forces = [d.force, d.outer.node_force, core, self._external(), self._gradient()]
+        self._launch(
+            self._of_nodes.residuals, (k.nchunk, d.nworld),
+            [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
+            [k.r, k.worth, st.touched, self._newton_on],
+        )  # fmt: skip
+        self.M.update(self._launcher, st, k.worth, k.r, self._gradient(), k.p, k.part, self._beside)
+        bounds = [m.options.tolerance, m.options.max_newton, int(m.has_liquid)]
+        self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
+
+    def _solve(self):
+        self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
+        self._advance_solve(1)
+
+    def _continue_solve(self):
+        k, st = self.k, self.st
+        self.M.apply(self._launcher, st, k.part, k.r, self._gradient(), k.z, k.part)
+        self._decide(krylov.choose_beta, [k.part, st])
+        self._launch(self._of_krylov.next_direction, self.d.x.shape, [k.z, st, k.p])
+        self._advance_solve(0)
+
+    def _advance_solve(self, first):
+        """A step of conjugate gradients along p."""
+        m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
+        self._multiply()
+        chunks, gradient = (k.nchunk, d.nworld), self._gradient()
+        pair = [k.chunk, k.p, k.q, gradient, m.free_mask]
+        self._launch(kernels.measure_product, chunks, [*pair, st.running], [k.part, self._solve_on])
+        self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
+        inputs = [k.chunk, first, *pair[1:], st, k.dx, k.r]
+        self._launch(kernels.update_solution, chunks, inputs, [k.part])
+
+    def _multiply(self):
+        """Tangent of all forces times p, but for what the liquid's pressure changes by."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        e = k.elements
+        e.multiply_corners(self._launcher, d.x, k.p, st.running)
+        inertia = wp.vec3d(0.0, 0.0, 0.0)
+        if self.implicit:
+            inertia = wp.vec3d(m.material.density, m.options.mass_damping, m.options.stiffness_damping)
+        wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
+        if m.has_liquid:
+            wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
+        surfaces = [
+            *self._blocks(m.outer, d.outer),
+            *self._blocks(m.core_surface if d.core else None, d.core),
+        ]
+        self._launch(
+            self._of_krylov.assemble_product, d.x.shape,
+            [e.start, e.slot, e.corner, *surfaces, *wet, m.free_mask, inertia, k.node_volume, d.dt, d.x, k.p, st],
+            [k.q],
+        )  # fmt: skip
+
+    def _search(self):
+        d, k, first = self.d, self.k, self._of_krylov.first_length
+        chunks = (k.nchunk, d.nworld)
+        self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.base, k.part])
+        self._look()
+
+    def _continue_search(self):
+        k = self.k
+        self._launch(self._of_krylov.move, self.d.x.shape, [k.base, k.dx, self.st, self.d.x])
+        self._look()
+
+    def _look(self):
+        d, k = self.d, self.k
+        self._evaluate(self.st.moving)
+        inputs = [k.chunk, d.force, k.dx, self.st]
+        self._launch(self._of_krylov.measure_slope, (k.nchunk, d.nworld), inputs, [k.part, self._search_on])
+        self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
+
+    def _finish(self, touched_by, wrench):
+        m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
+        w, o = d.nworld, d.outer
+        if m.inner is not None and not m.has_liquid:
+            self._launch(worlds.all_on, w, [], [st.moving])
+            self._fill(st.moving)  # the cavity's volume is told all the same
+        if g.ngroup:
+            touching = [o.touching, o.trial_geom, o.sample_force]
+            inputs = [_WRENCH_CHUNK, o.surface.face, m.sample, g.struct, d.x, *touching]
+            self._launch(faces.partial_wrench, (self._wrench_chunks, w), inputs, [self._part, touched_by])
+            self._launch(faces.sum_wrench, (2 * g.ngroup, w), [self._part], [wrench])
+        kept = [o.touching, o.bond, o.trial_anchor, o.kept]
+        self._launch(
+            faces.commit_contacts, o.touching.shape, [len(m.sample), *kept], [o.anchor_geom, o.anchor]
+        )
+        if d.memory:
+            d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
+        self._launch(worlds.release_geoms, w, [g.struct, self._held_pos, self._held_mat, st])
+        frame = [d.frame_pos, d.frame_mat]
+        self._launch(nodes.end_nodes, d.x.shape, [int(self.implicit), d.x, k.world, *frame, d.dt, d.x_last],
+                     [d.increment, d.velocity])  # fmt: skip
+        if self.implicit:
+            self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
+        self._launch(worlds.end_worlds, w, [st])
+
+    # --- forces ---
+
+    def _evaluate(self, on):
+        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        self._beside(
+            lambda: k.elements.push_corners(self._launcher, d.x, on, st.inverted),
+            lambda: self._inside(on),
+            lambda: self._contact(d.outer, self.geoms, k.near[0], 0, on),
+        )
+        none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
+        core, wet = none, [k.no_list, k.no_list, k.no_vector]
+        if d.core:
+            core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner]
+        if m.has_liquid:
+            wet = [m.inner.start, m.inner.slot, k.wet_corner]
+        inside = [k.elements.start, k.elements.slot, k.elements.corner_force]
+        outside = [m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner]
+        self._launch(
+            nodes.assemble_force, d.x.shape,
+            [*inside, *outside, *core, *wet, self._external(), st.pressure, on],
+            [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
+        )  # fmt: skip
+        if self.implicit:
+            self._resist_motion(on)
+
+    def _resist_motion(self, on):
+        """Inertia and damping."""
+        m, d, k, o, kernels = self.m, self.d, self.k, self.m.options, self._of_nodes
+        mass = [m.material.density, o.mass_damping, k.node_volume, d.dt]
+        positions = [k.target, d.x_last, d.x]
+        self._launch(kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
+        e = k.damped
+        if e:
+            self._launch(kernels.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
+            e.push_corners(self._launcher, d.x, on, self.st.inverted)
+            e.multiply_corners(self._launcher, d.x, k.q, on)
+            inputs = [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force]
+            self._launch(kernels.add_damping, d.x.shape, inputs)
+
+    def _inside(self, on):
+        """The skin's inner side: core and liquid."""
+        m, d = self.m, self.d
+        if d.core:
+            self._contact(d.core, m.core(d.nworld), self.k.near[1], 1, on)
+        if m.has_liquid:
+            self._fill(on)
+
+    def _contact(self, state, geoms, near, still, on):
+        """Contact of one surface; the core is a geom that never moves."""
+        m, d, k, s = self.m, self.d, self.k, state.surface
+        laws = d.laws.struct if not still else self._lawless
+        kernels = faces.contact_kernels(bool(len(laws.reach)))
+        dim, nsample = state.touching.shape, len(m.sample)
+        known = [state.seen, state.clearance]
+        self._launch(
+            faces.cull_faces, dim,
+            [still, nsample, s.face, geoms.struct, laws, d.x, on, *known, state.touching],
+            [near, state.trial_geom, state.bond],
+        )  # fmt: skip
+        if len(laws.reach):
+            inputs = [s.face, s.area, m.sample, m.contact_stiffness, geoms.struct, d.x, on, near]
+            self._launch(faces.push, dim, inputs, [k.corner_push])
+            self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
+        surface = [s.face, s.area, m.sample, m.contact_stiffness, m.options.stick_ratio]
+        held = [state.anchor_geom, state.anchor, on, near]
+        law = [*surface, geoms.struct, laws, d.x, d.x_last, *held]
+        out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
+        total = [state.corner, state.block, state.touching]
+        if k.by_sample is None:
+            self._launch(kernels.by_face, dim, [still, *law, *known], [*total, *out])
+            return
+        gap, tangent = k.by_sample[still]
+        self._launch(kernels.by_sample, out[0].shape, law, [*out, gap, tangent])
+        samples = [state.trial_geom, state.sample_force, gap, tangent]
+        self._launch(faces.sum_samples, (dim[0], 3, dim[1]), [still, s.face, m.sample, d.x, on, near, *samples],
+                     [*total, *known])  # fmt: skip
+
+    def _fill(self, on):
+        """The liquid's volume; with it, its pressure."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        c = d.core
+        law = [m.contact_stiffness, st.reference]
+        area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
+        if c:
+            area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
+        self._launch(
+            liquid.wet_faces, (k.face_chunks, d.nworld),
+            [k.chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
+            [k.share, k.wet, k.wet_corner],
+        )  # fmt: skip
+        enclosed = m.liquid_volume - m.rest_volume
+        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, on]
+        self._decide(liquid.settle_pressure, inputs, [st.volume, st.pressure])
+        if m.has_liquid and c:
+            inputs = [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block]
+            self._launch(liquid.release_pressure, c.touching.shape, inputs)
+
+    def _external(self):
+        return self.k.no_vector if self.d.external is None else self.d.external
+
+    def _gradient(self):
+        return self.d.gradient if self.m.has_liquid else self.k.no_vector
+
+    def _blocks(self, surface, state):
+        k = self.k
+        if state is None:
+            return [k.no_face, k.no_list, k.no_list, k.no_flag, k.no_block]
+        return [surface.face, surface.start, surface.slot, state.touching, state.block]
+
+    # --- launching ---
+
+    def _launch(self, kernel, dim, inputs, outputs=()):
+        threads = THREADS_FEW if self.d.nworld <= FEW else 256
+        self._launcher.launch(kernel, dim, inputs, outputs, threads)
+
+    def _decide(self, kernel, inputs, outputs=()):
+        """A block of threads for each world."""
+        self._launcher.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
+
+    def _beside(self, *branches):
+        """Launches up to three functions, which do not need each other's results, as branches of the graph."""
+        if not self._streams:
+            for branch in branches:
+                branch()
+            return
+        main = self.m.device.stream
+        main.record_event(self._events[0])
+        for stream, done, branch in zip(self._streams, self._events[1:], branches[1:]):
+            stream.wait_event(self._events[0])
+            with wp.ScopedStream(stream, sync_enter=False):
+                branch()
+                stream.record_event(done)
+        branches[0]()
+        for done, _ in zip(self._events[1:], branches[1:]):
+            main.wait_event(done)
+
+    def _warm_up(self):
+        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made, before
+        anything is captured."""
+        self._launcher = Launcher(self.m.device)
+        for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
+            flag.zero_()
+        self._evaluate(self.st.active)
+        self._check()
+        self._solve()
+        self._continue_solve()
+        self._search()
+        self._continue_search()
+        self._refuse_impossible()
+        self.k.flags.zero_()
