@@ -33,11 +33,11 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.edge_nodes import EDGES, with_edge_nodes
 from biotac_mj.geometry.skin_geometry import PARTS
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.contact import face_samples
+from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.quadratic import QuadraticTetrahedra
-from biotac_mj.skin.supernodal import Elimination, SupernodalFactor
+from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 
 __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 

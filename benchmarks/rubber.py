@@ -28,7 +28,6 @@ from accuracy import write_json
 from condensed import run
 
 from biotac_mj.skin import PRESETS, SkinData, SkinModel, clearance
-from biotac_mj.skin.data import view
 
 __all__ = ["main", "press", "shape"]
 
@@ -38,7 +37,7 @@ LOCATION, STEP = (-12e-3, 0.0), 10e-3  # [m, rad]; [s], at 10 mm/s
 def shape(model, data, vert_xpos) -> tuple[float, float]:
     """Least det F at the integration points of a skin at vert_xpos (nvert, 3), and how deep its inner faces
     are in the core [m]."""
-    view(data.x)[:, 0] = vert_xpos
+    data.x.numpy()[:, 0] = vert_xpos
     model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
     face = model.core_surface.face
     depth = wp.zeros((len(face), 1), dtype=wp.float64, device=model.device)

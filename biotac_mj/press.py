@@ -185,7 +185,7 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
       ValueError: a two-way press with a plane, which cannot move in MuJoCo.
     """
     from .coupling import attach
-    from .skin.material import material
+    from .skin.rubber.material import material
 
     chosen = material(options.material)
     friction = chosen.friction if options.friction is None else options.friction

@@ -135,7 +135,7 @@ def view(
     Raises:
       ValueError: no display for a window, or no GL library to render with.
     """
-    from .skin.material import material as preset
+    from .skin.rubber.material import material as preset
 
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add --web")

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from biotac_mj import batch
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin.material import material
+from biotac_mj.skin.rubber.material import material
 
 RADIUS, DT = 3.5e-3, 2e-3  # [m], [s]
 

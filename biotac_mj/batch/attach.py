@@ -15,8 +15,8 @@ from ..coupling.fem import _model as skin_model
 from ..coupling.skins import reference
 from ..coupling.touching import Touching
 from ..plugin.structs import ModelView
-from ..skin.material import Material
-from ..skin.material import material as preset
+from ..skin.rubber.material import Material
+from ..skin.rubber.material import material as preset
 from .batch import Batch, Hook
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch

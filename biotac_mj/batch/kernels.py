@@ -6,7 +6,7 @@ nothing else is said."""
 
 import warp as wp
 
-from ..skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+from ..skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
 __all__ = [
     "accept_models",

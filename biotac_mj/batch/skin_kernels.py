@@ -9,7 +9,7 @@ of them."""
 
 import warp as wp
 
-from ..skin.device_worlds import Worlds
+from ..skin.newton.worlds import Worlds
 
 __all__ = [
     "drag_rows",

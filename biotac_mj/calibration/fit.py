@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin.material import Material
+from ..skin.rubber.material import Material
 from ..skin.model import SkinOptions
 from .configurations import Configuration
 from .forward import simulate

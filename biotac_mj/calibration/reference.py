@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from ..skin.material import material as preset
+from ..skin.rubber.material import material as preset
 from ..skin.model import SkinOptions
 from .forward import simulate
 from .indentation import Indentation

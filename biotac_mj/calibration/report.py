@@ -82,7 +82,7 @@ def read_material(path):
     """
     import pathlib
 
-    from ..skin.material import Material
+    from ..skin.rubber.material import Material
 
     path = pathlib.Path(path)
     if not path.is_file():

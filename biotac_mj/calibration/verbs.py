@@ -4,7 +4,7 @@ import pathlib
 
 import tqdm
 
-from ..skin.material import PRESETS, material
+from ..skin.rubber.material import PRESETS, material
 from .comparison import PAPER, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
 from .fit import calibrate

@@ -159,8 +159,8 @@ def attach(
 
 
 def _material_choices(material, liquid, friction):
-    from ..skin.material import Material
-    from ..skin.material import material as preset
+    from ..skin.rubber.material import Material
+    from ..skin.rubber.material import material as preset
 
     chosen = Material(**material) if isinstance(material, dict) else preset(material or "default")
     return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction

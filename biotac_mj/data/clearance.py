@@ -4,9 +4,9 @@ deep they may go."""
 import numpy as np
 import warp as wp
 
-from ..skin.contact import Geoms, face_samples
+from ..skin.contact.faces import Geoms, face_samples
 from ..skin.geoms import GeomSet
-from ..skin.shapes import distance
+from ..skin.contact.shapes import distance
 from ..skin.types import real, vec3
 from .objects import grid_of, make_object
 

@@ -13,7 +13,7 @@ import trimesh
 
 from ..geometry.indenters import INDENTERS
 from ..press_indenter import Indenter, make_indenter
-from ..skin.shapes import DistanceGrid, bake_distance_grid
+from ..skin.contact.shapes import DistanceGrid, bake_distance_grid
 
 __all__ = ["OBJECTS", "grid_of", "make_object"]
 

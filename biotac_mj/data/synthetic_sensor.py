@@ -105,7 +105,7 @@ class SyntheticSensor:
 
     def __init__(self, seed: int = 0, skin: str = "fine", device="cpu"):
         from ..skin import SkinModel, SkinOptions
-        from ..skin.material import Material
+        from ..skin.rubber.material import Material
 
         for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
             if importlib.util.find_spec(module) is None:

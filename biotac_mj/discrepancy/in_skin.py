@@ -281,7 +281,7 @@ class _Remembering(Simulator):
         )
 
     def _model(self, log_friction, bubble):
-        from ..skin.material import material
+        from ..skin.rubber.material import material
         from ..skin.model import SkinModel
 
         if bubble not in self._models:

@@ -135,7 +135,7 @@ class Simulator:
     def _model(self, log_friction, bubble):
         from ..geometry.skins import load_skin
         from ..sensor.film import FilmConduction
-        from ..skin.material import material
+        from ..skin.rubber.material import material
         from ..skin.model import SkinModel, SkinOptions
 
         store = self.__dict__.setdefault("_models", {})

@@ -20,10 +20,10 @@ def rest_tangent(model) -> sp.csc_matrix:
     Args:
       model: SkinModel on the CPU.
     """
-    from .data import SkinData, view
+    from .data import SkinData
 
     data = SkinData(model)
-    view(data.x)[:, 0] = model.rest.vert
+    data.x.numpy()[:, 0] = model.rest.vert
     model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.product)
     pattern = _neighbours(model.nvert, model._elem)
     color = _colors(pattern)
@@ -41,16 +41,16 @@ def rest_tangent(model) -> sp.csc_matrix:
         nodes = np.flatnonzero(color == c)
         part = pattern[:, nodes].tocoo()
         for axis in range(3):
-            view(data.direction)[...] = 0
-            view(data.direction)[nodes, 0, axis] = 1
+            data.direction.numpy()[...] = 0
+            data.direction.numpy()[nodes, 0, axis] = 1
             model.elasticity.product(data.elastic, data.mu, data.lam, data.x, data.direction, data.product)
-            q = view(data.product)[:, 0].copy()
+            q = data.product.numpy()[:, 0].copy()
             if model.has_liquid:
                 inputs = [model.inner.face, wet, data.x, data.direction]
                 wp.launch(liquid.gradient_derivative, (nface, 1), inputs, [bend], device=model.device)
                 inputs = [model.inner.start, model.inner.slot, bend, 1.0, 0]
                 wp.launch(elasticity.gather, (model.nvert, 1), inputs, [nodal], device=model.device)
-                q -= model.rest.pressure * view(nodal)[:, 0]
+                q -= model.rest.pressure * nodal.numpy()[:, 0]
             row.append((3 * part.row[:, None] + np.arange(3)).ravel())
             column.append(np.repeat(3 * nodes[part.col] + axis, 3))
             value.append(q[part.row].ravel())
