@@ -37,8 +37,8 @@ _E_NEAR = {
 def plan(seed, count, skin="coarse"):
     """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,);
     press, hold, sometimes slide, unload."""
-    from biotac_mj import approach
     from biotac_mj.geometry import load_skin
+    from biotac_mj.press import approach
 
     geometry, rng, out, clock = load_skin(skin), np.random.default_rng(seed), [], 0.0
     for i in range(count):

@@ -44,8 +44,8 @@ import peer_flex
 import peer_newton
 from accuracy import write_json
 
-from biotac_mj.approach import nearest_point, surface_point
 from biotac_mj.geometry import SKINS, SkinGeometry, load_skin
+from biotac_mj.press.approach import nearest_point, surface_point
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
 

@@ -154,13 +154,13 @@ def _press(args):
     import math
     import pathlib
 
-    from . import press, press_report
-    from .press_record import write_readings, write_skin
+    from .press import PressOptions, press, render, report
+    from .press.record import write_readings, write_skin
 
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
-    options = press.PressOptions(
+    options = PressOptions(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
@@ -180,20 +180,20 @@ def _press(args):
         device=args.device,
     )
     _calm_warp()
-    record, picture = press.press(
-        options, render=press.render if args.render else None, progress=not args.quiet
+    record, picture = press(
+        options, render=render if args.render else None, progress=not args.quiet
     )
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
     write_readings(record, files[0])
     write_skin(record, files[1])
-    press_report.write_picture(record, files[2], picture)
+    report.write_picture(record, files[2], picture)
     if args.render and picture is None:
         print(
             "no GL library works here: press.png shows the surfaces drawn by matplotlib (libosmesa6 or "
             "libegl1 would do)"
         )
-    print(press_report.table(record, files))
+    print(report.table(record, files))
 
 
 def _add_view(verbs):
@@ -228,10 +228,10 @@ def _add_view(verbs):
 
 
 def _view(args):
-    from . import view
+    from .view import view
 
     _calm_warp()
-    view.view(
+    view(
         skin=args.skin,
         tier=args.tier,
         material=args.material,

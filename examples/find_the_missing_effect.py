@@ -12,8 +12,9 @@ import pathlib
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from biotac_mj import approach, load_skin
+from biotac_mj import load_skin
 from biotac_mj.discrepancy import CATALOGUE, Simulator, Trajectory, diagnose
+from biotac_mj.press import approach
 
 # What may hide, and how large (kept apart from the catalogue's own bounds).
 HIDDEN = {

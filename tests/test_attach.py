@@ -7,10 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
-from biotac_mj.plugin import structs
 
 import biotac_mj
-from biotac_mj.coupling import Config, attach
+from biotac_mj.coupling import Config, attach, structs
 from biotac_mj.coupling.instance import Setup
 from biotac_mj.coupling.show import electrode_colors
 

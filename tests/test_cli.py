@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from biotac_mj import cli, press_indenter
+from biotac_mj import cli
+from biotac_mj.press import indenter
 from biotac_mj.skin.material import PRESETS
 
 
 def test_names_in_the_help_are_the_real_ones():
     from biotac_mj.geometry import SKINS
 
-    assert sorted(cli.INDENTERS) == sorted(press_indenter.INDENTERS)
+    assert sorted(cli.INDENTERS) == sorted(indenter.INDENTERS)
     assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
 
 

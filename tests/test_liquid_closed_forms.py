@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from blocks import boundary, shell, skin
 
-from biotac_mj import approach
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.fem import FemStepper
 from biotac_mj.coupling.readings import SensorReadings
 from biotac_mj.geometry import load_skin
+from biotac_mj.press import approach
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.data import view
 from biotac_mj.skin.solver import _Step

@@ -13,10 +13,9 @@ import mujoco.rollout
 import numpy as np
 import pytest
 import spring_skin
-from biotac_mj.plugin import structs
 
 import biotac_mj
-from biotac_mj.coupling import SkinResult, attach, register_stepper
+from biotac_mj.coupling import SkinResult, attach, register_stepper, structs
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -339,7 +339,7 @@ assert set(beside.reset().observation) > {"pixels", "position", "target"}
 
 def test_dm_controls_pixels():
     """In a process of its own: dm_control chooses its renderer when it is imported."""
-    from biotac_mj.offscreen import find_gl
+    from biotac_mj.view.offscreen import find_gl
 
     gl = find_gl()
     if gl not in ("egl", "osmesa"):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from biotac_mj import web_scene
+from biotac_mj.view import web_scene
 
 XML = """<mujoco><asset>
   <mesh name="wedge" vertex="0 0 0  .02 0 0  0 .03 0  0 0 .04"/><material name="red" rgba="1 0 0 1"/></asset><worldbody>

@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attach import _add_slots, _check_place, _model
+from ..coupling.attachment import _add_slots, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _choices, _grid, rest_geometry
 from ..coupling.fem import _model as skin_model
-from ..coupling.skins import reference
+from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
-from ..plugin.structs import ModelView
+from ..geometry.skins import skin_reference
 from ..skin.material import Material
 from ..skin.material import material as preset
 from .batch import Batch, Hook
@@ -60,7 +60,7 @@ def add(
     _check_place(spec, site, body, prefix)
     own = spec.site(site).parent if site is not None else spec.worldbody if body is None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    child = _model(reference(skin)[1])
+    child = _model(skin_reference(skin)[1])
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:
         spec.attach(child, site=spec.site(site), prefix=prefix)
@@ -216,7 +216,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         single = dataclasses.asdict(single)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     config = Config(
-        skin=reference(skin)[0],
+        skin=skin_reference(skin)[0],
         material=single,
         liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
         geoms=settings["geoms"],
@@ -234,7 +234,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
             f"{names}"
         )
     touching = Touching(ModelView(mjm._address), core, config)
-    geometry = reference(skin)[1]
+    geometry = skin_reference(skin)[1]
     fem = skin_model(geometry, *_choices(config), device)
     if fem.options.dynamics != "quasistatic":
         raise ValueError(

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..press_indenter import make_indenter
+from ..press.indenter import make_indenter
 from ..skin import GeomSet, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
 from .indentation import Indentation
 

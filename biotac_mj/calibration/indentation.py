@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 
 __all__ = [
     "COLUMNS",
@@ -103,8 +103,8 @@ def plan_indentation(
       ValueError: see `press.plan_path`.
     """
     from ..geometry import load_skin
-    from ..press import PressOptions, plan_path
-    from ..press_indenter import make_indenter
+    from ..press.indenter import make_indenter
+    from ..press.path import PressOptions, plan_path
 
     stride = (depth + slide) / samples
     options = PressOptions(
@@ -235,7 +235,7 @@ def _column(path, header, rows, name):
 
 
 def _orientation(path, header, rows, direction):
-    from ..press import _rotation_from_y
+    from ..press.path import rotation_from_y
 
     if direction is not None:
         direction = np.asarray(direction, float)
@@ -244,7 +244,7 @@ def _orientation(path, header, rows, direction):
                 f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are "
                 "not all zero"
             )
-        return _rotation_from_y(direction / np.linalg.norm(direction))
+        return rotation_from_y(direction / np.linalg.norm(direction))
     if "quat_w" not in header:
         return np.array([1.0, 0, 0, 0])
     quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T

@@ -4,7 +4,7 @@ where it was."""
 import pathlib
 import pickle
 
-from ..press_record import replacing
+from ..files import replacing
 
 __all__ = ["Kept"]
 

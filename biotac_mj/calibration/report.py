@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 from .fit import Calibration
 
 __all__ = ["calibration_table", "read_material", "write_json", "write_picture"]

@@ -3,8 +3,9 @@
 import dataclasses
 import json
 
-__all__ = ["COUPLINGS", "TIERS", "Config"]
+__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
 
+PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 

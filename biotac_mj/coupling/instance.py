@@ -12,7 +12,7 @@ import threading
 import mujoco
 import numpy as np
 
-from . import skins
+from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
 from .stepper import SkinResult, make_readings, make_stepper
@@ -32,7 +32,7 @@ class _Skin:
     scratch memory."""
 
     def __init__(self, config, geoms):
-        self.geometry = skins.load(config.skin)
+        self.geometry = load_skin(config.skin)
         self.stepper = make_stepper(config, self.geometry, geoms)
         self.readings = make_readings(config, self.geometry)
         self.lock = threading.Lock()

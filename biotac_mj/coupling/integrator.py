@@ -11,7 +11,7 @@ import ctypes
 import mujoco
 import numpy as np
 
-from ..plugin.structs import LIBRARY
+from .structs import LIBRARY
 
 __all__ = ["Integrator", "FixedPoint"]
 

@@ -9,9 +9,9 @@ import time
 
 import numpy as np
 
+from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
-from ..press_record import replacing
 from .objects import OBJECTS
 from .plan import KINDS
 from .store import TactileSet, shard_path

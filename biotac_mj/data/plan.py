@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..approach import nearest_point
 from ..geometry.skin_geometry import SkinGeometry
+from ..press.approach import nearest_point
 from ..sensor.core_surface import CoreSurface
 from .clearance import Placed, first_touch, rotation_matrices, surface_samples
 
@@ -137,7 +137,7 @@ class _Planner:
         return out
 
     def _draw(self, rng):
-        from ..press import _rotation_from_y
+        from ..press.path import rotation_from_y
 
         kind = str(rng.choice(self.kinds, p=self.share))
         corner = self.geometry.vert[self.faces[rng.choice(len(self.faces), p=self.area)]]
@@ -148,7 +148,7 @@ class _Planner:
         side = np.cos(round_) * first + np.sin(round_) * second
         direction = -np.cos(tilt) * normal + np.sin(tilt) * side
         spin = rng.uniform(0, 2 * np.pi)
-        mat = _rotation(direction, spin) @ rotation_matrices(_rotation_from_y(direction))
+        mat = _rotation(direction, spin) @ rotation_matrices(rotation_from_y(direction))
         heading = rng.uniform(0, 2 * np.pi)
         slide = np.cos(heading) * first + np.sin(heading) * second
         return dict(

@@ -9,8 +9,8 @@ import pathlib
 import h5py
 import numpy as np
 
+from ..files import replacing, versions
 from ..geometry.skin_geometry import SkinGeometry
-from ..press_record import replacing, versions
 from ..sensor.channels import CHANNELS
 from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
 

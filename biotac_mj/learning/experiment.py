@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import FULL_SCALE
 from .arrays import load_arrays
 from .config import LearningConfig

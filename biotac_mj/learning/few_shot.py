@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.stats import t as t_quantile
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import FULL_SCALE
 from .arrays import load_arrays
 from .local import counts_change

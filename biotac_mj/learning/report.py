@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 

@@ -4,7 +4,7 @@ import json
 import pathlib
 import shutil
 
-from ..press_record import replacing
+from ..files import replacing
 from .report import UNIT
 from .weights import describe
 

@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 import torch
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import CHANNELS
 
 __all__ = [

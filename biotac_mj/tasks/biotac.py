@@ -152,7 +152,7 @@ class BioTac(composer.Entity):
 
     def vert_xpos(self, physics) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
-        from ..coupling.attach import Handle
+        from ..coupling.attachment import Handle
 
         return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(
             physics.model.ptr, physics.data.ptr
