@@ -2,8 +2,8 @@
 
 from setuptools import find_packages, setup
 
-# The model, the meshes and the engine plugin lie at the top of the repository, where people look for them, and
-# ship inside the package.
+# The model, the meshes and the engine plugin lie at the top of the repository, where people look for them,
+# and ship inside the package.
 AT_THE_TOP = {"biotac_mj.plugin": "plugin", "biotac_mj.mjcf": "mjcf", "biotac_mj.assets": "assets"}
 
 setup(

@@ -1,9 +1,9 @@
-"""Sets thresholds and the confidence of `biotac_mj.discrepancy.trajectories.thresholds` from practice seeds; prints them
-for the constant table.
+"""Sets the thresholds and the confidence of diagnosis (`biotac_mj.discrepancy.trajectories.thresholds`) from
+practice seeds; prints them for the constant table.
 
-    python benchmarks/discrepancy.py --seeds practice --counts
-    none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12 --json p.json python
-    benchmarks/discrepancy_calibrate.py p.json
+    python benchmarks/discrepancy.py --seeds practice --json p.json \\
+        --counts none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12
+    python benchmarks/discrepancy_calibrate.py p.json
 
 Left-out cases (the hidden effect is taken out of the catalogue) teach abstention: each name given there is
 wrong."""

@@ -250,13 +250,9 @@ def table(rows):
     """Prints dicts as a table."""
 
     def cell(v):
-        return (
-            " ".join(f"{x:.3g}" for x in v)
-            if isinstance(v, list)
-            else v
-            if isinstance(v, str)
-            else f"{v:.3g}"
-        )
+        if isinstance(v, str):
+            return v
+        return " ".join(f"{x:.3g}" for x in v) if isinstance(v, list) else f"{v:.3g}"
 
     columns = list(rows[0])
     width = [max(len(c), *(len(cell(r[c])) for r in rows)) + 2 for c in columns]

@@ -106,7 +106,7 @@ def main(argv=None):
         f"{'':<26}"
         + "".join(f"{f'{n} {unit} changes':>20}{'missed':>8}" for n, unit in names)
         + f"{'released: Pa':>14}{'missed':>8}{'counts':>8}{'s':>5}"
-    )  # noqa: E501
+    )
     for r in rows:
         label = f"{r['effect']} " + ", ".join(
             f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening", "c2", "along", "fraction") if k in r

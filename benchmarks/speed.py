@@ -409,8 +409,8 @@ def main(arguments=None) -> int:
                     _print_row(rows[-1])
                 if "largest_nworld" in rows[-1]:
                     print(
-                        f"  model {rows[-1]['mb_model']:.0f} MB; the largest nworld here: "
-                        f"{rows[-1]['largest_nworld']}",
+                        f"  model {rows[-1]['mb_model']:.0f} MB; "
+                        f"the largest nworld here: {rows[-1]['largest_nworld']}",
                         flush=True,
                     )
             _model.cache_clear()

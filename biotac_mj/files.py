@@ -9,6 +9,7 @@ import numpy as np
 
 __all__ = ["replacing", "versions"]
 
+
 @contextlib.contextmanager
 def replacing(path):
     """Gives a temporary path with the same ending in the same folder; renames it to `path` if all went well,

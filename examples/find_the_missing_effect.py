@@ -51,7 +51,7 @@ def presses(count, seed):
                 clock,
                 t,
                 point - np.outer(d, normal),
-                np.tile(mat, (n, 1, 1)),  # noqa: E501
+                np.tile(mat, (n, 1, 1)),
                 np.full((n, 19), 2000.0),
                 np.full(n, 2000.0),
                 None,

@@ -230,8 +230,8 @@ def register():
         slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))
         if slot < 0:
             raise RuntimeError(
-                f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of "
-                "biotac_mj loaded?"
+                f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: "
+                "is another copy of biotac_mj loaded?"
             )
         _alive.extend((callbacks, names, plugin))
         atexit.register(_fall_silent, slot)

@@ -39,7 +39,7 @@ def _imported(name, path, known):
 
 
 def circles(graph: dict) -> list:
-    """Sets of modules that import each other, each a sorted list: the strongly connected components (Tarjan)."""
+    """Sets of modules that import each other, each sorted: the strongly connected components (Tarjan)."""
     number, low, stack, out = {}, {}, [], []
 
     def visit(name):

@@ -476,8 +476,8 @@ def test_errors_say_what_to_do():
     spec = ball_spec()
     with pytest.raises(
         ValueError,
-        match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are "
-        "world, ball",
+        match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; "
+        "the model's bodies are world, ball",
     ):
         attach(spec.compile())
     batches.add(spec, skin=shell())

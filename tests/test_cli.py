@@ -44,8 +44,8 @@ def test_help_shows_all_choices(capsys):
 
 def test_help_is_light():
     code = (
-        "import sys; from biotac_mj.cli import parser; parser(); print({'warp', 'trimesh', 'matplotlib'} "
-        "& set(sys.modules))"
+        "import sys; from biotac_mj.cli import parser; parser(); "
+        "print({'warp', 'trimesh', 'matplotlib'} & set(sys.modules))"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"

@@ -19,7 +19,8 @@ GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with
 PAD_DOWN = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
 G = 9.81
 HINGED = """<body name="finger"><joint name="hinge" type="hinge" axis="0 1 0" pos="-.04 0 0" {}/>
-  <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/></body>"""
+  <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/>
+  </body>"""
 
 
 def scene(

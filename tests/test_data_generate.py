@@ -105,9 +105,7 @@ def test_first_touch_is_where_rays_find_it(skin, name):
     )[0]
     spec = mujoco.MjSpec()
     shape = make_indenter(name)
-    add_indenter(
-        spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False
-    )
+    add_indenter(spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

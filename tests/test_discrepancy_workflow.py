@@ -98,7 +98,7 @@ def measured(effects, seed=1, **kw):
             t.time,
             t.pos,
             t.mat,
-            np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),  # noqa: E501
+            np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),
             np.rint(r.pdc + rng.standard_normal(len(t.time))),
             None,
             r.force + 0.005 * rng.standard_normal(r.force.shape),
@@ -118,13 +118,13 @@ def run_of(n=40):
         heading=np.array([0, 1.0, 0]),
         depth=d,
         place=np.array([-0.01, -0.008, 0.001]),
-        order=0,  # noqa: E501
+        order=0,
         offset=np.zeros((n, 3)),
         force=-np.outer(800 * d, [0, 1.0, 0.2]),
         pressure=3e6 * d,
         log_z=z,
         temperature=np.linspace(0, 1, n),
-        session={},  # noqa: E501
+        session={},
         rest_log_z=z[0],
         counts=4095 / (np.exp(z) / 1e4 + 1),
         pdc=2000 + 3e6 * d / 36.5,

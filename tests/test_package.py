@@ -43,8 +43,8 @@ def test_import_registers_the_plugin():
 )
 def test_a_gl_library_that_fails_does_not_stop_the_import():
     result = run(
-        "import os, biotac_mj, mujoco; print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, "
-        "os.environ['MUJOCO_GL'])",
+        "import os, biotac_mj, mujoco; "
+        "print(mujoco.MjModel.from_xml_string('<mujoco/>').nq, os.environ['MUJOCO_GL'])",
         MUJOCO_GL="nonsense",
     )
     assert result.stdout.split() == ["0", "disable"], result.stderr

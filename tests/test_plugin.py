@@ -395,7 +395,8 @@ def test_overhead_is_small_beside_the_skin(coupling, limit):
 
 _OUTLIVED = """
 import mujoco, biotac_mj, sys
-spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body><freejoint/><geom size=".01" mass=".01"/></body></worldbody></mujoco>')
+ball = '<body><freejoint/><geom size=".01" mass=".01"/></body>'
+spec = mujoco.MjSpec.from_string('<mujoco><worldbody>' + ball + '</worldbody></mujoco>')
 biotac_mj.attach(spec, pos=[0, 0, 1], skin="coarse", readings="none")
 class Kept:
     pass

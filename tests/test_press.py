@@ -110,9 +110,16 @@ def touching_box(size):
 
 @pytest.mark.parametrize(
     ("name", "tip"),
-    [("sphere_7mm", 0.0), ("cylinder_short_7mm", 0.0), ("cube_14mm", 0.0), ("ring_7mm", 0.0), ("geom:capsule:0.002,0.003", 5e-3),
-     ("geom:ellipsoid:0.002,0.003,0.004", 4e-3), ("geom:plane", 0.0)],
-)  # fmt: skip
+    [
+        ("sphere_7mm", 0.0),
+        ("cylinder_short_7mm", 0.0),
+        ("cube_14mm", 0.0),
+        ("ring_7mm", 0.0),
+        ("geom:capsule:0.002,0.003", 5e-3),
+        ("geom:ellipsoid:0.002,0.003,0.004", 4e-3),
+        ("geom:plane", 0.0),
+    ],
+)
 def test_path_starts_5_um_before_a_flat_skin(name, tip):
     size = 5e-3
     options = PressOptions(
@@ -136,9 +143,7 @@ def test_slide_goes_across_the_press(shell):
 def test_quaternion_turns_y_to_the_direction():
     for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
         out = np.empty(3)
-        mujoco.mju_rotVecQuat(
-            out, np.array([0.0, 1, 0]), rotation_from_y(np.array(direction, float))
-        )
+        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), rotation_from_y(np.array(direction, float)))
         assert np.allclose(out, direction)
 
 

@@ -262,7 +262,8 @@ def test_slip_is_in_the_plugins_state():
 
     spec = mujoco.MjSpec.from_string(
         """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="finger"/>
-        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body></worldbody></mujoco>"""
+        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body>
+        </worldbody></mujoco>"""
     )
     material = {"hysteresis": [[1.0, 0.02]], "stiffening": 0.3, "element": "linear"}
     pose = {"pos": [0.0062, 0, 0], "quat": [0.5**0.5, -(0.5**0.5), 0, 0]}  # pad up

@@ -325,9 +325,11 @@ _PIXELS = """
 from dm_control.suite.wrappers import pixels
 from biotac_mj.tasks import load, suite
 for domain, task in suite.tasks():
-    env = pixels.Wrapper(load(domain, task, task_kwargs={"random": 0}), render_kwargs={"height": 48, "width": 64})
+    size = {"height": 48, "width": 64}
+    env = pixels.Wrapper(load(domain, task, task_kwargs={"random": 0}), render_kwargs=size)
     picture = env.reset().observation["pixels"]
-    assert picture.shape == (48, 64, 3) == env.observation_spec()["pixels"].shape and picture.std() > 5, (task, picture)
+    assert picture.shape == (48, 64, 3) == env.observation_spec()["pixels"].shape, task
+    assert picture.std() > 5, (task, picture)
 size = {"height": 48, "width": 64, "camera_id": "side"}
 env = pixels.Wrapper(load("finger", "press", task_kwargs={"random": 0}), render_kwargs=size)
 picture = env.reset().observation["pixels"]

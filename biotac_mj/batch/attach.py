@@ -230,16 +230,16 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
-            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are "
-            f"{names}"
+            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
+            f"the model's bodies are {names}"
         )
     touching = Touching(ModelView(mjm._address), core, config)
     geometry = skin_reference(skin)[1]
     fem = skin_model(geometry, *_choices(config), device)
     if fem.options.dynamics != "quasistatic":
         raise ValueError(
-            "a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use "
-            "biotac_mj.attach for inertia"
+            "a batch's skins are quasi-static: "
+            "leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia"
         )
     grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
     frictions = _frictions(mjm, touching.geom, mu, priority)
@@ -289,8 +289,8 @@ def _check_model(mjm, coupling):
         )
     if mjm.opt.disableflags & _SPRINGLESS == _SPRINGLESS:
         raise ValueError(
-            "mujoco_warp asks for no passive forces where springs and dampers are both disabled: enable one "
-            "of the flags"
+            "mujoco_warp asks for no passive forces where springs and dampers are both disabled: "
+            "enable one of the flags"
         )
     if coupling == "two-way" and mjm.opt.disableflags & _ROWLESS:
         raise ValueError(
@@ -308,8 +308,8 @@ def _warn_of_damping(mjm, touching):
         warnings.warn(
             f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the "
             "batch solves its skins where "
-            "the body would go without the integrator's damping; take smaller steps, less damping, or "
-            "biotac_mj.attach on the CPU",
+            "the body would go without the integrator's damping; "
+            "take smaller steps, less damping, or biotac_mj.attach on the CPU",
             stacklevel=3,
         )
 
@@ -335,8 +335,8 @@ def _slots(mjm, m, d, touching, prefix):
     )
     if needed and d.njmax < rows + 7:
         raise ValueError(
-            f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a "
-            "larger njmax"
+            f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: "
+            "make the Data with a larger njmax"
         )
     active0, active = m.eq_active0.numpy().copy(), d.eq_active.numpy().copy()
     for root, weld in place.items():

@@ -66,8 +66,8 @@ class Skins:
             mask = wp.array(np.asarray(world_mask, bool), dtype=bool, device=self.device)
         if mask.shape != (self.nworld,) or mask.dtype is not wp.bool:
             raise ValueError(
-                f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, "
-                "True resets"
+                f"world_mask has shape {mask.shape} and type {mask.dtype}: "
+                f"pass ({self.nworld},) of bool, True resets"
             )
         self.skin.reset(mask)
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]

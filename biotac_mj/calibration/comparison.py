@@ -196,7 +196,7 @@ def comparison_table(comparisons, reference: str) -> str:
     line("nodal, mean norm [m]", [f"{c.nodal_mean:.2e}" for c in comparisons], f"{PAPER['nodal_mean']:.2e}")
     line("steps not converged", [f"{c.nonconverged}/{c.steps}" for c in comparisons], "")
     lines.append(
-        "(in brackets: of each indentation's largest reference force; the paper compared with ANSYS over "
-        "other indentations)"
+        "(in brackets: of each indentation's largest reference force; "
+        "the paper compared with ANSYS over other indentations)"
     )
     return "\n".join(lines)

@@ -243,8 +243,8 @@ def calibrate(
     for p, value in zip(parameters, begin):
         if not p.lower <= value <= p.upper:
             raise ValueError(
-                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: change the "
-                "start or the bounds"
+                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: "
+                "change the start or the bounds"
             )
     scale_force = np.sqrt((indentation.force**2).sum(1).mean())
     if not scale_force > 0:
@@ -274,8 +274,8 @@ def calibrate(
     for p, column in zip(parameters, np.moveaxis(there, -1, 0)):
         if np.sqrt((column**2).sum(1).mean()) < 1e-6 * scale_force:
             raise ValueError(
-                f"the force of this indentation does not depend on {p.name}: leave it out, or load the skin "
-                "so that it shows"
+                f"the force of this indentation does not depend on {p.name}: "
+                "leave it out, or load the skin so that it shows"
             )
     # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and
     # this straightens their valley

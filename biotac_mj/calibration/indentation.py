@@ -57,8 +57,8 @@ class Indentation:
                 )
             if not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of indentation {self.name!r} contains NaN or infinite numbers: remove those "
-                    "samples"
+                    f"{name} of indentation {self.name!r} contains NaN or infinite numbers: "
+                    "remove those samples"
                 )
             object.__setattr__(self, name, value)
         if n < 4:
@@ -67,8 +67,8 @@ class Indentation:
             )
         if not (np.diff(self.time) > 0).all():
             raise ValueError(
-                f"time_s of indentation {self.name!r} does not increase: sort the rows and remove repeated "
-                "ones"
+                f"time_s of indentation {self.name!r} does not increase: "
+                "sort the rows and remove repeated ones"
             )
         if np.abs(self.tip).max() > _REACH:
             raise ValueError(
@@ -168,8 +168,8 @@ def read_indentation(path, indenter: str | None = None, direction=None) -> Inden
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no force-deflection data at {path}: give a CSV file with columns {', '.join(COLUMNS)}, or a "
-            "press's skin.h5"
+            f"no force-deflection data at {path}: "
+            f"give a CSV file with columns {', '.join(COLUMNS)}, or a press's skin.h5"
         )
     return _read_press(path, indenter) if path.suffix == ".h5" else _read_csv(path, indenter, direction)
 
@@ -215,12 +215,12 @@ def _column(path, header, rows, name):
         if other:
             given = other[len(stem) :].lstrip("_") or "none"
             raise ValueError(
-                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; convert the "
-                "numbers and rename it"
+                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; "
+                "convert the numbers and rename it"
             )
         raise ValueError(
-            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; it has "
-            f"{', '.join(header)}"
+            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; "
+            f"it has {', '.join(header)}"
         )
     index, values = header.index(name), []
     for number, row in enumerate(rows, start=2):
@@ -241,8 +241,8 @@ def _orientation(path, header, rows, direction):
         direction = np.asarray(direction, float)
         if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction):
             raise ValueError(
-                f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are "
-                "not all zero"
+                f"direction {np.asarray(direction).tolist()} is no direction: "
+                "give three numbers that are not all zero"
             )
         return rotation_from_y(direction / np.linalg.norm(direction))
     if "quat_w" not in header:

@@ -29,8 +29,8 @@ def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
     scale = np.sqrt(np.diag(normal))
     if (scale == 0).any() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
         raise ValueError(
-            "the forces do not tell the parameters apart: fit fewer, or use an indentation with more shear "
-            "and sliding"
+            "the forces do not tell the parameters apart: "
+            "fit fewer, or use an indentation with more shear and sliding"
         )
     inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     score = np.einsum("tip,ti->tp", jacobian, residual)

@@ -115,8 +115,8 @@ def compare_verb(args) -> None:
             else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
         )
         reference = (
-            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin "
-            f"{args.reference_skin})"
+            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, "
+            f"skin {args.reference_skin})"
         )
     results = []
     for body in chosen:
@@ -127,8 +127,8 @@ def compare_verb(args) -> None:
     for result in results:
         m = result.material
         print(
-            f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, mu "
-            f"{m.friction:.4f}"
+            f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, "
+            f"mu {m.friction:.4f}"
         )
     print(comparison_table(results, reference))
     print(f"wrote {out / 'compare.json'}")

@@ -56,8 +56,8 @@ class Config:
             raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
-                f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: leave one "
-                "of them out"
+                f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
+                "leave one of them out"
             )
         if not self.friction >= 0:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
@@ -83,7 +83,7 @@ class Config:
                     values[field.name] = json.loads(text)
                 except json.JSONDecodeError as error:
                     raise ValueError(
-                        f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, "
-                        "as in '\"default\"'"
+                        f"plugin setting {field.name}={text!r} is not JSON ({error}): "
+                        "strings need quotes, as in '\"default\"'"
                     ) from error
         return cls(**values)

@@ -20,12 +20,9 @@ _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 _CLEAR = 1e-3
-_RESTS = (
-    1e-8,
-    1.0,
-    # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
-    # error
-)
+# a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
+# error
+_RESTS = 1e-8, 1.0
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 

@@ -90,8 +90,8 @@ class Setup:
         cores = np.flatnonzero(model.body_plugin == index)
         if len(cores) != 1:
             raise ValueError(
-                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with "
-                "biotac_mj.attach"
+                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: "
+                "make it with biotac_mj.attach"
             )
         self.core = int(cores[0])
         self.config = Config.parse(lambda attribute: model.config(index, attribute))
@@ -172,8 +172,8 @@ class Instance:
         start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
         if size < setup.nstate:
             raise ValueError(
-                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile "
-                "it again from its XML or MjSpec"
+                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: "
+                "compile it again from its XML or MjSpec"
             )
         self._state = slice(start, start + size)
         self._result = self._reading = self._pose = self._geom_pose = None
@@ -201,8 +201,8 @@ class Instance:
         self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
-                "the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or "
-                "Euler, or coupling='one-way'"
+                "the integrator discrete overwrites the skin's stiffness: "
+                "choose implicitfast, implicit or Euler, or coupling='one-way'"
             )
 
     def last_model(self):

@@ -43,8 +43,8 @@ class Metric:
             raise ValueError(
                 f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has "
                 f"room for {len(slots)}: "
-                "attach it after adding the objects, pass attach(slots=...), or name the geoms that may "
-                "touch with attach(geoms=[...])"
+                "attach it after adding the objects, pass attach(slots=...), "
+                "or name the geoms that may touch with attach(geoms=[...])"
             )
         self.root = roots
         self._layout = None

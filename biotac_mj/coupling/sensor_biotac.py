@@ -36,8 +36,8 @@ class SensorBioTac:
             raise ValueError(f"unknown signal {self.signal!r}: choose one of {', '.join(SIGNALS)}")
         if self.signal == "physics" and self.weights is not None:
             raise ValueError(
-                f"weights {self.weights!r} are given but the signal is 'physics': take "
-                "signal='latent_projection'"
+                f"weights {self.weights!r} are given but the signal is 'physics': "
+                "take signal='latent_projection'"
             )
 
     def options(self) -> dict:

@@ -170,8 +170,8 @@ def check_names(config):
     ):
         if name not in table:
             raise ValueError(
-                f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in "
-                "biotac_mj.coupling.stepper"
+                f"unknown {what} {name!r}: "
+                f"choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper"
             )
 
 

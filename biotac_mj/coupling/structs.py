@@ -74,8 +74,8 @@ def _c_type(node):
     if name in enums.ENUMS:
         return ctypes.c_int
     raise ValueError(
-        f"biotac_mj does not know MuJoCo's type {node.name!r}: this MuJoCo is newer than the plugin; "
-        "install mujoco>=3.17,<4"
+        f"biotac_mj does not know MuJoCo's type {node.name!r}: "
+        "this MuJoCo is newer than the plugin; install mujoco>=3.17,<4"
     )
 
 

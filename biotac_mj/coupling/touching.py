@@ -177,8 +177,8 @@ def _select(model, core, names):
         for i in ids:
             if weld[model.geom_bodyid[i]] == own and own:
                 raise ValueError(
-                    f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: leave it "
-                    "out of geoms"
+                    f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: "
+                    "leave it out of geoms"
                 )
         return np.array(sorted(ids), dtype=np.int64)
     parent = model.body_weldid[

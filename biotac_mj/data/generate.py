@@ -77,8 +77,8 @@ class GenerateOptions:
         kinds = {name.split(":")[0] for name in self.devices}
         if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
             raise ValueError(
-                f"device is {self.device!r}: choose cpu, cuda:0, or several GPUs once each, as in "
-                "cuda:0,cuda:1"
+                f"device is {self.device!r}: "
+                "choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1"
             )
         if not 0 <= self.labelled <= self.count:
             raise ValueError(
@@ -95,13 +95,13 @@ class GenerateOptions:
         unknown = [name for name in self.objects if name not in OBJECTS]
         if unknown or not self.objects:
             raise ValueError(
-                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: choose from "
-                f"{', '.join(OBJECTS)}"
+                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: "
+                f"choose from {', '.join(OBJECTS)}"
             )
         if self.labelled and not set(self.objects) & set(INDENTERS):
             raise ValueError(
-                "labelled interactions are made with the eight indenters: add one of them to the objects, "
-                "or take 0 labelled"
+                "labelled interactions are made with the eight indenters: "
+                "add one of them to the objects, or take 0 labelled"
             )
 
     @property
@@ -227,7 +227,7 @@ def _is_there(path, settings):
     different = [f"{k} {found.get(k)!r} there, {v!r} now" for k, v in settings.items() if found.get(k) != v]
     if different:
         raise ValueError(
-            f"{path} was generated with other options ({'; '.join(different)}): use another --out, or "
-            "delete that set"
+            f"{path} was generated with other options ({'; '.join(different)}): "
+            "use another --out, or delete that set"
         )
     return True

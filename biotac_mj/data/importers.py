@@ -186,8 +186,8 @@ def read_text(
     newtons = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
     if newtons is not None and len(newtons) != len(counts):
         raise ValueError(
-            f"{path} has {len(counts)} rows and {force} has {len(newtons)}: they must be samples of the "
-            "same instants"
+            f"{path} has {len(counts)} rows and {force} has {len(newtons)}: "
+            "they must be samples of the same instants"
         )
     n = len(counts)
     size = n if block is None else max(1, int(round(block * rate)))
@@ -303,8 +303,8 @@ def _numbers(path, rows, first, names):
         for name, cell in zip(names, row):
             if not (_is_number(cell) and np.isfinite(float(cell))):
                 raise ValueError(
-                    f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; correct or "
-                    "remove the line"
+                    f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; "
+                    "correct or remove the line"
                 )
     raise ValueError(f"{path} has rows of different length: every row needs {len(names)} columns")
 

@@ -103,8 +103,8 @@ class _Export:
         step = np.concatenate(steps)
         if not len(step) or np.ptp(step) > 1e-4:
             raise ValueError(
-                "the time steps of the set are not even: LeRobot's layout has one frame rate; resample the "
-                "recordings first"
+                "the time steps of the set are not even: LeRobot's layout has one frame rate; "
+                "resample the recordings first"
             )
         rate = 1 / step.mean()
         return int(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)

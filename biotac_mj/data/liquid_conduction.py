@@ -75,8 +75,8 @@ class LiquidConduction:
         missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in range(23) if (disc == e).sum() < 10]
         if missing:
             raise ValueError(
-                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move "
-                "the electrode"
+                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
+                "move the electrode"
             )
         self._pair = self._near(np.arange(len(keep)))
         self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)

@@ -41,9 +41,7 @@ def _box(name, half, turn):
 
     half, inner = np.array(half), np.array(half) - _EDGE
     quat = (
-        _UPRIGHT
-        if turn is None
-        else rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
+        _UPRIGHT if turn is None else rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
     )
     rotation = trimesh.transformations.quaternion_matrix(quat)[:3, :3]
     reach = np.abs(rotation[1]) @ inner + _EDGE
@@ -88,8 +86,8 @@ def make_object(name: str) -> Indenter:
         return make_indenter(name)
     if name not in OBJECTS:
         raise ValueError(
-            f"unknown object {name!r}: choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or "
-            "mesh:FILE"
+            f"unknown object {name!r}: "
+            f"choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
         )
     if name in TABLE:
         half = 3 * [_TABLE]

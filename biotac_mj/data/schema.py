@@ -114,8 +114,8 @@ class Interaction:
                 )
             if not name.startswith("measured") and not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of {where} contains NaN or infinite numbers: drop those steps, or keep the "
-                    "last good ones"
+                    f"{name} of {where} contains NaN or infinite numbers: "
+                    "drop those steps, or keep the last good ones"
                 )
         if n > 1 and not (np.diff(self.time) > 0).all():
             raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")

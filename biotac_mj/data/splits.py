@@ -23,8 +23,8 @@ class Split:
         for name in ("train", "validation", "test"):
             if not len(getattr(self, name)):
                 raise ValueError(
-                    f"the {name} part of the split is empty: more interactions are needed, or another "
-                    "object or fractions"
+                    f"the {name} part of the split is empty: "
+                    "more interactions are needed, or another object or fractions"
                 )
         return self
 

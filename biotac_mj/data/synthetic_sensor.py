@@ -110,8 +110,8 @@ class SyntheticSensor:
         for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
             if importlib.util.find_spec(module) is None:
                 raise ValueError(
-                    f"the synthetic measured sensor needs {name}: pip install 'biotac-mj[data]', or take "
-                    "--labelled 0"
+                    f"the synthetic measured sensor needs {name}: "
+                    "pip install 'biotac-mj[data]', or take --labelled 0"
                 )
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)

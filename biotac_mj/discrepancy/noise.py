@@ -4,6 +4,7 @@ import numpy as np
 
 __all__ = ["noise_level"]
 
+
 def noise_level(counts, repeated=None, least=0.05):
     """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the
     quietest quarter of the record."""

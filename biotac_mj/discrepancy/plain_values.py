@@ -6,6 +6,7 @@ import numpy as np
 
 __all__ = ["plain_values"]
 
+
 def plain_values(x):
     if isinstance(x, dict):
         return {str(k): plain_values(v) for k, v in x.items()}

@@ -57,7 +57,7 @@ CATALOGUE = (
     Asperities(),
     Gain(),
     CrossTalk(),
-    Saturation(),  # noqa: E501
+    Saturation(),
     LowPass(),
     Latency(),
     Drift(),

@@ -1,5 +1,5 @@
-"""Constitutive effects inside the finite elements instead of on the forces that they bear: what each becomes of
-a skin's material, contact, model and film.
+"""Constitutive effects inside the finite elements instead of on the forces that they bear: what each becomes
+of a skin's material, contact, model and film.
 
 `docs/discrepancy.md` says how much the reduced forms differ."""
 

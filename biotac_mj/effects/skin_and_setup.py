@@ -67,8 +67,8 @@ class PowerCreep(Effect):
 class Hysteresis(Effect):
     id, name, stage = "hyster", "rate-independent hysteresis", "C"
     physics = (
-        "Prandtl-Ishlinskii elements in depth: loading and unloading differ at equal depth, whatever "
-        "the speed"
+        "Prandtl-Ishlinskii elements in depth: "
+        "loading and unloading differ at equal depth, whatever the speed"
     )
     params = {
         "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
@@ -93,8 +93,8 @@ class Hysteresis(Effect):
 class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
     physics = (
-        "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) "
-        "below the deepest press before"
+        "Ogden-Roxburgh, the work taken as depth^2: "
+        "load times 1 - s erf((1 - W / Wmax) / width) below the deepest press before"
     )
     params = {
         "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
@@ -173,8 +173,8 @@ class Friction(Effect):
 class FrictionLoad(Effect):
     id, name, stage = "fric_load", "friction that saturates with load", "K"
     physics = (
-        "tangential force tau0 A rather than mu F: its ratio to the normal force falls with load "
-        "(Trejo 2017; Sahli 2018)"
+        "tangential force tau0 A rather than mu F: "
+        "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
     )
     params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
     confusable = {"friction": "slides at three normal loads"}

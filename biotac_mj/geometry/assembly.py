@@ -36,8 +36,8 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         or (box[0][1] < box[1][1]).any()
     ):
         raise ValueError(
-            "the outer surface of the skin does not enclose the inner one: mesh the skin as one shell "
-            "around one cavity"
+            "the outer surface of the skin does not enclose the inner one: "
+            "mesh the skin as one shell around one cavity"
         )
     return outer, inner
 
@@ -97,8 +97,8 @@ def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> Sk
     fixed = held_nodes(mesh.vert, (core, nail, clamp))
     if not len(fixed):
         raise ValueError(
-            f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the "
-            "same frame and units?"
+            f"no skin node lies within {HELD} m of core, nail or clamp: "
+            "are skin and rigid bodies in the same frame and units?"
         )
     position, normal = lin_electrodes_on(*core) if electrodes is None else electrodes
     return SkinGeometry(

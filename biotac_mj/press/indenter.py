@@ -65,15 +65,15 @@ def _from_geom(text):
     kind, _, sizes = text.partition(":")
     if kind not in _SIZES:
         raise ValueError(
-            f"unknown geom type {kind!r} in 'geom:{text}': use geom:TYPE:SIZE[,SIZE...] with TYPE one of "
-            f"{', '.join(_SIZES)}"
+            f"unknown geom type {kind!r} in 'geom:{text}': "
+            f"use geom:TYPE:SIZE[,SIZE...] with TYPE one of {', '.join(_SIZES)}"
         )
     try:
         size = tuple(float(s) for s in sizes.split(",") if s)
     except ValueError:
         raise ValueError(
-            f"sizes {sizes!r} of 'geom:{text}' are not numbers: give half-sizes in metres, as in "
-            "geom:capsule:0.003,0.005"
+            f"sizes {sizes!r} of 'geom:{text}' are not numbers: "
+            "give half-sizes in metres, as in geom:capsule:0.003,0.005"
         ) from None
     if kind == "plane":
         size = size or (0.02, 0.02, 0.001)
@@ -82,8 +82,8 @@ def _from_geom(text):
         needed = _SIZES[kind]
     if len(size) != needed or not all(np.isfinite(s) and s > 0 for s in size):
         raise ValueError(
-            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: as in "
-            "geom:capsule:0.003,0.005"
+            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: "
+            "as in geom:capsule:0.003,0.005"
         )
     vert, face = _surface(kind, size)
     return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), _Z_TO_Y, vert @ _matrix(_Z_TO_Y).T, face)
@@ -103,13 +103,13 @@ def _from_file(path):
         ) from error
     if not len(getattr(mesh, "faces", ())) or not np.isfinite(mesh.vertices).all():
         raise ValueError(
-            f"the indenter mesh {path} has no faces or vertices that are not finite: give a closed surface "
-            "in metres"
+            f"the indenter mesh {path} has no faces or vertices that are not finite: "
+            "give a closed surface in metres"
         )
     if mesh.extents.max() > 0.5:
         raise ValueError(
-            f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; scale it "
-            "from millimetres"
+            f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
+            "scale it from millimetres"
         )
     if not mesh.is_watertight:
         raise ValueError(f"the indenter mesh {path} is open: its inside is not defined; close its holes")
@@ -150,8 +150,8 @@ def make_indenter(text: str) -> Indenter:
         return _from_file(rest)
     if text not in INDENTERS:
         raise ValueError(
-            f"unknown indenter {text!r}: choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], "
-            "or mesh:FILE"
+            f"unknown indenter {text!r}: "
+            f"choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
         )
     shape = indenter(text)
     return Indenter(

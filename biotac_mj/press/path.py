@@ -1,4 +1,4 @@
-"""What a press is and the way its indenter goes: from just before first touch to the depth, then along the skin."""
+"""What a press is, and the way of its indenter: to the depth, then along the skin."""
 
 import dataclasses
 
@@ -64,8 +64,8 @@ class PressOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
         if len(self.location) not in (2, 3):
             raise ValueError(
-                f"location {self.location} has {len(self.location)} numbers: give x and an angle, or x, y "
-                "and z"
+                f"location {self.location} has {len(self.location)} numbers: "
+                "give x and an angle, or x, y and z"
             )
         for name in ("location", "direction", "slide_direction"):
             value = getattr(self, name)

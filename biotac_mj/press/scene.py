@@ -45,8 +45,8 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions):
     if options.two_way:
         if indenter.type == "plane":
             raise ValueError(
-                "a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: press it one-way, or use a "
-                "flat geom:box"
+                "a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: "
+                "press it one-way, or use a flat geom:box"
             )
         body.mass, body.inertia, body.explicitinertial = _SERVO_MASS, [1e-3] * 3, True
         rotation = np.empty(9)

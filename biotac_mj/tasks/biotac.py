@@ -82,8 +82,8 @@ class BioTac(composer.Entity):
         for key in ("site", "body", "pos", "quat", "prefix"):
             if key in settings:
                 raise ValueError(
-                    f"BioTac got {key}={settings[key]!r}: an Entity is placed with "
-                    "robot.attach(BioTac(...), site)"
+                    f"BioTac got {key}={settings[key]!r}: "
+                    "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
         options = {**(options or {})}
         options["readings"] = {**options.get("readings", {}), "noise": False}

@@ -1,4 +1,4 @@
-"""What a BioTac looks like: in MuJoCo's viewer or a picture (`window`, `offscreen`), in the browser (`web`)."""
+"""What a BioTac looks like: in MuJoCo's viewer, in a picture, in the browser."""
 
 _HOME = {"build_hand": "window", "build_scene": "window", "view": "window"}
 

@@ -181,7 +181,7 @@ def gap(session, findings, late=()) -> dict:
                 float(np.clip((view["before"] ** 2 - view["after"] ** 2) / closable, -9, 1))
                 if view["before"] > 1.05 * floor
                 else float("nan")
-            )  # noqa: E501
+            )
             view["drift_variance_removed"] = 1 - after["wander"] / max(before["wander"], 1e-12)
         view["amendments"] = [c.text(findings) for c in choices]
         view["trials"] = trials

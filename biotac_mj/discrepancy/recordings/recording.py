@@ -44,24 +44,24 @@ class Recording:
         e = self.electrodes = np.asarray(self.electrodes, float)
         if e.ndim != 2 or e.shape[1] != 19:
             raise ValueError(
-                f"electrodes have shape {e.shape}: 19 columns of raw counts e1..e19 are needed, one row per "
-                "sample"
+                f"electrodes have shape {e.shape}: "
+                "19 columns of raw counts e1..e19 are needed, one row per sample"
             )
         _check_numbers(e, "electrodes")
         if len(e) < MIN_ROWS:
             raise ValueError(
-                f"{len(e)} rows are too few to fit on one part and check on another: record at least "
-                f"{MIN_ROWS}"
+                f"{len(e)} rows are too few to fit on one part and check on another: "
+                f"record at least {MIN_ROWS}"
             )
         if e.min() < 0 or e.max() > FULL_SCALE:
             raise ValueError(
                 f"electrodes reach from {e.min():g} to {e.max():g}, raw counts are 0..4095: give the raw "
-                "values, not tared, scaled or in ohm"  # noqa: E501
+                "values, not tared, scaled or in ohm"
             )
         if e.max() <= 8:
             raise ValueError(
-                f"no electrode exceeds {e.max():g} counts: these look like volts or normalised values; give "
-                "raw counts 0..4095"
+                f"no electrode exceeds {e.max():g} counts: these look like volts or normalised values; "
+                "give raw counts 0..4095"
             )
         for label, width in (("force", 3), ("tdc", None)):
             value = getattr(self, label)
@@ -72,24 +72,24 @@ class Recording:
             value = value.reshape(len(value), -1)[:, 0] if width is None else value
             if value.shape != shape:
                 raise ValueError(
-                    f"{label} has shape {value.shape}, the electrodes have {len(e)} rows: {shape} is "
-                    "needed, row by row"
+                    f"{label} has shape {value.shape}, the electrodes have {len(e)} rows: "
+                    f"{shape} is needed, row by row"
                 )
             _check_numbers(value.reshape(len(e), -1), label)
             setattr(self, label, value)
         if self.force is not None and np.abs(self.force).max() > 1000:
             raise ValueError(
                 f"force reaches {np.abs(self.force).max():.3g}: a BioTac is pressed with a few newtons; "
-                "give newtons (Fx Fy Fz), not "
-                "millinewtons or raw counts"
+                "give newtons (Fx Fy Fz), "
+                "not millinewtons or raw counts"
             )
         if self.rate is None:
             share = self.repeated.mean()
             if 0.02 < share < 0.98:
                 self.rate = BUS_RATE / (1 - share)
                 self.rate_source = (
-                    f"{share:.1%} of the rows repeat the one before: a logger faster than "
-                    f"the bus of {BUS_RATE:g} Hz"
+                    f"{share:.1%} of the rows repeat the one before: "
+                    f"a logger faster than the bus of {BUS_RATE:g} Hz"
                 )
             else:
                 self.rate, self.rate_source = BUS_RATE, "assumed: the bus rate"

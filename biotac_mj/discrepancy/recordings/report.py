@@ -20,6 +20,10 @@ __all__ = ["summary", "verdict_dict", "write_report"]
 SCHEMA = 1
 
 
+# of parameters that an effect reports besides those it names
+_OTHER_UNITS = {"counts": "counts", "change": "ln Z", "spread": "1", "delay_otherwise": "s"}
+
+
 def verdict_dict(diagnosis: RecordingDiagnosis) -> dict:
     """What verdict.json holds; numbers, strings, lists and dicts only, no NaN."""
     d = diagnosis
@@ -66,11 +70,7 @@ def _finding(f):
             {
                 "name": name,
                 "value": value,
-                "unit": known.unit
-                if known
-                else {"counts": "counts", "change": "ln Z", "spread": "1", "delay_otherwise": "s"}.get(
-                    name, ""
-                ),
+                "unit": known.unit if known else _OTHER_UNITS.get(name, ""),
                 "interval95": [low, high],
                 "bounds": [known.low, known.high] if known else None,
                 "source": known.source if known else None,
@@ -302,20 +302,21 @@ def _page(d, figures):
         )
         channels = "all" if len(f.channels) > 12 else ", ".join(f"e{k + 1}" for k in f.channels)
         rows.append(
-            f"<tr><td><b>{esc(f.effect.name)}</b><br>{esc(f.effect.physics)}</td><td>{STAGES[f.effect.stage]}</td><td>{channels}</td>"
-            f"<td>{f.start:.1f}–{f.end:.1f} s</td><td>{numbers}</td><td>{f.confidence:.2f}<br>{f.nats:.0f} "
-            f"nats</td><td>{esc(ties)}</td>"
+            f"<tr><td><b>{esc(f.effect.name)}</b><br>{esc(f.effect.physics)}</td>"
+            f"<td>{STAGES[f.effect.stage]}</td><td>{channels}</td>"
+            f"<td>{f.start:.1f}–{f.end:.1f} s</td><td>{numbers}</td>"
+            f"<td>{f.confidence:.2f}<br>{f.nats:.0f} nats</td><td>{esc(ties)}</td>"
             f"<td>{proof}<br>{esc(f.note)}</td></tr>"
         )
     effects = "".join(rows) or "<tr><td colspan=8>none</td></tr>"
     cells = "".join(
-        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} "
-        f"s</td><td>{c['counts']:+.1f}</td><td>{c['p']:.1e}</td></tr>"
+        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} s</td>"
+        f"<td>{c['counts']:+.1f}</td><td>{c['p']:.1e}</td></tr>"
         for c in d.where[:12]
     )
     gaps = "".join(
-        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{esc(v['unit'])}</td><td>{v['variance_removed']:.1%}</td>"
-        f"<td>{esc(_amendments(v))}</td></tr>"
+        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{esc(v['unit'])}</td>"
+        f"<td>{v['variance_removed']:.1%}</td><td>{esc(_amendments(v))}</td></tr>"
         for n, v in d.gap.items()
     )
     apart = "".join(
@@ -330,18 +331,21 @@ def _page(d, figures):
     return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
 <style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}
 table{{border-collapse:collapse;width:100%;font-size:13px}}
-td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
+td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}
+h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
 <p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
 the last {d.locked:.0%} took no part in the fits.</p>
 <h2>1. What was found and added</h2>
-<table><tr><th>effect</th><th>stage</th><th>electrodes</th><th>when</th><th>parameters (95 %)</th><th>confidence</th>
-<th>not distinguished from</th><th>proof</th></tr>
+<table><tr><th>effect</th><th>stage</th><th>electrodes</th><th>when</th><th>parameters (95 %)</th>
+<th>confidence</th><th>not distinguished from</th><th>proof</th></tr>
 {effects}</table>
-<h2>2. Where the unamended recording departs</h2><p>{len(d.where)} cells of channel x tenth of the record, family-wise 5 %.</p>
+<h2>2. Where the unamended recording departs</h2>
+<p>{len(d.where)} cells of channel x tenth of the record, family-wise 5 %.</p>
 <table><tr><th>channel</th><th>when</th><th>counts</th><th>p</th></tr>{cells}</table>
 <h2>3. Gap on the part kept aside</h2>
-<table><tr><th>view</th><th>before</th><th>after</th><th>unit</th><th>variance removed</th><th>amended by</th></tr>{gaps}</table>
+<table><tr><th>view</th><th>before</th><th>after</th><th>unit</th><th>variance removed</th>
+<th>amended by</th></tr>{gaps}</table>
 <p>Walk-forward trials inside the part fitted decided which of the findings a view takes.</p>
 <h2>4. What is left</h2><p>{left}</p>
 <h2>5. What the recording cannot tell</h2><ul>{"".join(f"<li>{esc(n)}</li>" for n in d.notes)}</ul>

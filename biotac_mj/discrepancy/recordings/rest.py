@@ -110,8 +110,8 @@ def _unloaded(line, deviation, slope, common):
             guilty.append(
                 (
                     excess,
-                    f"{name}: {excess:.1f} counts RMS beyond noise, most at {when}, keeps its sign for "
-                    f"about {length:.1f} s",
+                    f"{name}: {excess:.1f} counts RMS beyond noise, most at {when}, "
+                    f"keeps its sign for about {length:.1f} s",
                 )
             )
     if not guilty:
@@ -139,7 +139,7 @@ def _loaded(line, deviation, slope):
                     size[odd].max() * slope[k],
                     f"e{line.used[k] + 1} departs from the other "
                     f"electrodes by {size[odd].max() * slope[k]:.0f} "
-                    "counts"  # noqa: E501
+                    "counts"
                     f" from {start:.0f} s to {end:.0f} s",
                 )
             )
@@ -180,8 +180,8 @@ def _by_force(session):
     text = f"force alone explains {static:.0%} of the electrodes' variance on blocks left out"
     if missing == "the other electrodes":
         text += (
-            f", the other electrodes {others:.0%}: place and torque of the contact, which the force "
-            "does not say, make the rest"
+            f", the other electrodes {others:.0%}: "
+            "place and torque of the contact, which the force does not say, make the rest"
         )
     else:
         text += f"; most of the rest depends on {missing} (+{out[missing]:.0%})"

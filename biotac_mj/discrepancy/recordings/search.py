@@ -304,27 +304,27 @@ def _notes(result):
     for (k, second), counts in sorted(result.events.items(), key=lambda item: -item[1])[:3]:
         notes.append(
             f"e{k + 1} leaves the others at {second} s by {counts:.0f} counts and comes back: a place "
-            "pressed only then or a loose contact; press it again there"  # noqa: E501
+            "pressed only then or a loose contact; press it again there"
         )
     if r.force is None:
         notes.append(
-            "no force: latency, relaxation and hysteresis against the load cannot be known; give --force to "
-            "see them"
+            "no force: latency, relaxation and hysteresis against the load cannot be known; "
+            "give --force to see them"
         )
     elif result.session.force_view() is None:
         notes.append(
-            "the electrodes do not predict the force (or it does not change): nothing between force and "
-            "electrodes can be known"
+            "the electrodes do not predict the force (or it does not change): "
+            "nothing between force and electrodes can be known"
         )
     if r.tdc is None:
         notes.append(
-            "no TDC: a change with temperature cannot be told from one with time; give --tdc, or switch the "
-            "heater off and on"
+            "no TDC: a change with temperature cannot be told from one with time; "
+            "give --tdc, or switch the heater off and on"
         )
     if line.loaded:
         notes.append(
             "the sensor is loaded: a gain, cross-talk or channel order that is wrong during the whole "
-            "record cannot be told from its calibration"  # noqa: E501
+            "record cannot be told from its calibration"
         )
         if r.force is not None and not (np.linalg.norm(r.force, axis=1) < 0.1).any():
             notes.append(
@@ -337,7 +337,7 @@ def _notes(result):
     if r.rest_correlation < 0.5:
         notes.append(
             f"the pattern of the electrodes correlates {r.rest_correlation:.2f} with that of published "
-            "sensors (0.9 among them): check the channels' order"  # noqa: E501
+            "sensors (0.9 among them): check the channels' order"
         )
     return notes
 

@@ -8,6 +8,7 @@ from .timeline import Timeline
 
 __all__ = ["Session"]
 
+
 class Session:
     """What the search knows. `counts` is the recording less what was found so far.
 

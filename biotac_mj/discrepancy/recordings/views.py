@@ -71,7 +71,7 @@ class Amended:
             for f in findings
             if (choice.time != "none" or not over_time(f))
             and (choice.force or not isinstance(f.effect, ForceEffect))
-        ]  # noqa: E501
+        ]
         self.rate = recording.rate
         self.session = Session(recording, session.fit)
         self.session.masked = session.masked
@@ -102,7 +102,7 @@ class Amended:
         return force
 
 
-# --- the views: Amended -> prediction, measured numbers (n or bins, components), time of the rows [s] ------------------------------------
+# --- the views: Amended -> prediction, measured numbers (n or bins, components), time of the rows [s]
 
 
 def electrodes_from_force(a):

@@ -24,17 +24,14 @@ def diagnose_data(args) -> None:
     """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`."""
     out = pathlib.Path(args.out)
     data = read_trajectories(args.data)
-    sim = (
-        load_simulator(args.sensor)
-        if args.sensor
-        else InSkinSimulator()
-        if args.in_skin
-        else Simulator(tier=args.tier)
-    )
+    if args.sensor:
+        sim = load_simulator(args.sensor)
+    else:
+        sim = InSkinSimulator() if args.in_skin else Simulator(tier=args.tier)
     if args.in_skin and not isinstance(sim, InSkinSimulator):
         raise ValueError(
-            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: in_skin` "
-            "into it, or leave --in-skin out"
+            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: "
+            "in_skin` into it, or leave --in-skin out"
         )
     sim.device = args.device
     if args.device != "cpu" and (sim.tier != "full" or args.in_skin):
@@ -86,7 +83,7 @@ def summary(report: Report) -> str:
     for e in report.effects:
         lines.append(
             f"  {e['name']} [{STAGES[e['stage']]}], confidence {e['confidence']:.2f}, {e['nats']:.1f} nats "
-            f"per trajectory left out, p {e['p']:.2g}"  # noqa: E501
+            f"per trajectory left out, p {e['p']:.2g}"
         )
         for p in e["parameters"][:4]:
             lines.append(
@@ -227,8 +224,10 @@ def _page(report, pictures):
             for p in e["parameters"]
         )
         rows.append(
-            f"<tr><td><b>{esc(e['name'])}</b><br>{esc(e['physics'])}</td><td>{STAGES[e['stage']]}</td><td>{numbers}</td><td>{e['confidence']:.2f}</td>"
-            f"<td>{e['nats']:.1f}</td><td>{e['p']:.2g}</td><td>{esc(', '.join(e['ties']) or 'none')}</td></tr>"
+            f"<tr><td><b>{esc(e['name'])}</b><br>{esc(e['physics'])}</td><td>{STAGES[e['stage']]}</td>"
+            f"<td>{numbers}</td><td>{e['confidence']:.2f}</td>"
+            f"<td>{e['nats']:.1f}</td><td>{e['p']:.2g}</td>"
+            f"<td>{esc(', '.join(e['ties']) or 'none')}</td></tr>"
         )
     gap = "".join(
         f"<tr><td>{g}</td><td>{report.before[g]:.4g}</td><td>{report.after[g]:.4g}</td></tr>"
@@ -243,19 +242,24 @@ def _page(report, pictures):
         for c in report.where[:20]
     )
     return f"""<!doctype html><meta charset="utf-8"><title>diagnosis</title>
-<style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}table{{border-collapse:collapse;font-size:13px}}
-td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
+<style>body{{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em}}
+table{{border-collapse:collapse;font-size:13px}}
+td,th{{border:1px solid #ccc;padding:4px 6px;vertical-align:top;text-align:left}}
+h1{{font-size:1.3em}}h2{{font-size:1.05em}}</style>
 <h1>{esc(report.verdict)}</h1>
-<h2>1. Is there a disagreement?</h2><p>Mean square of residuals over noise, resolution and repeatability: {level["level"]:.2f} of a
-trajectory, {level["peak"]:.2f} of the worst channel (beyond {THRESHOLDS["significant"]} or {THRESHOLDS["peak"]} something is wrong).
+<h2>1. Is there a disagreement?</h2><p>Mean square of residuals over noise, resolution and repeatability:
+{level["level"]:.2f} of a trajectory, {level["peak"]:.2f} of the worst channel
+(beyond {THRESHOLDS["significant"]} or {THRESHOLDS["peak"]} something is wrong).
 With the effects found {after["level"]:.2f} and {after["peak"]:.2f}.</p>
 <h2>2. Where</h2><p>{len(report.where)} cells of channel x condition at family-wise 5 %.</p><table>
 <tr><th>channel</th><th>condition</th><th>t</th><th>p</th></tr>{cells}</table>{image["where"]}
-<h2>3. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th><th>nats per trajectory</th>
-<th>p</th><th>ties</th></tr>
+<h2>3. What</h2><table><tr><th>effect</th><th>stage</th><th>parameters (95 %)</th><th>confidence</th>
+<th>nats per trajectory</th><th>p</th><th>ties</th></tr>
 {"".join(rows) or "<tr><td colspan=7>none</td></tr>"}</table><p>{esc(report.remainder)}</p>{image["evidence"]}
 <h2>4. Added</h2><p>sensor_amended.yaml</p>
-<h2>5. Proof on trajectories kept aside</h2><table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table>
+<h2>5. Proof on trajectories kept aside</h2>
+<table><tr><th></th><th>before</th><th>after</th></tr>{gap}</table>
 <p>share of the closable gap: {closed}</p>{image["channels"]}
-<h2>6. What the data cannot tell</h2><ul>{notes}</ul><p>Next experiment: {esc(report.next_experiment)}</p>{image["isolability"]}
+<h2>6. What the data cannot tell</h2><ul>{notes}</ul><p>Next experiment: {esc(report.next_experiment)}</p>
+{image["isolability"]}
 <p>thresholds {threshold_hash()}</p>"""

@@ -137,6 +137,10 @@ def next_experiment(effects, isolability):
         if effect["id"] in ids and other in ids:
             share = isolability["matrix"][ids.index(effect["id"])][ids.index(other)]
             left = share * isolability["nats"][ids.index(effect["id"])]
-            nats = f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: {int(np.ceil(3 / max(left, 1e-3)))} trajectories make 3 nats)"  # noqa: E501
+            count = int(np.ceil(3 / max(left, 1e-3)))
+            nats = (
+                f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: "
+                f"{count} trajectories make 3 nats)"
+            )
         out.append(f"{effect['name']} or {other}: {text or 'vary load, speed and hold together less'}{nats}")
     return "; ".join(out) or "none needed: nothing was named, or nothing is tied"

@@ -9,6 +9,7 @@ from .simulator import SCHEMA, Simulator
 
 __all__ = ["load_simulator"]
 
+
 def load_simulator(path, extra=()) -> Simulator:
     """A Simulator from YAML; `extra` are your own effects.
 
@@ -31,8 +32,8 @@ def load_simulator(path, extra=()) -> Simulator:
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         found = document.get("schema") if isinstance(document, dict) else None
         raise ValueError(
-            f"{path} has schema {found!r}, {SCHEMA!r} is needed: write it with this version's "
-            "Simulator().save(path)"
+            f"{path} has schema {found!r}, {SCHEMA!r} is needed: "
+            "write it with this version's Simulator().save(path)"
         )
     effects, intervals = [], {}
     for stage, items in (document.get("stages") or {}).items():
@@ -42,8 +43,8 @@ def load_simulator(path, extra=()) -> Simulator:
             for name, entry in item["parameters"].items():
                 if name not in effect.params:
                     raise ValueError(
-                        f"{path}: effect {effect.id!r} has no parameter {name!r}; it has "
-                        f"{', '.join(effect.params)}"
+                        f"{path}: effect {effect.id!r} has no parameter {name!r}; "
+                        f"it has {', '.join(effect.params)}"
                     )
                 theta[name] = float(entry["value"])
                 if "interval95" in entry:

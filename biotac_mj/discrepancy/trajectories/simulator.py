@@ -85,7 +85,7 @@ class Simulator:
                         round(bubble * 1e12, 6),
                         "v2",
                     )
-                ).encode()  # noqa: E501
+                ).encode()
                 + np.round(pos, 9).tobytes()
                 + np.round(t.mat, 9).tobytes()
             ).hexdigest()[:24]
@@ -261,13 +261,12 @@ class Simulator:
             for i, r in enumerate(runs)
             if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble
         ]
-        anew = (
-            changed
-            if exact is True
-            else [i for i in changed if i in set(np.atleast_1d(exact).tolist())]
-            if exact is not False
-            else []
-        )
+        if exact is True:
+            anew = changed
+        elif exact is False:
+            anew = []
+        else:
+            anew = [i for i in changed if i in set(np.atleast_1d(exact).tolist())]
         if anew:
             kept = [runs[i] for i in anew]
             solved = self.solve(

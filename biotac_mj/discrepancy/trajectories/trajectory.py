@@ -51,13 +51,13 @@ class Trajectory:
                 continue
             if np.shape(value) != shape:
                 raise ValueError(
-                    f"{name} of trajectory {self.id!r} has shape {np.shape(value)}: {shape} is needed, one "
-                    "row per time"
+                    f"{name} of trajectory {self.id!r} has shape {np.shape(value)}: "
+                    f"{shape} is needed, one row per time"
                 )
             if not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of trajectory {self.id!r} has values that are not finite: cut the trajectory "
-                    "there, or leave it out"
+                    f"{name} of trajectory {self.id!r} has values that are not finite: "
+                    "cut the trajectory there, or leave it out"
                 )
         if n < 8:
             raise ValueError(
@@ -71,24 +71,24 @@ class Trajectory:
         if step.max() > 100 * np.median(step):
             raise ValueError(
                 f"the clock of trajectory {self.id!r} has a gap of {step.max():.3g} s where rows are "
-                f"{np.median(step):.3g} s apart: cut it in two "  # noqa: E501
+                f"{np.median(step):.3g} s apart: cut it in two "
                 "there; what happened meanwhile cannot be guessed"
             )
         if np.abs(self.pos).max() > 0.5:
             raise ValueError(
-                f"pos of trajectory {self.id!r} reaches {np.abs(self.pos).max():.3g}: metres are needed, "
-                "these look like millimetres"
+                f"pos of trajectory {self.id!r} reaches {np.abs(self.pos).max():.3g}: "
+                "metres are needed, these look like millimetres"
             )
         if self.electrodes.min() < 0 or self.electrodes.max() > 4095 or self.electrodes.max() <= 8:
             raise ValueError(
                 f"electrodes of trajectory {self.id!r} lie in "
-                f"{self.electrodes.min():g}..{self.electrodes.max():g}: raw counts 0..4095 are "
-                "needed"  # noqa: E501
+                f"{self.electrodes.min():g}..{self.electrodes.max():g}: "
+                "raw counts 0..4095 are needed"
             )
         if self.force is not None and np.abs(self.force).max() > 500:
             raise ValueError(
-                f"force of trajectory {self.id!r} reaches {np.abs(self.force).max():.3g}: newtons are "
-                "needed, these look like mN"
+                f"force of trajectory {self.id!r} reaches {np.abs(self.force).max():.3g}: "
+                "newtons are needed, these look like mN"
             )
 
     @property
@@ -126,8 +126,8 @@ def read_trajectories(path) -> list[Trajectory]:
             counts, wrench = one.measured_counts, one.measured_wrench
             if one.indenter_pos is None:
                 raise ValueError(
-                    f"interaction {one.id!r} of {path} has no poses of the object: without them nothing can "
-                    "be simulated"
+                    f"interaction {one.id!r} of {path} has no poses of the object: "
+                    "without them nothing can be simulated"
                 )
             mat = Rotation.from_quat(np.roll(one.indenter_quat, -1, axis=1)).as_matrix()
             begin = float(one.parameters.get("clock", clock))

@@ -132,7 +132,7 @@ def depends_on(comparison, current, chosen):
     return (
         f"depends on {' and '.join(top) or 'several things together'}, not visibly on {', '.join(rest)}; "
         f"these explain {share:.0%} of it on trajectories left out"
-    )  # noqa: E501
+    )
 
 
 def _explained(x, y, owner):

@@ -87,7 +87,7 @@ def diagnose(
     if n < FEWEST:
         raise ValueError(
             f"{n} trajectories are too few: the trajectory is the unit of evidence and some are kept aside; "
-            f"measure at least {FEWEST}, better 24"  # noqa: E501
+            f"measure at least {FEWEST}, better 24"
         )
     if not 0 < locked < 0.6:
         raise ValueError(f"locked is {locked}: keep a share between 0 and 0.6 of the trajectories aside")
@@ -244,8 +244,8 @@ def _base(comparison, nuisance) -> list:
     notes = []
     if abs(nuisance.footprint) > 0.02:
         notes.append(
-            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: calibrate before looking "
-            "for small effects"
+            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
+            "calibrate before looking for small effects"
         )
     if nuisance.mesh > 0.5:
         notes.append(
@@ -259,16 +259,16 @@ def _notes(data, comparison):
     notes = []
     if len(data) < 12:
         notes.append(
-            f"{len(data)} trajectories: p-values cannot fall below {2.0 ** -len(data):.3g}, small effects "
-            "stay unseen"
+            f"{len(data)} trajectories: "
+            f"p-values cannot fall below {2.0 ** -len(data):.3g}, small effects stay unseen"
         )
     unloading = any(phases(t)["unload"].any() for t in data)
     if not unloading:
         notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")
     if not any(phases(t)["free"].sum() > 1 for t in data):
         notes.append(
-            "no free segment: drift and warm-up cannot be told from load; begin each trajectory before the "
-            "touch"
+            "no free segment: drift and warm-up cannot be told from load; "
+            "begin each trajectory before the touch"
         )
     if not any(phases(t)["hold"].sum() > 3 for t in data):
         notes.append("no holds: relaxation cannot be told from hysteresis")

@@ -353,7 +353,7 @@ class Thermal(TimeShaped):
                 nats,
                 0.0,
                 float(recording.time[-1]),
-                float(np.exp(-min(nats, 700))),  # noqa: E501
+                float(np.exp(-min(nats, 700))),
                 ties=("warmup",),
                 note="the common change follows TDC",
             )

@@ -59,7 +59,7 @@ class Stuck(RecordedEffect):
                     (first + long[0][0]) / rate,
                     (first + long[-1][0] + long[-1][1]) / rate,
                     p=float(max(p, 0.02) ** min(n, 200)),
-                    note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",  # noqa: E501
+                    note=f"{total / rate:.1f} s without any change; chance repeats {p:.0%} of samples",
                 )
             )
         return found
@@ -163,7 +163,7 @@ class Saturate(RecordedEffect):
                     at[-1] / session.recording.rate,
                     p=0.0,
                     note=f"{np.mean([g[1] for g in group]):.1%} of the samples lie on {level}, the "
-                    f"{'largest' if side > 0 else 'smallest'} value",  # noqa: E501
+                    f"{'largest' if side > 0 else 'smallest'} value",
                 )
             )
         return found
@@ -372,13 +372,13 @@ class Swap(RecordedEffect):
             self,
             channels,
             {"start": start, "end": end + (1 if late else 0)},
-            {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},  # noqa: E501
+            {"onset": (onset, onset - line.period * 3, onset + line.period * 3)},
             gain,
             start,
             end,
             0.0,
             note=f"with the two exchanged the misfit of that part falls by a factor {np.exp(ratio):.3g}",
-        )  # noqa: E501
+        )
 
     @staticmethod
     def _onset(z, t, a, b, cut, late, line):

@@ -117,8 +117,8 @@ class LoadLowPass(ForceEffect):
 class Relaxation(ForceEffect):
     id, name, stage = "relax", "relaxation after load changes", "C"
     physics = (
-        "force answers a change of deformation at once and relaxes towards a part of it: G(t) = Ginf "
-        "+ G1 exp(-t / tau)"
+        "force answers a change of deformation at once and relaxes towards a part of it: "
+        "G(t) = Ginf + G1 exp(-t / tau)"
     )
     params = {
         "fraction": Parameter("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),

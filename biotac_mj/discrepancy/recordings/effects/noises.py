@@ -171,8 +171,8 @@ class LowPass(RecordedEffect):
 class CrossTalk(RecordedEffect):
     id, name, stage, unit = "crosstalk", "cross-talk between electrodes", "A", "mean correlation of noise"
     physics = (
-        "V = (I + kappa K) U: part of the neighbours' signal and noise is added, neighbours in space "
-        "or in the multiplexer's order"
+        "V = (I + kappa K) U: part of the neighbours' signal and noise is added, "
+        "neighbours in space or in the multiplexer's order"
     )
     params = {
         "kappa": Parameter("1", 0.005, 0.5, "0-0.2"),
@@ -235,8 +235,8 @@ class CrossTalk(RecordedEffect):
         if pattern.startswith("distance"):
             parameters["length"] = (float(pattern.split()[1]), np.nan, np.nan)
         note = (
-            f"noise of neighbours ({pattern}) is correlated by {2 * value:.2f}; a sensor's is "
-            "independent (0.00)"
+            f"noise of neighbours ({pattern}) is correlated by {2 * value:.2f}; "
+            "a sensor's is independent (0.00)"
         )
         return [
             Finding(
@@ -329,8 +329,8 @@ class CommonNoise(RecordedEffect):
 class Noise(RecordedEffect):
     id, name, stage, unit = "noise", "excess noise of single electrodes", "A", "times the law"
     physics = (
-        "an electrode's white noise is larger than the law min(15.8 (1 - E/4095), 6.6) counts scaled "
-        "to the other electrodes"
+        "an electrode's white noise is larger than the law min(15.8 (1 - E/4095), "
+        "6.6) counts scaled to the other electrodes"
     )
     params = {"factor": Parameter("1", 1.8, 100, "a real sensor follows the law within 20 %")}
     confusable = {"hum": "a line in the spectrum", "spikes": "single samples"}
@@ -374,7 +374,7 @@ class Noise(RecordedEffect):
                     nats,
                     start,
                     end,
-                    float(np.exp(-min(nats, 700))),  # noqa: E501
+                    float(np.exp(-min(nats, 700))),
                     note=f"{own:.1f} times as noisy as the other electrodes' law",
                 )
             )
