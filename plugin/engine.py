@@ -189,7 +189,7 @@ def _compute(model, data, index, capability):
 
 @_guarded(None)
 def _advance(model, data, index):
-    _world(model, data, index).instances[index].advance()
+    _world(model, data, index).instances[index].commit_step()
 
 
 @_guarded(None)

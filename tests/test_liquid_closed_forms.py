@@ -284,7 +284,7 @@ def test_filled_sensor_in_the_coupling(coarse):
     readings.reset(memory)
     assert abs(stepper.vert_xpos(state) - coarse.vert).max() > 5e-5
     rest = readings.rest
-    result = stepper.solve(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
+    result = stepper.solve_skin(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
     counts = readings.advance(memory, 0.0, 0.01, result.vert_xpos, result.pressure)
     np.testing.assert_array_equal(
         counts["electrodes"], rest["electrodes"]

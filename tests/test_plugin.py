@@ -233,7 +233,7 @@ class _Free:
     def vert_xpos(self, state):
         return self.vert
 
-    def solve(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
         return SkinResult(
             state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert
         )
@@ -245,8 +245,8 @@ register_stepper("free", _Free)
 class _Breaking(spring_skin.SpringSkin):
     """Does not converge, or raises, once it is pressed with more than 1 N."""
 
-    def solve(self, state, geom_pos, geom_mat, dt):
-        result = super().solve(state, geom_pos, geom_mat, dt)
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
+        result = super().solve_skin(state, geom_pos, geom_mat, dt)
         result.iterations, result.residual = 7, 0.5
         if abs(result.wrench).max() > 1.0:
             if "raise" in self.options:
@@ -301,10 +301,10 @@ def test_an_exception_is_kept_warned_of_and_raised_on_request():
 
 def test_ctrl_c_inside_a_solve_is_raised_by_check():
     class Interrupted(_Free):
-        def solve(self, state, geom_pos, geom_mat, dt):
+        def solve_skin(self, state, geom_pos, geom_mat, dt):
             if geom_pos[0, 1] > -0.0178:
                 raise KeyboardInterrupt
-            return super().solve(state, geom_pos, geom_mat, dt)
+            return super().solve_skin(state, geom_pos, geom_mat, dt)
 
     register_stepper("interrupted", Interrupted)
     model, _ = two_biotacs(1, "interrupted", "none")

@@ -36,7 +36,7 @@ class NodeSprings:
     def vert_xpos(self, state):
         return state.reshape(-1, 3)
 
-    def solve(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
         x = self.geometry.vert.copy()
         away = x[self.outer] - geom_pos[0]
         distance = np.linalg.norm(away, axis=1)

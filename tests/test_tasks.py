@@ -57,7 +57,7 @@ def check(domain, task, steps):
     np.testing.assert_array_equal(first, again)
     other, _ = rollout(domain, task, steps, 4)
     assert (other != first).any()
-    touched = [np.abs(env.task.force(env.physics, i)).max() for i in range(len(env.task.biotacs))]
+    touched = [np.abs(env.task.contact_force(env.physics, i)).max() for i in range(len(env.task.biotacs))]
     assert env.action_spec().shape == (len(env.action_spec().name.split("\t")),)
     assert env.task.hidden(env.physics).shape == (len(env.task.biotacs), len(env.task.estimated))
     return touched

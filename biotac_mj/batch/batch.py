@@ -74,7 +74,7 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def solve(self, m, d, accelerated):
+    def solve_skins(self, m, d, accelerated):
         """Solves the skins where the bodies go, with d.qacc or without acceleration."""
         pos, mat = self._start_pos, self._start_mat
         if accelerated:
@@ -122,7 +122,7 @@ class Hook:
                 batch.act(m, d)
             _accelerate(m, d)
         for batch in batches:
-            batch.solve(m, d, batch.moving)
+            batch.solve_skins(m, d, batch.moving)
         if moving:
             wp.copy(d.qfrc_passive, self._outside)
             for batch in moving:

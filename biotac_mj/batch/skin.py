@@ -24,7 +24,8 @@ class BatchSkin:
 
     Attributes (wp.arrays on the model's device, double precision where nothing else is said):
       data: the SkinData: positions, materials and liquids.
-      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before `step`.
+      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before
+        `solve_skins`.
       x: (nvert, nworld) nodes [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
@@ -71,7 +72,7 @@ class BatchSkin:
         """Device memory that grows with the number of worlds [bytes]."""
         return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
-    def step(self):
+    def solve_skins(self):
         """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA
         graph.
 

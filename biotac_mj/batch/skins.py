@@ -104,7 +104,7 @@ class Skins:
         self._launch(
             kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
         )
-        skin.step()
+        skin.solve_skins()
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
         self._launch(
             kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models

@@ -57,7 +57,7 @@ class CondensedStepper(FemStepper):
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
         return (self._skin.rest + self._skin.displacement(self._read(state)))[:n]
 
-    def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
+    def solve_skin(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
@@ -81,8 +81,8 @@ class CondensedStepper(FemStepper):
     def resting(self, state):
         return not self._part(state, "forces")[0]
 
-    def stay(self, state, geom_pos, geom_mat):
-        super().stay(state, geom_pos, geom_mat)
+    def stay_at_rest(self, state, geom_pos, geom_mat):
+        super().stay_at_rest(state, geom_pos, geom_mat)
         self._part(state, "head")[:] = _AT_REST
 
     def key(self, state) -> bytes:

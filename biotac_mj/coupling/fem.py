@@ -105,7 +105,7 @@ class FemStepper:
     def vert_xpos(self, state):
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
-    def solve(self, state, geom_pos, geom_mat, dt, core_pos=_STILL[0], core_mat=_STILL[1]) -> SkinResult:
+    def solve_skin(self, state, geom_pos, geom_mat, dt, core_pos=_STILL[0], core_mat=_STILL[1]) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
@@ -158,7 +158,7 @@ class FemStepper:
         """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
         return bool(self._part(state, "resting")[0])
 
-    def clear(self, state, geom_pos, geom_mat) -> bool:
+    def is_out_of_reach(self, state, geom_pos, geom_mat) -> bool:
         """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
         come in a step [BioTac frame]."""
         return (
@@ -167,7 +167,7 @@ class FemStepper:
             and self._search.clear(geom_pos, geom_mat, _CLEAR)
         )
 
-    def stay(self, state, geom_pos, geom_mat):
+    def stay_at_rest(self, state, geom_pos, geom_mat):
         """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
         last, new = self._part(state, "geom_pos"), np.ravel(geom_pos)
         started = self._part(state, "started")
@@ -199,7 +199,7 @@ class FemStepper:
         self.reset(new)
         for name in ("started", "geom_pos", "geom_mat"):
             self._part(new, name)[:] = self._part(state, name)
-        self.stay(new, geom_pos, geom_mat)
+        self.stay_at_rest(new, geom_pos, geom_mat)
         n = 1 + max((g.group for g in self._geoms), default=-1)
         return SkinResult(new, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.vert_xpos(new))
 

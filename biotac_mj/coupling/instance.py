@@ -196,7 +196,7 @@ class Instance:
             else self.model.opt.timestep
         )
 
-    def begin(self):
+    def forget_last_solve(self):
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
         self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
@@ -221,25 +221,25 @@ class Instance:
         """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
         return getattr(self.setup.skin.stepper, "inertial", False)
 
-    def clear(self, pos, mat):
+    def is_out_of_reach(self, pos, mat):
         """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
         reach it within the step."""
         stepper, skin = self.setup.skin.stepper, self.setup.parts(self.state)[2]
-        if not hasattr(stepper, "clear") or not stepper.resting(skin):
+        if not hasattr(stepper, "is_out_of_reach") or not stepper.resting(skin):
             return False
         self._geom_pose = self.touching.geom_pose(pos, mat)
         with self.setup.skin.lock:
-            return stepper.clear(skin, *self._geom_pose)
+            return stepper.is_out_of_reach(skin, *self._geom_pose)
 
-    def rest(self, pos, mat):
-        """Instead of `solve`, after `clear` has found the skin so of bodies at these poses: costs next to
-        nothing."""
+    def stay_at_rest(self, pos, mat):
+        """Instead of `solve_for_pose`, of a skin that is out of reach of bodies at these poses: costs next
+        to nothing."""
         skin = self.setup.skin
         with skin.lock:
             self._result = skin.untouched
         self._pose, self._reading = (pos, mat), None
 
-    def solve(self, pos, mat, core=()):
+    def solve_for_pose(self, pos, mat, core=()):
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
         the result for the readings.
 
@@ -256,7 +256,7 @@ class Instance:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
-                result = skin.stepper.solve(before, *geom_pose, dt, *core)
+                result = skin.stepper.solve_skin(before, *geom_pose, dt, *core)
             if not result.converged:  # go on with what was last known to be good
                 wrench, _, pos, mat = self.last_model()
                 tangent = np.zeros((self.setup.ngroup, 6, 6))
@@ -317,7 +317,7 @@ class Instance:
         if "status" in self.sensor:
             self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan, self._tier)
 
-    def advance(self):
+    def commit_step(self):
         """Commits the solved step."""
         result = self._result
         if self._error or result is None:
@@ -329,7 +329,7 @@ class Instance:
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:] = self._pose[0], self._pose[1].reshape(n, 9)
         if result.state is None:
-            self.setup.skin.stepper.stay(skin, *self._geom_pose)
+            self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:
             skin[:] = result.state
         readings_state[:] = readings

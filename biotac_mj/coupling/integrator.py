@@ -51,7 +51,7 @@ class Integrator:
         entry = np.flatnonzero(row >= 0)
         return entry, row[entry], place[column[entry]]
 
-    def begin(self, data):
+    def take_matrices(self, data):
         """Takes M and D at this step's state, after MuJoCo's actuation stage; returns whether a' differs from
         a."""
         size, h = len(self.dofs), self.model.opt.timestep
@@ -79,7 +79,7 @@ class Integrator:
         self._inertia, self._step = inertia, np.linalg.solve(inertia - h * derivative, inertia)
         return True
 
-    def advance(self, acceleration):
+    def integrated(self, acceleration):
         """(nv,) a' of a (nv,)."""
         out = acceleration.copy()
         out[self.dofs] = self._step @ acceleration[self.dofs]

@@ -67,7 +67,7 @@ class Metric:
             else np.zeros((0, 6, self.model.nv))
         )
 
-    def begin(self, data):
+    def find_rows(self, data):
         """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them."""
         model = self.model
         self._rows = {}

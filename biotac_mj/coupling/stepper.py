@@ -50,7 +50,7 @@ class SkinResult:
 
     Attributes:
       state: (nstate,) the new state, committed by the caller; None: the skin rests as before (see
-        `SkinStepper.stay`).
+        `SkinStepper.stay_at_rest`).
       wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin
         [N, N m].
       tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric
@@ -75,14 +75,16 @@ class SkinResult:
 class SkinStepper(Protocol):
     """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions
     are not yet known, perhaps with more geoms than there will be (so more geoms may not need less state).
-    Heavy work belongs into the first `reset` or `solve`."""
+    Heavy work belongs into the first `reset` or `solve_skin`."""
 
     nstate: int
 
     def reset(self, state: np.ndarray) -> None:
         """Writes the rest state into state (nstate,)."""
 
-    def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
+    def solve_skin(
+        self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float
+    ) -> SkinResult:
         """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its
         arguments alone, which keeps `state` as it is. A stepper with a true attribute `inertial` gets
         core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
@@ -96,11 +98,11 @@ class SkinStepper(Protocol):
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""
 
-    def clear(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
+    def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
         """Whether the skin rests and no geom at these poses reaches it by a step's acceleration."""
 
-    def stay(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
-        """Makes `state`, of a skin that is `clear`, what `solve` would return."""
+    def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
+        """Makes `state`, of a skin that is out of reach, what `solve_skin` would return."""
 
 
 class Readings(Protocol):

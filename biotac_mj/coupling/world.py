@@ -47,12 +47,12 @@ class World:
         asked."""
         instance = self.instances[index]
         if not instance.two_way:
-            instance.begin()
+            instance.forget_last_solve()
             core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
-            instance.solve(*instance.touching.predict(self.data, instance.horizon), core)
+            instance.solve_for_pose(*instance.touching.predict(self.data, instance.horizon), core)
         elif index == self.first:
             for other in self.coupled:
-                other.begin()
+                other.forget_last_solve()
             self._step()
 
     def failed(self, index):
@@ -77,7 +77,7 @@ class World:
         self._damped = None
         for skin in skins:
             if skin.idle:
-                skin.rest()
+                skin.leave_at_rest()
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
@@ -102,11 +102,11 @@ class World:
         self._forces(skins, outside)
         found = self.data.acceleration()
         if self._damped is None:  # known only after the actuation stage
-            self._damped = self.integrator.begin(self.data)
+            self._damped = self.integrator.take_matrices(self.data)
         if not self._damped:
             return found
         if not any(s.tangent.any() for s in skins):
-            return self.integrator.advance(found)
+            return self.integrator.integrated(found)
         jacobian, tangent, wrench0, correction = (
             np.concatenate([getattr(s, name) for s in skins])
             for name in ("jacobian", "tangent", "wrench0", "correction")
@@ -114,7 +114,7 @@ class World:
         stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
-            moved = self.integrator.advance(found)
+            moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
             wrong = excess - correction
             poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
@@ -145,10 +145,10 @@ class _Coupled:
 
     def __init__(self, instance, data):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
-        instance.metric.begin(data)
+        instance.metric.find_rows(data)
         self.pose = instance.touching.predict(data, self.horizon)
         # the skin rests, and what comes is too far for this step's accelerations to matter
-        self.idle = instance.clear(*self.pose)
+        self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
         if self.idle:
             return
@@ -161,9 +161,9 @@ class _Coupled:
         self.solved = self.written = False
         self.converged = True
 
-    def rest(self):
+    def leave_at_rest(self):
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
-        self.instance.rest(*self.pose)
+        self.instance.stay_at_rest(*self.pose)
         self.let_go()
 
     def follow(self, acceleration):
@@ -172,7 +172,7 @@ class _Coupled:
         pose = displace(*self.pose, motion)
         if self.solved and (not self.converged or self._distance(pose) < TOLERANCE):
             return False
-        result = self.instance.solve(*pose, self._core_motion(acceleration))
+        result = self.instance.solve_for_pose(*pose, self._core_motion(acceleration))
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
         self.solved, self.converged, self.written = True, result.converged, False
         if not self.tangent.any():
