@@ -2,6 +2,8 @@
 into `mujoco_warp.step`."""
 
 import dataclasses
+import pathlib
+import typing
 import warnings
 
 import mujoco
@@ -14,12 +16,17 @@ from ..coupling.fem import _choices, _grid, rest_geometry
 from ..coupling.fem import _model as skin_model
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..skin.material import Material
 from ..skin.material import material as preset
 from .batch import Batch, Hook
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
 
 __all__ = ["add", "attach", "make"]
 
@@ -29,15 +36,15 @@ _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBi
 
 
 def add(
-    spec,
-    site=None,
-    body=None,
-    pos=(0.0, 0.0, 0.0),
-    quat=(1.0, 0.0, 0.0, 0.0),
-    prefix="biotac_",
-    skin="default",
-    coupling="two-way",
-    geoms=None,
+    spec: mujoco.MjSpec,
+    site: str | None = None,
+    body: str | None = None,
+    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
+    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    coupling: str = "two-way",
+    geoms: list | None = None,
 ) -> str:
     """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
 
@@ -97,21 +104,21 @@ def _mover(body):
 
 
 def attach(
-    mjm,
-    m,
-    d,
-    prefix="biotac_",
-    skin="default",
-    material=None,
-    liquid=None,
-    friction=None,
-    priority=0,
-    coupling="two-way",
-    geoms=None,
-    rounding=None,
-    seed=0,
-    readings=True,
-    options=None,
+    mjm: mujoco.MjModel,
+    m: "mjw.Model",
+    d: "mjw.Data",
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    coupling: str = "two-way",
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    seed: int = 0,
+    readings: bool | dict = True,
+    options: dict | None = None,
 ) -> Batch:
     """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on
     `mjw.step(m, d)` steps them too.
@@ -162,20 +169,20 @@ def attach(
 
 
 def make(
-    mjm,
-    nworld,
-    device=None,
-    prefix="biotac_",
-    skin="default",
-    material=None,
-    liquid=None,
-    friction=None,
-    priority=0,
-    geoms=None,
-    rounding=None,
-    seed=0,
-    readings=True,
-    options=None,
+    mjm: mujoco.MjModel,
+    nworld: int,
+    device: str | None = None,
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    seed: int = 0,
+    readings: bool | dict = True,
+    options: dict | None = None,
 ) -> PoseBatch:
     """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step,
     such as mjx.

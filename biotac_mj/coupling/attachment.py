@@ -2,11 +2,13 @@
 
 import dataclasses
 import importlib.resources
+import pathlib
 import weakref
 
 import mujoco
 import numpy as np
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from .config import PLUGIN_NAME, Config
 from .stepper import check_names
@@ -30,7 +32,7 @@ class Handle:
     body: str
     config: Config
 
-    def sensor(self, channel) -> str:
+    def sensor(self, channel: str) -> str:
         """Name of a channel's sensor: electrodes, pdc, pac, tac, tdc, contact_force or status.
 
         Raises:
@@ -40,14 +42,14 @@ class Handle:
             raise ValueError(f"a BioTac has no channel {channel!r}: choose one of {', '.join(CHANNELS)}")
         return self.prefix + channel
 
-    def read(self, data, channel) -> np.ndarray:
+    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray:
         """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m]
         on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
         converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
         measured)."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
-    def vert_xpos(self, model, data) -> np.ndarray:
+    def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
         index = int(model.body_plugin[model.body(self.body).id])
         setup = _setup(model, index)
@@ -71,27 +73,27 @@ def _setup(model, index):
 
 
 def attach(
-    spec,
-    site=None,
-    body=None,
-    pos=(0.0, 0.0, 0.0),
-    quat=(1.0, 0.0, 0.0, 0.0),
-    prefix="biotac_",
-    skin="default",
-    material=None,
-    liquid=None,
-    coupling="two-way",
-    geoms=None,
-    rounding=None,
-    friction=None,
-    priority=0,
-    seed=0,
-    device="cpu",
-    stepper="fem",
-    tier="full",
-    readings="biotac",
-    options=None,
-    slots=None,
+    spec: mujoco.MjSpec,
+    site: str | None = None,
+    body: str | None = None,
+    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
+    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    coupling: str = "two-way",
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    seed: int = 0,
+    device: str = "cpu",
+    stepper: str = "fem",
+    tier: str = "full",
+    readings: str = "biotac",
+    options: dict | None = None,
+    slots: int | None = None,
 ) -> Handle:
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 
 __all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
 
@@ -69,7 +70,7 @@ class Config:
         return {f.name: json.dumps(getattr(self, f.name)) for f in dataclasses.fields(self)}
 
     @classmethod
-    def parse(cls, read) -> "Config":
+    def parse(cls, read: Callable[[str], str]) -> "Config":
         """Settings from read(attribute) -> text, "" where the model gives none.
 
         Raises:

@@ -3,9 +3,13 @@ deformed skin and give counts."""
 
 import dataclasses
 import importlib
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from .config import Config
 
 __all__ = [
     "Geom",
@@ -146,13 +150,13 @@ _readings = {
 }
 
 
-def register_stepper(name, factory):
+def register_stepper(name: str, factory: Callable) -> None:
     """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)`
     takes."""
     _steppers[name] = factory
 
 
-def register_readings(name, factory):
+def register_readings(name: str, factory: Callable) -> None:
     """Makes factory(config, geometry) -> Readings known under a name that `attach(readings=...)` takes."""
     _readings[name] = factory
 
@@ -164,7 +168,7 @@ def _factory(table, name):
     return table[name]
 
 
-def check_names(config):
+def check_names(config: Config) -> None:
     """Raises ValueError if the settings name a stepper or readings that nobody registered."""
     for table, name, what in (
         (_steppers, config.stepper, "stepper"),
@@ -177,7 +181,7 @@ def check_names(config):
             )
 
 
-def make_stepper(config, geometry, geoms) -> SkinStepper:
+def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> SkinStepper:
     """The skin that `config.stepper` names, of the tier that `config.tier` names.
 
     Raises:
@@ -189,7 +193,7 @@ def make_stepper(config, geometry, geoms) -> SkinStepper:
     return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 
-def make_readings(config, geometry) -> Readings:
+def make_readings(config: Config, geometry: SkinGeometry) -> Readings:
     """The readings that `config.readings` names.
 
     Raises:

@@ -79,7 +79,7 @@ def _c_type(node):
     )
 
 
-def c_structs(name):
+def c_structs(name: str) -> type:
     """The ctypes.Structure of one of MuJoCo's public structs, for example "mjData"."""
     if name not in _built:
         fields = []
@@ -153,7 +153,7 @@ def _pointer_fields(kind):
 class ModelView(_View):
     """mjModel at an address. Arrays are found once and kept: a model's arrays never move."""
 
-    def __init__(self, address):
+    def __init__(self, address: int):
         super().__init__("mjModel", address)
 
     def __getattr__(self, name):
@@ -161,19 +161,19 @@ class ModelView(_View):
         self.__dict__[name] = value
         return value
 
-    def name(self, kind, index):
+    def name(self, kind: str, index: int) -> str:
         """Name of an object, for example name("body", 3)."""
         start = getattr(self, f"name_{kind}adr")[index]
         names = self.names
         return names[start : start + int(np.argmax(names[start:] == 0))].tobytes().decode()
 
-    def config(self, instance, attribute):
+    def config(self, instance: int, attribute: str) -> str:
         """Configuration string of a plugin instance, "" where the model gives none."""
         value = LIBRARY.mj_getPluginConfig(self.address, instance, attribute.encode())
         return value.decode() if value else ""
 
     @property
-    def is_sparse(self):
+    def is_sparse(self) -> bool:
         return bool(LIBRARY.mj_isSparse(self.address))
 
 
@@ -181,7 +181,7 @@ class DataView(_View):
     """mjData at an address. Arrays of fixed size are kept; those that live on the arena (efc_*, contacts) are
     looked up at each use."""
 
-    def __init__(self, address, model):
+    def __init__(self, address: int, model: ModelView):
         super().__init__("mjData", address)
         self.model = model
         self._own = {name for name, *_ in self.struct._fields_}
@@ -199,7 +199,7 @@ class DataView(_View):
             self.__dict__[name] = value
         return value
 
-    def jacobian(self, body, point):
+    def jacobian(self, body: int, point: np.ndarray) -> np.ndarray:
         """(6, nv) Jacobian of the point [m, world] that moves with `body`: translation, then rotation."""
         out = np.empty((6, self.model.nv))
         address = out.ctypes.data
@@ -208,12 +208,12 @@ class DataView(_View):
         )
         return out
 
-    def project_constraints(self):
+    def project_constraints(self) -> None:
         """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and
         regularisation."""
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
 
-    def acceleration(self):
+    def acceleration(self) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.
 

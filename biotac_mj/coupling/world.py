@@ -12,6 +12,7 @@ import numpy as np
 
 from .instance import Instance
 from .integrator import FixedPoint, Integrator
+from .structs import DataView, ModelView
 from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
@@ -30,7 +31,7 @@ _SCALE = np.array([1.0, 1.0, 1.0, *[1 / _LEVER] * 3])  # compares torques with f
 class World:
     """The instances of the plugin in one mjData."""
 
-    def __init__(self, model, data, indices):
+    def __init__(self, model: ModelView, data: DataView, indices: list[int]):
         self.model, self.data = model, data
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
@@ -42,7 +43,7 @@ class World:
             model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
         )
 
-    def passive(self, index):
+    def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
         instance = self.instances[index]
@@ -55,7 +56,7 @@ class World:
                 other.forget_last_solve()
             self._step()
 
-    def failed(self, index):
+    def failed(self, index: int) -> None:
         """After an exception: no skin that was being solved is known, and none acts."""
         instance = self.instances[index]
         for other in self.coupled if instance.two_way else [instance]:

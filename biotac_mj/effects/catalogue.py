@@ -66,7 +66,7 @@ CATALOGUE = (
 )
 
 
-def by_id(name: str, extra=()) -> Effect:
+def by_id(name: str, extra: tuple | list = ()) -> Effect:
     """The effect of that id.
 
     Raises:

@@ -94,12 +94,12 @@ class Run:
         """(n,) against the heading, positive while pressed [N]."""
         return np.maximum(-self.force @ self.heading, 0)
 
-    def give(self, compliance) -> np.ndarray:
+    def give(self, compliance: float) -> np.ndarray:
         """(n,) x = compliance F(depth - x): how far something in series gives way [m]."""
         stiffness = 0.0 if self.stiffness is None else self.stiffness
         return compliance * self.normal_force / (1 + max(compliance, 0) * stiffness)
 
-    def scale_load(self, factor):
+    def scale_load(self, factor: float | np.ndarray) -> None:
         """Multiplies what the rubber bears: force and the liquid's pressure (n,)."""
         factor = np.broadcast_to(factor, self.time.shape)
         self.force = self.force * factor[:, None]
@@ -125,7 +125,7 @@ class Effect(abc.ABC):
     def apply(self, run: Run, theta: dict) -> None:
         """Changes `run` where the effect acts."""
 
-    def applicable(self, trajectories) -> str | None:
+    def applicable(self, trajectories: list) -> str | None:
         """Why the data cannot show the effect, or None."""
         return None
 
@@ -143,7 +143,7 @@ class Effect(abc.ABC):
         return {**{n: p.start for n, p in self.params.items()}, **self.grid[0]}
 
 
-def memory(run, x, tau):
+def memory(run: Run, x: np.ndarray, tau: float) -> np.ndarray:
     """(n, ...) x less its exponential memory: what has changed within about tau."""
     out = np.zeros_like(x)
     for i in range(1, len(x)):

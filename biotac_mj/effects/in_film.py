@@ -4,6 +4,7 @@ conductance."""
 import numpy as np
 
 from ..sensor.film import FilmConduction
+from ..skin import SkinData, SkinModel
 
 __all__ = ["RoughFilm", "drain", "left"]
 
@@ -20,21 +21,21 @@ class RoughFilm(FilmConduction):
       film: FilmConduction; power: 1 is a smooth film.
     """
 
-    def __init__(self, film, power):
+    def __init__(self, film: FilmConduction, power: float):
         self.__dict__.update(film.__dict__)
         self._power, self._rest = power, film.film(film.geometry.vert)[1]
 
-    def film(self, vert_xpos):
+    def film(self, vert_xpos: np.ndarray) -> tuple:
         middle, thickness = super().film(vert_xpos)
         return middle, self._rest * (thickness / self._rest) ** self._power
 
 
-def left(rate, clock) -> float:
+def left(rate: float, clock: float) -> float:
     """Share of the liquid that is left at the session's clock [s] where `rate` is lost in an hour."""
     return 1 - min(rate * clock / 3600, _MOST)
 
 
-def drain(model, data, share):
+def drain(model: SkinModel, data: SkinData, share: float) -> None:
     """Brings an untouched skin to rest on a share of its liquid."""
     from ..skin import GeomSet, step
 

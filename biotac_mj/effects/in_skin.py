@@ -4,6 +4,7 @@ of a skin's material, contact, model and film.
 `docs/discrepancy.md` says how much the reduced forms differ."""
 
 import typing
+from collections.abc import Callable
 
 import numpy as np
 
@@ -79,7 +80,7 @@ class Inside(typing.NamedTuple):
     rest: list
 
 
-def memory_of(effects) -> Inside:
+def memory_of(effects: list) -> Inside:
     """What effects [(Effect, theta)] change of a skin in which they act themselves."""
     inside = Inside({"prony": ()}, {}, {}, {}, [])
     for effect, theta in effects:
@@ -106,7 +107,7 @@ def _mullins(inside, theta):
         inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
 
 
-def modulus_of(theta):
+def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
     """Function of positions (n, 3) [m] that gives the factors (n,) on Young's modulus of
     `skin_and_setup.Inhomogeneity`."""
 

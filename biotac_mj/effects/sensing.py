@@ -4,7 +4,7 @@ given skin."""
 import numpy as np
 
 from ..geometry.electrodes import electrode_positions
-from .effect import LAW, Effect, Param, memory
+from .effect import LAW, Effect, Param, Run, memory
 
 __all__ = [
     "FluidLoss",
@@ -34,7 +34,7 @@ class FluidLoss(Effect):
         "gain": "the same probe at the beginning and the end of the session",
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.log_z - np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))[:, None]
 
 
@@ -48,11 +48,11 @@ class Thermal(Effect):
     }
     confusable = {"warmup": "heater on and off"}
 
-    def applicable(self, trajectories):
+    def applicable(self, trajectories: list) -> str | None:
         tdc = [t.tdc for t in trajectories if t.tdc is not None]
         return None if tdc and np.ptp(np.concatenate(tdc)) > 8 else "no TDC, or it does not change"
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         if run.temperature is not None:
             run.log_z = run.log_z - theta["alpha"] * run.temperature[:, None]
 
@@ -72,7 +72,7 @@ class WarmUp(Effect):
         "drift": "free segments: one electrode or all",
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
 
 
@@ -84,7 +84,7 @@ class Asperities(Effect):
     }
     confusable = {"gain": "one electrode or all", "saturate": "depth ladder"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.rest_log_z + np.exp(theta["log_p"]) * (run.log_z - run.rest_log_z)
 
 
@@ -98,13 +98,13 @@ class Gain(Effect):
         "saturate": "depth ladder",
     }
 
-    def doubt(self, theta):
+    def doubt(self, theta: dict) -> str | None:
         g = np.array(list(theta.values()))
         return (
             "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
         )  # scatter of manufacturing has no mean
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
         run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))
 
@@ -124,7 +124,7 @@ class CrossTalk(Effect):
         "base": "a footprint or mesh that is a little off looks alike",
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         p = electrode_positions()
         K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
@@ -142,7 +142,7 @@ class Saturation(Effect):
     law = LAW
     confusable = {"gain": "depth ladder at one place"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
         change = run.counts - rest
         over = np.sign(change) * np.maximum(np.abs(change) - theta["knee"], 0)
@@ -156,7 +156,7 @@ class LowPass(Effect):
     law = LAW
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         if theta["tau"] > 0:
             run.counts = run.counts - memory(run, run.counts, theta["tau"])
 
@@ -167,7 +167,7 @@ class Latency(Effect):
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         at = run.time - theta["delay"]
         run.counts = np.stack([np.interp(at, run.time, c) for c in run.counts.T], axis=1)
 
@@ -179,7 +179,7 @@ class Drift(Effect):
     law = LAW
     confusable = {"warmup": "free segments over the session", "relax": "free segments"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.counts = run.counts + theta["rate"] * (run.time - run.time[0])[:, None]
 
 
@@ -189,10 +189,10 @@ class PressureGain(Effect):
     params = {"gain": Param("1", -0.7, 2.0, "transducer 10 %", 0.15)}
     confusable = {"bubble": "electrodes far from the contact", "relax": "holds"}
 
-    def applicable(self, trajectories):
+    def applicable(self, trajectories: list) -> str | None:
         return None if any(t.pdc is not None for t in trajectories) else "no PDC"
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.pdc = 2000 + (run.pdc - 2000) * (1 + theta["gain"])
 
 
@@ -202,8 +202,8 @@ class ForceZero(Effect):
     params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
     confusable = {"misalign": "turn the force sensor by 180 degrees", "friction": "press without slides"}
 
-    def applicable(self, trajectories):
+    def applicable(self, trajectories: list) -> str | None:
         return None if any(t.force is not None for t in trajectories) else "no force"
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))

@@ -8,7 +8,7 @@ exact for linear materials while the contact grows)."""
 import numpy as np
 from scipy.special import erf
 
-from .effect import LAW, Effect, Param, memory
+from .effect import LAW, Effect, Param, Run, memory
 
 __all__ = [
     "Relaxation",
@@ -43,7 +43,7 @@ class Relaxation(Effect):
         "creep": "a hold of 100 s",
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
         run.pressure = run.pressure + theta["g"] * memory(run, run.pressure, theta["tau"])
 
@@ -55,7 +55,7 @@ class PowerCreep(Effect):
     law = LAW
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
         # slope n ln 3).
         for tau in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0):
@@ -83,7 +83,7 @@ class Hysteresis(Effect):
         "mullins": "a third cycle to the same depth",
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         z, width = np.zeros(len(run.depth)), theta["width"]
         for i in range(1, len(z)):
             z[i] = np.clip(z[i - 1] + run.depth[i] - run.depth[i - 1], -width, width)
@@ -105,7 +105,7 @@ class Mullins(Effect):
     law = LAW
     confusable = {"hyster": "a third cycle to the same depth", "adhesion": "talc on the skin"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         seen = run.session.setdefault("mullins", [])
         before = max(
             (d * np.exp(-((np.linalg.norm(p - run.place) / theta["reach"]) ** 2)) for p, d in seen),
@@ -125,7 +125,7 @@ class Stiffening(Effect):
     law = LAW
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.scale_load(1 + theta["c2"] * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
 
 
@@ -141,7 +141,7 @@ class Inhomogeneity(Effect):
         "sensor"
     }
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
         run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
 
@@ -152,7 +152,7 @@ class Bubble(Effect):
     params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
     confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.bubble = run.bubble + theta["volume"]
 
 
@@ -162,11 +162,11 @@ class Friction(Effect):
     params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
     confusable = {"fric_load": "slides at three normal loads with two radii"}
 
-    def applicable(self, trajectories):
+    def applicable(self, trajectories: list) -> str | None:
         slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
         return None if slide > 0.3e-3 else "no slides"
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.log_friction = run.log_friction + theta["log_mu"]
 
 
@@ -180,7 +180,7 @@ class FrictionLoad(Effect):
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         normal = -np.outer(run.force @ run.heading, run.heading)
         tangential = run.force + normal
         run.force = (
@@ -195,7 +195,7 @@ class Adhesion(Effect):
     law = LAW
     confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         radius, modulus = 3.5e-3, 1e6
         a = np.sqrt(radius * np.maximum(run.depth, 0))
         out = np.gradient(run.depth, run.time) < -1e-9
@@ -211,10 +211,10 @@ class Radius(Effect):
     params = {"log_radius": Param("1", -0.4, 0.4, "+-25 %", 0.1)}
     confusable = {"mount": "light load", "stiffen": "another tool"}
 
-    def applicable(self, trajectories):
+    def applicable(self, trajectories: list) -> str | None:
         return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         if "sphere" in run.tool:
             run.log_radius = run.log_radius + theta["log_radius"]
 
@@ -225,7 +225,7 @@ class Misalignment(Effect):
     params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")}
     confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.offset = run.offset + np.array([theta["x"], 0, theta["z"]])
 
 
@@ -235,7 +235,7 @@ class DepthZero(Effect):
     params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
     confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.offset = run.offset + theta["dz"] * run.heading
 
 
@@ -245,7 +245,7 @@ class Mount(Effect):
     params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
     confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
 
 
@@ -255,5 +255,5 @@ class Rocking(Effect):
     params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in ("x", "z")}
     confusable = {"misalign": "light load", "mount": "camera on the clamp"}
 
-    def apply(self, run, theta):
+    def apply(self, run: Run, theta: dict) -> None:
         run.offset = run.offset + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))

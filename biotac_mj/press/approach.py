@@ -57,7 +57,7 @@ def _normal_at(tri, point):
     return normal / np.linalg.norm(normal)
 
 
-def surface_point(geometry: SkinGeometry, x: float, angle: float):
+def surface_point(geometry: SkinGeometry, x: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """The point of the outer surface at a place along and around the finger.
 
     Args:
@@ -84,7 +84,7 @@ def surface_point(geometry: SkinGeometry, x: float, angle: float):
     return point, _normal_at(tri, point)
 
 
-def nearest_point(geometry: SkinGeometry, position):
+def nearest_point(geometry: SkinGeometry, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The point of the outer surface that is nearest to position (3,) [m], and its unit outward normal
     (3,)."""
     tri = geometry.vert[geometry.outer_face]
@@ -104,7 +104,7 @@ def first_touch(
     geometry: SkinGeometry,
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    direction,
+    direction: np.ndarray,
     resolution: float = 2e-5,
     keep: int = 48,
 ) -> float:

@@ -165,7 +165,9 @@ def make_indenter(text: str) -> Indenter:
     )
 
 
-def add_indenter(spec: mujoco.MjSpec, body, shape: Indenter, exact: bool = True, **geom):
+def add_indenter(
+    spec: mujoco.MjSpec, body: "mujoco._specs.MjsBody", shape: Indenter, exact: bool = True, **geom: object
+) -> "mujoco._specs.MjsGeom":
     """Adds the indenter's geom, named "indenter", to a body of a spec whose frame is the indenter's.
 
     Args:

@@ -100,7 +100,7 @@ class Path:
         return self.start + depth * self.direction + slid * self.slide_direction
 
 
-def rotation_from_y(direction):
+def rotation_from_y(direction: np.ndarray) -> np.ndarray:
     """Quaternion of the smallest rotation that takes +y to a unit direction."""
     quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
     return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])

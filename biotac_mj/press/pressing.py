@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -25,7 +26,11 @@ def _read(handle, data):
     return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
 
 
-def press(options: PressOptions = PressOptions(), render=None, progress: bool = True):  # noqa: B008 - frozen
+def press(
+    options: PressOptions = PressOptions(),  # noqa: B008 - frozen
+    render: Callable | None = None,
+    progress: bool = True,
+) -> tuple[PressRecord, np.ndarray | None]:
     """Presses.
 
     Args:
@@ -100,7 +105,9 @@ def press(options: PressOptions = PressOptions(), render=None, progress: bool = 
     return record, picture
 
 
-def render(model, data, width: int = 900, height: int = 640):
+def render(
+    model: mujoco.MjModel, data: mujoco.MjData, width: int = 900, height: int = 640
+) -> np.ndarray | None:
     """(height, width, 3) uint8 of the scene through the camera "press"; None where no GL library works."""
     from ..view.offscreen import Offscreen, find_gl
 

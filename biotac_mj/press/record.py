@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class PressRecord:
         return int(np.flatnonzero(self.depth >= self.depth.max() - 1e-9)[-1])
 
 
-def write_readings(record: PressRecord, path) -> None:
+def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
     """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved
     step."""
     tier = record.parameters.get("tier", "full")
@@ -96,7 +97,7 @@ def write_readings(record: PressRecord, path) -> None:
             )
 
 
-def write_skin(record: PressRecord, path) -> None:
+def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
     """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and
     versions as JSON attributes."""
     import h5py

@@ -1,8 +1,11 @@
 """The picture of a press and its table on the terminal. No window and no global state of matplotlib is
 touched."""
 
+import pathlib
+
 import mujoco
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -26,7 +29,7 @@ def _unroll(points):
     return 1e3 * np.stack([points[:, 0], _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])], axis=1)
 
 
-def draw_electrodes(axes, record: PressRecord, step: int) -> None:
+def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
     """The unrolled core: electrodes coloured by their change (red: fewer counts, as in the render) over
     contours of the skin's motion."""
     geometry = record.geometry
@@ -64,7 +67,7 @@ def draw_electrodes(axes, record: PressRecord, step: int) -> None:
     axes.margins(0.12)
 
 
-def draw_force(axes, record: PressRecord) -> None:
+def draw_force(axes: Axes, record: PressRecord) -> None:
     """Components and size of the force over depth."""
     depth = 1e3 * record.depth
     for i, name in enumerate("xyz"):
@@ -75,7 +78,7 @@ def draw_force(axes, record: PressRecord) -> None:
     axes.grid(alpha=0.3)
 
 
-def draw_traces(axes, record: PressRecord, named: int = 6) -> None:
+def draw_traces(axes: Axes, record: PressRecord, named: int = 6) -> None:
     """Changes of the 19 electrodes over time; those that change most are named."""
     change = record.electrode_change
     order = np.argsort(-np.abs(change).max(0))
@@ -88,7 +91,7 @@ def draw_traces(axes, record: PressRecord, named: int = 6) -> None:
     axes.grid(alpha=0.3)
 
 
-def draw_surface(axes, record: PressRecord, step: int) -> None:
+def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
     """What stands in for MuJoCo's render: deformed outer skin, nail and indenter as shaded triangles, seen
     from beside the pad.
 
@@ -138,7 +141,7 @@ def draw_surface(axes, record: PressRecord, step: int) -> None:
     axes.set_axis_off()
 
 
-def write_picture(record: PressRecord, path, render: np.ndarray | None = None) -> None:
+def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndarray | None = None) -> None:
     """press.png: render, electrode map, force over depth, electrode traces.
 
     Args:
@@ -169,7 +172,7 @@ def write_picture(record: PressRecord, path, render: np.ndarray | None = None) -
         figure.savefig(temporary, dpi=110)
 
 
-def table(record: PressRecord, files=()) -> str:
+def table(record: PressRecord, files: tuple | list = ()) -> str:
     """The end of a press in a few lines of text."""
     force = np.linalg.norm(record.force, axis=1)
     change = record.electrode_change[record.deepest]

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from ..coupling.attachment import Handle
 from .indenter import Indenter, add_indenter
 from .path import LEAD, Path, PressOptions
 
@@ -16,7 +17,7 @@ _PREFIX = "biotac_"
 _SERVO_STIFFNESS, _SERVO_MASS = 5e4, 1.25
 
 
-def build_scene(indenter: Indenter, path: Path, options: PressOptions):
+def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[mujoco.MjSpec, Handle]:
     """The BioTac on a fixed body, the indenter on a mocap body or, two-way, on slide joints with servos; a
     camera named "press".
 
@@ -77,7 +78,7 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions):
     return spec, handle
 
 
-def see_through(spec, handle):
+def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
     """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are
     seen."""
     spec.skin(handle.prefix + "skin").rgba[3] = 0.45

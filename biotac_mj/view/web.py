@@ -2,11 +2,15 @@
 recorded press. Extra `web`."""
 
 import dataclasses
+import pathlib
 import time as clock
+from collections.abc import Callable
 
+import mujoco
 import numpy as np
 
 from ..coupling.show import electrode_colors
+from ..geometry.skin_geometry import SkinGeometry
 
 __all__ = ["Finger", "Page", "play_file", "play_model"]
 
@@ -34,7 +38,7 @@ class Finger:
     rest: np.ndarray
 
     @classmethod
-    def of(cls, geometry, rest):
+    def of(cls, geometry: SkinGeometry, rest: np.ndarray) -> "Finger":
         """Of a SkinGeometry."""
         node, face = np.unique(geometry.outer_face, return_inverse=True)
         face = face.reshape(-1, 3)
@@ -62,7 +66,7 @@ class Page:
       ValueError: viser is not installed; the text says what to do.
     """
 
-    def __init__(self, fingers, host="127.0.0.1", port=8080):
+    def __init__(self, fingers: dict[str, Finger], host: str = "127.0.0.1", port: int = 8080):
         try:
             import viser
         except ImportError as error:
@@ -141,7 +145,7 @@ class Page:
             )
         self._aimed = True
 
-    def update(self, time, state):
+    def update(self, time: float, state: dict) -> None:
         """Shows a moment.
 
         Args:
@@ -170,7 +174,7 @@ class Page:
                 plot.data = (rows[0], rows[20], rows[21])
         self.server.flush()
 
-    def close(self):
+    def close(self) -> None:
         """Stops the server."""
         self.server.stop()
 
@@ -197,7 +201,15 @@ def _series(viser, names):
     )
 
 
-def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **server):
+def play_model(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    handles: dict,
+    page: Page | None = None,
+    seconds: float = np.inf,
+    control: Callable | None = None,
+    **server: object,
+) -> Page:
     """Steps a model and shows its BioTacs 25 times a second of its time; returns the page.
 
     Args:
@@ -206,8 +218,6 @@ def play_model(model, data, handles, page=None, seconds=np.inf, control=None, **
       seconds: how long [s of the model].
       control: f(data), called before each step.
     """
-    import mujoco
-
     from .. import plugin
     from ..geometry import load_skin
     from ..sensor.channels import REST_COUNTS
@@ -257,15 +267,19 @@ def _state(model, data, handle, finger, rest):
     )
 
 
-def play_file(path, page=None, speed=1.0, rounds=np.inf, **server):
+def play_file(
+    path: pathlib.Path | str,
+    page: Page | None = None,
+    speed: float = 1.0,
+    rounds: float = np.inf,
+    **server: object,
+) -> Page:
     """Shows a recorded press (skin.h5 of `biotac press`) again and again; returns the page.
 
     Raises:
       FileNotFoundError: no such file.
       ValueError: it is no recorded press.
     """
-    import pathlib
-
     import h5py
 
     from ..geometry import load_skin

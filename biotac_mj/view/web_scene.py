@@ -15,7 +15,7 @@ class Scene:
       server: ViserServer. model: MjModel. hidden: names of bodies that are shown otherwise.
     """
 
-    def __init__(self, server, model, hidden=()):
+    def __init__(self, server: object, model: mujoco.MjModel, hidden: tuple | list = ()):
         hidden = {model.body(name).id for name in hidden}
         self._frames = {}
         for g in range(model.ngeom):
@@ -36,7 +36,7 @@ class Scene:
                 flat_shading=False,
             )
 
-    def update(self, data):
+    def update(self, data: mujoco.MjData) -> None:
         """Moves the bodies to where they are in `data`."""
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = data.xpos[body].copy(), data.xquat[body].copy()

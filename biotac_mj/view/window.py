@@ -2,6 +2,7 @@
 are shown by the plugin."""
 
 import os
+import pathlib
 import sys
 import time
 
@@ -9,7 +10,9 @@ import mujoco
 import numpy as np
 
 from .. import plugin
+from ..coupling.attachment import Handle
 from ..files import replacing
+from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
 
@@ -21,7 +24,9 @@ _PAD_UP = np.array(
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 
 
-def build_scene(skin="default", **attach_options):
+def build_scene(
+    skin: str | pathlib.Path | SkinGeometry = "default", **attach_options: object
+) -> tuple[mujoco.MjSpec, Handle]:
     """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs
     keep it over the pad.
 
@@ -79,7 +84,9 @@ def _light(spec):
     )
 
 
-def build_hand(path, skin="coarse", **attach_options):
+def build_hand(
+    path: pathlib.Path | str, skin: str | pathlib.Path | SkinGeometry = "coarse", **attach_options: object
+) -> tuple[mujoco.MjSpec, dict]:
     """A Shadow Hand of MuJoCo Menagerie, palm up, with five BioTacs and a ball that lies on its fingers.
 
     Args:
@@ -93,8 +100,6 @@ def build_hand(path, skin="coarse", **attach_options):
       FileNotFoundError: no such file.
       ValueError: it is no Shadow Hand.
     """
-    import pathlib
-
     from ..tasks.hands import attach_to_hand
 
     if not pathlib.Path(path).is_file():
@@ -111,19 +116,19 @@ def build_hand(path, skin="coarse", **attach_options):
 
 
 def view(
-    skin="default",
-    material="default",
-    liquid=None,
-    seed=0,
-    device="cpu",
-    tier="full",
-    render=None,
-    seconds=0.3,
-    hand=None,
-    web=False,
-    recording=None,
-    port=8080,
-):
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str = "default",
+    liquid: bool | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    tier: str = "full",
+    render: pathlib.Path | str | None = None,
+    seconds: float = 0.3,
+    hand: pathlib.Path | str | None = None,
+    web: bool = False,
+    recording: pathlib.Path | str | None = None,
+    port: int = 8080,
+) -> object:
     """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
 
     Args:
