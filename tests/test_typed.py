@@ -6,7 +6,7 @@ import inspect
 import pytest
 from imports import modules
 
-TYPED = ("coupling", "batch", "press", "view", "effects")  # those that are done
+TYPED = ("coupling", "batch", "press", "view", "effects", "geometry", "calibration")  # those that are done
 
 
 def _public_modules():

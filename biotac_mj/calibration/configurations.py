@@ -36,7 +36,7 @@ CONFIGURATIONS = {
 }
 
 
-def configuration(name: str, skin: str = "coarse", **options) -> Configuration:
+def configuration(name: str, skin: str = "coarse", **options: object) -> Configuration:
     """One of the paper's four configurations.
 
     Args:

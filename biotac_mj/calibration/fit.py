@@ -42,13 +42,13 @@ class Parameter:
     upper: float
     logarithmic: bool = False
 
-    def scaled(self, value):
+    def scaled(self, value: float) -> float:
         return np.log(value) if self.logarithmic else 2 * value / (self.upper - self.lower)
 
-    def value(self, scaled):
+    def value(self, scaled: float) -> float:
         return float(np.exp(scaled)) if self.logarithmic else float(scaled * (self.upper - self.lower) / 2)
 
-    def slope(self, value):
+    def slope(self, value: float) -> float:
         """d value / d scaled."""
         return value if self.logarithmic else (self.upper - self.lower) / 2
 
@@ -151,11 +151,11 @@ class Calibration:
 def forces_and_jacobian(
     configuration: Configuration,
     material: Material,
-    parameters,
-    values,
+    parameters: list,
+    values: np.ndarray,
     indentation: Indentation,
-    device="cpu",
-):
+    device: str = "cpu",
+) -> tuple[np.ndarray, np.ndarray]:
     """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one
     batch.
 
@@ -198,7 +198,7 @@ def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
-    parameters=("E", "nu", "mu"),
+    parameters: list | tuple = ("E", "nu", "mu"),
     max_iterations: int = 20,
     device: str = "cpu",
     progress: bool = False,

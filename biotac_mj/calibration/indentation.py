@@ -79,14 +79,14 @@ class Indentation:
 
 
 def plan_indentation(
-    indenter="sphere_7mm",
-    location=(-0.010, 0.3),
-    depth=1.2e-3,
-    slide=1.2e-3,
-    slide_direction=(1, 0, 0),
-    direction=None,
-    samples=24,
-    skin="coarse",
+    indenter: str = "sphere_7mm",
+    location: tuple = (-0.010, 0.3),
+    depth: float = 1.2e-3,
+    slide: float = 1.2e-3,
+    slide_direction: tuple | np.ndarray = (1, 0, 0),
+    direction: tuple | np.ndarray | None = None,
+    samples: int = 24,
+    skin: str = "coarse",
 ) -> Indentation:
     """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along
     it.
@@ -125,7 +125,10 @@ def plan_indentation(
 
 
 def plan_shear(
-    indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4, **place
+    indenter: str = "sphere_7mm",
+    corners: tuple = ((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)),
+    stride: float = 2e-4,
+    **place: object,
 ) -> Indentation:
     """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a
     press that squeezes the skin on the core, in which the force hardly depends on nu.
@@ -148,7 +151,9 @@ def plan_shear(
     return dataclasses.replace(plan, time=0.02 * np.arange(len(tip)), tip=tip, force=np.zeros_like(tip))
 
 
-def read_indentation(path, indenter: str | None = None, direction=None) -> Indentation:
+def read_indentation(
+    path: pathlib.Path | str, indenter: str | None = None, direction: tuple | np.ndarray | None = None
+) -> Indentation:
     """Reads force-deflection data.
 
     CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is
@@ -174,7 +179,7 @@ def read_indentation(path, indenter: str | None = None, direction=None) -> Inden
     return _read_press(path, indenter) if path.suffix == ".h5" else _read_csv(path, indenter, direction)
 
 
-def write_indentation(indentation: Indentation, path) -> None:
+def write_indentation(indentation: Indentation, path: pathlib.Path | str) -> None:
     """Writes COLUMNS and the orientation as CSV (to a temporary name, then renamed)."""
     n = len(indentation.time)
     rows = np.column_stack(

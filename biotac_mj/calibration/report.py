@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 
 from ..files import replacing
+from ..skin.material import Material
 from .fit import Calibration
 
 __all__ = ["calibration_table", "read_material", "write_json", "write_picture"]
@@ -66,14 +68,14 @@ def plain(value):
     return value
 
 
-def write_json(content, path) -> None:
+def write_json(content: dict, path: pathlib.Path | str) -> None:
     """A dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite become
     null."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
 
 
-def read_material(path):
+def read_material(path: pathlib.Path | str) -> Material:
     """The material in a calibration's JSON.
 
     Raises:
@@ -97,7 +99,7 @@ def read_material(path):
         ) from error
 
 
-def write_picture(result: Calibration, path) -> None:
+def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
     """Measured and fitted force over time, and what is left."""
     import matplotlib
 

@@ -1,5 +1,6 @@
 """What `biotac calibrate` and `biotac compare` do with their arguments."""
 
+import argparse
 import pathlib
 
 import tqdm
@@ -29,7 +30,7 @@ def _material(text):
     return material(text) if text in PRESETS or not text.endswith(".json") else read_material(text)
 
 
-def calibrate_verb(args) -> None:
+def calibrate_verb(args: argparse.Namespace) -> None:
     """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be."""
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
@@ -65,7 +66,7 @@ def calibrate_verb(args) -> None:
     print(f"wrote {out / 'calibration.json'} and {out / 'calibration.png'}")
 
 
-def compare_verb(args) -> None:
+def compare_verb(args: argparse.Namespace) -> None:
     """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be.
 
     Called again with the same settings and folder it goes on where it was stopped.

@@ -170,7 +170,10 @@ def batches(options: GenerateOptions) -> list[Batch]:
 
 
 def generate(
-    out, options: GenerateOptions = GenerateOptions(), workers: int | None = None, progress: bool = True
+    out: pathlib.Path | str,
+    options: GenerateOptions = GenerateOptions(),
+    workers: int | None = None,
+    progress: bool = True,
 ) -> Report:  # noqa: B008 - frozen
     """Makes a set in folder `out`, or what is missing of it.
 

@@ -2,6 +2,7 @@
 the core."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -59,7 +60,13 @@ def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
 
 
 def plan_motions(
-    geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KINDS, device="cpu", progress=None
+    geometry: SkinGeometry,
+    name: str,
+    seeds: list,
+    steps: int,
+    kinds: tuple | list = KINDS,
+    device: str = "cpu",
+    progress: Callable | None = None,
 ) -> list[Motion]:
     """One motion for each seed; the same seed gives the same motion whatever the others are.
 

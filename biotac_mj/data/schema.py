@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS
 
 __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
@@ -122,6 +123,6 @@ class Interaction:
         return self
 
 
-def nodes_of(geometry) -> np.ndarray:
+def nodes_of(geometry: SkinGeometry) -> np.ndarray:
     """(nouter,) sorted nodes of a skin's outer surface: those that `contact_force` is stored for."""
     return np.unique(geometry.outer_face)

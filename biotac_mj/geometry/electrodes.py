@@ -21,7 +21,7 @@ _ELECTRODES_MM = {  # Lin et al. 2013, in the sensor's frame [mm]; E11..E16 mirr
 }
 
 
-def electrode_positions():
+def electrode_positions() -> np.ndarray:
     """(19, 3) [mm]."""
     table = {**_ELECTRODES_MM, **{k + 10: (x, -y, z) for k, (x, y, z) in _ELECTRODES_MM.items() if k <= 6}}
     return np.array([table[k] for k in range(1, 20)])

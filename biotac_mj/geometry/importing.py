@@ -16,7 +16,7 @@ __all__ = ["import_mesh", "read_obj", "read_tet_mesh", "write_obj"]
 _MESHES = (".tet", ".msh", ".vtu")
 
 
-def import_mesh(path, name: str | None = None) -> SkinGeometry:
+def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeometry:
     """A skin from a folder, or from a mesh file whose folder also holds the rigid bodies.
 
     The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of
@@ -52,7 +52,7 @@ def import_mesh(path, name: str | None = None) -> SkinGeometry:
     return assemble(name or path.parent.name, mesh, core, nail, clamp)
 
 
-def read_tet_mesh(path) -> TetMesh:
+def read_tet_mesh(path: pathlib.Path | str) -> TetMesh:
     """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; nodes of no tetrahedron
     are dropped for the last two.
 
@@ -123,7 +123,7 @@ def _lines(path):
         raise ValueError(f"{path} is not a text file ({error}): export it again") from error
 
 
-def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
+def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
     """The connected bodies of a Wavefront .obj, polygons cut into triangles, equal positions merged: [(vert
     (n, 3), face (m, 3)), ...].
 
@@ -165,7 +165,7 @@ def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
     return bodies
 
 
-def write_obj(path, vert, face) -> pathlib.Path:
+def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
     """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ __all__ = ["SKINS", "load_skin", "skin_reference"]
 SKINS = ("coarse", "default", "fine")
 
 
-def load_skin(name_or_path="default") -> SkinGeometry:
+def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
     """A shipped skin by name ("coarse", "default", "fine"), or one stored as .npz by path.
 
     Raises:
@@ -25,7 +25,7 @@ def load_skin(name_or_path="default") -> SkinGeometry:
     return SkinGeometry.load(name_or_path)
 
 
-def skin_reference(skin) -> tuple[str, SkinGeometry]:
+def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:
     """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache,
     named by its content.
 
