@@ -115,8 +115,8 @@ def solve_case(
         raise ValueError(f"unknown material kind {law['kind']!r}: use one of {', '.join(LAWS)}")
     if case["displacement"].shape[1] != geometry.nvert:
         raise ValueError(
-            f"the case has {case['displacement'].shape[1]} nodes, skin {geometry.name!r} {geometry.nvert}: "
-            "pass its mesh with --skin"
+            f"the case has {case['displacement'].shape[1]} nodes, "
+            f"skin {geometry.name!r} {geometry.nvert}: pass its mesh with --skin"
         )
     friction = float(case["friction"])
     model = _model(case, geometry, law, bool(settings.get("core", False)), samples, tolerance)

@@ -8,8 +8,8 @@ import argparse
 
 import numpy as np
 
-from biotac_mj import approach
 from biotac_mj.geometry import load_skin
+from biotac_mj.press import approach
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
 

@@ -69,7 +69,7 @@ def run(
     stepper = fem.FemStepper
     if tier == "condensed":
         stepper = CondensedStepper
-    solve = stepper.solve
+    solve = stepper.solve_skin
 
     def timed(self, *arguments):
         begin = time.perf_counter(), time.thread_time()
@@ -78,7 +78,7 @@ def run(
         results.append(result)
         return result
 
-    stepper.solve = timed
+    stepper.solve_skin = timed
     try:
         options = PressOptions(
             indenter=indenter,
@@ -92,7 +92,7 @@ def run(
         )
         record, _ = press(options, progress=False)
     finally:
-        stepper.solve = solve
+        stepper.solve_skin = solve
     n = len(record.depth) - 1
     return record, results[-n:], np.array(seconds[-n:])
 

@@ -72,9 +72,9 @@ def cases(counts, seeds, plans=4):
 def baselines(comparison, chosen):
     """Names by least RMS in sample and by BIC with every sample independent, both on the linearised
     signatures."""
-    from biotac_mj.discrepancy.catalogue import CATALOGUE
-    from biotac_mj.discrepancy.fitting import fit_effects
-    from biotac_mj.discrepancy.screening import columns, nuisance_space
+    from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+    from biotac_mj.discrepancy.trajectories.screening import columns, nuisance_space
+    from biotac_mj.effects.catalogue import CATALOGUE
 
     null = fit_effects(comparison, [], chosen)
     base = null.residuals(comparison)
@@ -177,7 +177,7 @@ class Worker:
     def run(self, case) -> dict:
         """The record of a case: truth, verdict and all numbers that thresholds are set on."""
         from biotac_mj.discrepancy import CATALOGUE, diagnose
-        from biotac_mj.discrepancy.workflow import threshold_hash
+        from biotac_mj.discrepancy.trajectories.workflow import threshold_hash
 
         began = time.process_time()
         effects, settings = case["effects"], case["settings"]
@@ -283,7 +283,7 @@ def main(argv=None):
         if args.figure:
             confusion(rows, args.figure)
         return
-    from biotac_mj.discrepancy.workflow import threshold_hash
+    from biotac_mj.discrepancy.trajectories.workflow import threshold_hash
 
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text()) if path.exists() else []

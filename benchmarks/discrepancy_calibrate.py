@@ -1,9 +1,9 @@
-"""Sets thresholds and the confidence of `biotac_mj.discrepancy.thresholds` from practice seeds; prints them
-for the constant table.
+"""Sets the thresholds and the confidence of diagnosis (`biotac_mj.discrepancy.trajectories.thresholds`) from
+practice seeds; prints them for the constant table.
 
-    python benchmarks/discrepancy.py --seeds practice --counts
-    none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12 --json p.json python
-    benchmarks/discrepancy_calibrate.py p.json
+    python benchmarks/discrepancy.py --seeds practice --json p.json \\
+        --counts none=30,single=6,left-out=3,outside=20,pair=30,wrong-base=12
+    python benchmarks/discrepancy_calibrate.py p.json
 
 Left-out cases (the hidden effect is taken out of the catalogue) teach abstention: each name given there is
 wrong."""
@@ -16,7 +16,7 @@ import numpy as np
 from discrepancy_table import right
 from scipy.optimize import minimize
 
-from biotac_mj.discrepancy.thresholds import THRESHOLDS, terms
+from biotac_mj.discrepancy.trajectories.thresholds import THRESHOLDS, terms
 
 _RIDGE = 0.5
 _LEFT_OUT = 0.25  # weight of a case whose effect is not in the catalogue: about one in ten of all
@@ -113,7 +113,7 @@ def main(argv=None):
     weights = tuple(round(float(v), 3) for v in w)
     print("CONFIDENCE =", weights, "of", len(data), "names,", sum(e["exact"] for e in data), "right")
     if args.write:
-        path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/thresholds.py"
+        path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/trajectories/thresholds.py"
         lines = [
             f"CONFIDENCE = {weights}" if line.startswith("CONFIDENCE = ") else line
             for line in path.read_text().splitlines()

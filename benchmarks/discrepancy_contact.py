@@ -121,7 +121,7 @@ def sticking(skin, W, reach=None, depth=1e-4):
 def trajectory(knots, depths, along, rows):
     """A Trajectory of the 7 mm sphere: times [s], depths [m] below first touch and places x [m] of its
     corners; rows of each part."""
-    from biotac_mj.discrepancy.trajectories import Trajectory
+    from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
     from biotac_mj.geometry import load_skin
 
     t = np.concatenate(
@@ -136,8 +136,8 @@ def trajectory(knots, depths, along, rows):
 
 def both(sim, path, effect, theta, none):
     """Runs without the effect, with it inside the contact, and in its reduced form."""
-    from biotac_mj.discrepancy.catalogue import by_id
-    from biotac_mj.discrepancy.simulator import Fields
+    from biotac_mj.discrepancy.trajectories.simulator import Fields
+    from biotac_mj.effects.catalogue import by_id
 
     plain, inside = (sim.run([path], effects=[(by_id(effect), th)])[0] for th in (none, theta))
     base = [{"force": plain.force, "pressure": plain.pressure, "log_z": plain.log_z}]
@@ -250,13 +250,9 @@ def table(rows):
     """Prints dicts as a table."""
 
     def cell(v):
-        return (
-            " ".join(f"{x:.3g}" for x in v)
-            if isinstance(v, list)
-            else v
-            if isinstance(v, str)
-            else f"{v:.3g}"
-        )
+        if isinstance(v, str):
+            return v
+        return " ".join(f"{x:.3g}" for x in v) if isinstance(v, list) else f"{v:.3g}"
 
     columns = list(rows[0])
     width = [max(len(c), *(len(cell(r[c])) for r in rows)) + 2 for c in columns]
@@ -277,7 +273,7 @@ def main(argv=None):
     args.add_argument("--only", help="first letters of one table")
     args.add_argument("--json")
     args = args.parse_args(argv)
-    from biotac_mj.discrepancy.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 
     skins, sim, out = args.skins.split(","), InSkinSimulator(), {}
     for name, make in (

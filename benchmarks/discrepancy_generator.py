@@ -20,14 +20,14 @@ _E_NEAR = {
     5: (3, 4, 18),
     6: (7, 8, 9),
     7: (0, 6, 9),
-    8: (6, 9, 10),  # noqa: E501
+    8: (6, 9, 10),
     9: (6, 7, 8, 16),
     10: (8, 11, 13),
     11: (10, 12, 13, 16),
     12: (11, 14, 16, 17),
     13: (10, 11, 12, 14),
     14: (12, 13, 15, 17),
-    15: (13, 14, 18),  # noqa: E501
+    15: (13, 14, 18),
     16: (1, 9, 11, 17),
     17: (4, 14, 16, 18),
     18: (5, 15, 17),
@@ -37,8 +37,8 @@ _E_NEAR = {
 def plan(seed, count, skin="coarse"):
     """Trajectories: dicts of tool, clock [s], time (n,), pos (n, 3) [m], quat (4,) w x y z, heading (3,);
     press, hold, sometimes slide, unload."""
-    from biotac_mj import approach
     from biotac_mj.geometry import load_skin
+    from biotac_mj.press import approach
 
     geometry, rng, out, clock = load_skin(skin), np.random.default_rng(seed), [], 0.0
     for i in range(count):
@@ -381,7 +381,7 @@ _READ = {
     "lowpass": _lowpass,
     "latency": _latency,
     "drift": _drift,
-    "ripple": _ripple,  # noqa: E501
+    "ripple": _ripple,
     "leak": _leak,
     "ring": _ring,
     "squeeze": _squeeze,
@@ -393,18 +393,18 @@ HIDDEN = {
     "stiffen": (0.2, 0.5),
     "mullins": (0.2, 0.4),
     "adhesion": (0.06, 0.15),
-    "fluidloss": (0.03, 0.1),  # noqa: E501
+    "fluidloss": (0.03, 0.1),
     "warmup": (0.06, 0.25),
     "asper": (0.15, 0.4),
     "gain": (0.1, 0.25),
     "crosstalk": (0.06, 0.15),
     "saturate": (150, 400),
-    "lowpass": (0.04, 0.15),  # noqa: E501
+    "lowpass": (0.04, 0.15),
     "latency": (0.03, 0.1),
     "drift": (4, 15),
     "radius": (0.12, 0.25),
     "mount": (4e-5, 12e-5),
     "depth0": (6e-5, 15e-5),
-    "misalign": (1.5e-4, 4e-4),  # noqa: E501
+    "misalign": (1.5e-4, 4e-4),
 }
 OUTSIDE = {"ripple": (20, 60), "leak": (40, 120), "ring": (0.1, 0.3), "squeeze": (10, 40)}

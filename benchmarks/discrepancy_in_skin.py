@@ -30,7 +30,7 @@ CASES = (
 def press(depth=1.2e-3, rows=8):
     """A Trajectory: in 1 s, held for 2 s, half way out in 0.5 s, held for 1.5 s, in again to the same depth
     and out."""
-    from biotac_mj.discrepancy.trajectories import Trajectory
+    from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
     from biotac_mj.geometry import load_skin
 
     touch = load_skin("coarse").vert
@@ -48,7 +48,7 @@ def press(depth=1.2e-3, rows=8):
 def compare(effect, theta, trajectory, sim, plain):
     """Row of the table: largest change and what the reduced form misses, touched and released [N, Pa,
     counts]; processor time [s]."""
-    from biotac_mj.discrepancy.catalogue import by_id
+    from biotac_mj.effects.catalogue import by_id
 
     effects = [(by_id(effect), theta)]
     began = time.process_time()
@@ -76,7 +76,7 @@ def compare(effect, theta, trajectory, sim, plain):
 
 def fields_of(plain, trajectory):
     """Fields of the elastic skin, so that the reduced form need not solve it again."""
-    from biotac_mj.discrepancy.simulator import Fields
+    from biotac_mj.discrepancy.trajectories.simulator import Fields
 
     base = [{"force": plain.force, "pressure": plain.pressure, "log_z": plain.log_z}]
     none = [{k: np.zeros_like(v) for k, v in base[0].items()}]
@@ -90,7 +90,7 @@ def main(argv=None):
     args.add_argument("--only", help="one effect")
     args.add_argument("--json")
     args = args.parse_args(argv)
-    from biotac_mj.discrepancy.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 
     sim, trajectory = InSkinSimulator(skin=args.skin), press(rows=args.rows)
     began = time.process_time()
@@ -106,7 +106,7 @@ def main(argv=None):
         f"{'':<26}"
         + "".join(f"{f'{n} {unit} changes':>20}{'missed':>8}" for n, unit in names)
         + f"{'released: Pa':>14}{'missed':>8}{'counts':>8}{'s':>5}"
-    )  # noqa: E501
+    )
     for r in rows:
         label = f"{r['effect']} " + ", ".join(
             f"{k} {r[k]:g}" for k in ("g", "tau", "n", "softening", "c2", "along", "fraction") if k in r

@@ -1,5 +1,5 @@
 """What the parameters of stiffen and hyster are as constants of the rubber, measured on presses; the tables
-of `discrepancy/in_skin.py`.
+of `effects/in_skin.py`.
 
     python benchmarks/discrepancy_in_skin_maps.py --json out/in_skin_maps.json
 
@@ -126,7 +126,7 @@ def hysteresis():
 
 
 def places():
-    from biotac_mj.discrepancy.in_skin import modulus_of
+    from biotac_mj.effects.in_skin import modulus_of
 
     depths, rows = np.array([-0.1e-3, 0.2e-3, 0.4e-3, 0.6e-3, 0.8e-3]), []
     print("inhomog: along, across [1/cm], place mm, force changes by, reduced form")

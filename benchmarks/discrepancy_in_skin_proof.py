@@ -29,8 +29,9 @@ def presses(count, seed):
     """Trajectories without readings: in, held, out, at places on the pad."""
     from scipy.spatial.transform import Rotation
 
-    from biotac_mj import approach, load_skin
+    from biotac_mj import load_skin
     from biotac_mj.discrepancy import Trajectory
+    from biotac_mj.press import approach
 
     rng, skin, out, clock = np.random.default_rng(seed), load_skin("coarse"), [], 0.0
     for i in range(count):
@@ -68,7 +69,8 @@ def measure(trajectories, rubber, skin, seed):
     import dataclasses
 
     from biotac_mj import load_skin
-    from biotac_mj.discrepancy.in_skin import modulus_of, solve_with_memory
+    from biotac_mj.discrepancy.trajectories.in_skin import solve_with_memory
+    from biotac_mj.effects.in_skin import modulus_of
     from biotac_mj.sensor.film import FilmConduction
     from biotac_mj.skin import Material, SkinModel, SkinOptions
 
@@ -100,7 +102,7 @@ def main(argv=None):
     args.add_argument("--json")
     args = args.parse_args(argv)
     from biotac_mj.discrepancy import Simulator, diagnose
-    from biotac_mj.discrepancy.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 
     trajectories, rows = presses(args.count, args.seed), []
     began = time.process_time()

@@ -90,7 +90,7 @@ def main(argv=None):
 def diagnose(make, folder):
     """Runs one case as a user would, through text files, and scores it."""
     from biotac_mj.discrepancy import diagnose_recording, read_recording
-    from biotac_mj.discrepancy.recorded_report import verdict_dict
+    from biotac_mj.discrepancy.recordings.report import verdict_dict
 
     e, force, rate, truth = make()
     paths = folder / "e.txt", folder / "f.txt"
@@ -134,12 +134,8 @@ def diagnose(make, folder):
 def code_hash():
     """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
     folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    names = (
-        "drifts electrode_drifts faults hum load_search loads noises plain recorded_effect recorded_gap "
-        "recorded_rest"
-    )
-    names += " recorded_views recording shapes timeline"
-    return hashlib.sha256(b"".join((folder / f"{n}.py").read_bytes() for n in names.split())).hexdigest()[:12]
+    files = [folder / "evidence.py", folder / "noise.py", *sorted((folder / "recordings").rglob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 def table(rows):

@@ -42,7 +42,7 @@ PLACES = np.array(
         [-2.5, 0],
         [1.3, 0],
     ]
-)  # noqa: E501
+)
 XY = np.column_stack([PLACES[:, 0], 5.3 * np.radians(PLACES[:, 1])])  # unrolled [mm]
 
 
@@ -105,7 +105,8 @@ def bases():
     return names + (["unloaded, real", "loaded, real"] if REAL.exists() else [])
 
 
-# --- hidden effects: counts (n, 19) float before noise, force, rng, rate -> the same, plus the channels concerned ---------------------
+# --- hidden effects: counts (n, 19) float before noise, force, rng, rate -> the same, plus the channels
+# concerned
 
 
 def _onset(rng, n):
@@ -321,14 +322,10 @@ def make_case(effect, base, seed, with_force):
 
     def add_noise(x):
         # a straight line in counts, not the law of the sensor model
-        return (
-            x
-            + level
-            * np.interp(x, [500, 2000, 3400, 4000], [5.5, 6.5, 2.8, 1.0])
-            * rng.standard_normal(x.shape)
-            if synthetic
-            else x
-        )
+        if not synthetic:
+            return x
+        spread = level * np.interp(x, [500, 2000, 3400, 4000], [5.5, 6.5, 2.8, 1.0])
+        return x + spread * rng.standard_normal(x.shape)
 
     if when == "after":
         e = np.rint(add_noise(e))

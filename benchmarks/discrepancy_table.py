@@ -136,8 +136,8 @@ def reliability(rows) -> str:
         if (bins == b).any()
     )
     return (
-        f"confidence -> share right: {shown}; Brier {np.mean((c - hit) ** 2):.3f}, calibration error "
-        f"{error:.3f}"
+        f"confidence -> share right: {shown}; "
+        f"Brier {np.mean((c - hit) ** 2):.3f}, calibration error {error:.3f}"
     )
 
 

@@ -282,7 +282,8 @@ def main(arguments=None) -> int:
 def _skins(skins):
     rows = []
     print(
-        f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}{'solve ms':>10}{'force N':>10}{'error':>9}"
+        f"{'material':<10}{'skin':<10}{'element':<11}{'unknowns':>9}{'factor s':>10}"
+        f"{'solve ms':>10}{'force N':>10}{'error':>9}"
     )
     for label, (E, nu) in MATERIALS.items():
         for name in skins:
@@ -332,8 +333,8 @@ def _cook(nu=0.4999):
 def _spheres():
     rows = []
     print(
-        "\nThick sphere (radii 6 and 10 mm) under internal pressure, growth against Lame, at inner and "
-        "outer radius"
+        "\nThick sphere (radii 6 and 10 mm) under internal pressure, growth against Lame, "
+        "at inner and outer radius"
     )
     for nu in (0.3, 0.4999):
         for element, mesh in (

@@ -67,13 +67,15 @@ def model_xml(geometry, material, radius, center):
     friction = f'friction="{material.friction} 0 0"'
     return f"""
 <mujoco>
-  <option timestep="{TIMESTEP}" integrator="discrete" solver="CG" iterations="100" tolerance="1e-8" gravity="0 0 0">
+  <option timestep="{TIMESTEP}" integrator="discrete" solver="CG" iterations="100" tolerance="1e-8"
+          gravity="0 0 0">
     <flag refsafe="disable"/>
   </option>
   <size memory="2G"/>
   <worldbody>
     <body mocap="true" pos="{text(center)}"><geom type="sphere" size="{radius}" {friction} {_CONTACT}/></body>
-    <flexcomp name="skin" type="direct" dim="3" radius="1e-6" mass="{mass}" point="{text(geometry.vert)}" element="{text(geometry.tets)}">
+    <flexcomp name="skin" type="direct" dim="3" radius="1e-6" mass="{mass}"
+              point="{text(geometry.vert)}" element="{text(geometry.tets)}">
       <pin id="{text(geometry.fixed)}"/>
       <elasticity young="{material.youngs_modulus}" poisson="{material.poissons_ratio}"/>
       <contact selfcollide="none" {friction} {_CONTACT}/>

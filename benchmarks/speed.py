@@ -44,8 +44,8 @@ import peer_flex
 import peer_newton
 from accuracy import write_json
 
-from biotac_mj.approach import nearest_point, surface_point
 from biotac_mj.geometry import SKINS, SkinGeometry, load_skin
+from biotac_mj.press.approach import nearest_point, surface_point
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
 
@@ -409,8 +409,8 @@ def main(arguments=None) -> int:
                     _print_row(rows[-1])
                 if "largest_nworld" in rows[-1]:
                     print(
-                        f"  model {rows[-1]['mb_model']:.0f} MB; the largest nworld here: "
-                        f"{rows[-1]['largest_nworld']}",
+                        f"  model {rows[-1]['mb_model']:.0f} MB; "
+                        f"the largest nworld here: {rows[-1]['largest_nworld']}",
                         flush=True,
                     )
             _model.cache_clear()

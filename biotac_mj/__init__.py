@@ -19,8 +19,8 @@ except (AttributeError, ImportError, OSError, RuntimeError) as error:
     if not os.environ.get("MUJOCO_GL") or isinstance(error, ModuleNotFoundError):
         raise
     warnings.warn(
-        f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({error}): going on without MuJoCo's "
-        "renderer",
+        f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({error}): "
+        "going on without MuJoCo's renderer",
         stacklevel=2,
     )
     os.environ["MUJOCO_GL"] = "disable"

@@ -144,8 +144,8 @@ def _add_press(verbs):
         "--render",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="MuJoCo's render in press.png; without it, or without a GL library, matplotlib "
-        "draws the surfaces",
+        help="MuJoCo's render in press.png; "
+        "without it, or without a GL library, matplotlib draws the surfaces",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -154,13 +154,13 @@ def _press(args):
     import math
     import pathlib
 
-    from . import press, press_report
-    from .press_record import write_readings, write_skin
+    from .press import PressOptions, press, render, report
+    from .press.record import write_readings, write_skin
 
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
-    options = press.PressOptions(
+    options = PressOptions(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
@@ -180,20 +180,18 @@ def _press(args):
         device=args.device,
     )
     _calm_warp()
-    record, picture = press.press(
-        options, render=press.render if args.render else None, progress=not args.quiet
-    )
+    record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
     write_readings(record, files[0])
     write_skin(record, files[1])
-    press_report.write_picture(record, files[2], picture)
+    report.write_picture(record, files[2], picture)
     if args.render and picture is None:
         print(
-            "no GL library works here: press.png shows the surfaces drawn by matplotlib (libosmesa6 or "
-            "libegl1 would do)"
+            "no GL library works here: "
+            "press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)"
         )
-    print(press_report.table(record, files))
+    print(report.table(record, files))
 
 
 def _add_view(verbs):
@@ -201,8 +199,8 @@ def _add_view(verbs):
         verbs,
         "view",
         _view,
-        "Open MuJoCo's viewer on a BioTac and a ball to press it with: double-click the ball, then drag "
-        "with ctrl and right button.",
+        "Open MuJoCo's viewer on a BioTac and a ball to press it with: "
+        "double-click the ball, then drag with ctrl and right button.",
     )
     _add_skin(verb)
     verb.add_argument(
@@ -228,10 +226,10 @@ def _add_view(verbs):
 
 
 def _view(args):
-    from . import view
+    from .view import view
 
     _calm_warp()
-    view.view(
+    view(
         skin=args.skin,
         tier=args.tier,
         material=args.material,
@@ -416,8 +414,8 @@ def _add_compare(verbs):
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(
         "--material",
-        help="given to all configurations, preset or a calibration's JSON (default: each is calibrated "
-        "first)",
+        help="given to all configurations, preset or a calibration's JSON (default: "
+        "each is calibrated first)",
     )
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
@@ -538,8 +536,8 @@ def _add_diagnose(verbs):
         help="rows per second (default: guessed from repeated rows, else 100)",
     )
     kept = (
-        "of the data, kept aside for the proof (default: 0.4 of the rows, 0.3 with --force, a quarter of "
-        "the trajectories)"
+        "of the data, kept aside for the proof (default: "
+        "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")

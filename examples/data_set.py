@@ -31,8 +31,8 @@ def main(out=None, count=24, steps=10, skin="coarse", tier="condensed", progress
         )
         report = generate(out or folder, options, workers=0, progress=progress)
         print(
-            f"{report.interactions} interactions of {steps} time steps, {report.nonconverged} steps not "
-            "converged"
+            f"{report.interactions} interactions of {steps} time steps, "
+            f"{report.nonconverged} steps not converged"
         )
         with TactileSet(out or folder) as data:
             split = split_by_interaction(data, fractions=(0.7, 0.1, 0.2))

@@ -6,7 +6,8 @@ from biotac_mj.tasks import TACTILE, BioTac
 
 ROBOT = """<mujoco model="robot"><worldbody>
   <body name="arm" pos="0 0 0.02"><joint name="down" type="slide" axis="0 0 -1" damping="2"/>
-    <geom type="box" size=".004 .004 .02" pos=".014 0 .02" mass=".05"/><site name="fingertip" quat="1 1 0 0"/></body>
+    <geom type="box" size=".004 .004 .02" pos=".014 0 .02" mass=".05"/>
+    <site name="fingertip" quat="1 1 0 0"/></body>
   <geom name="table" type="box" size=".05 .05 .005" pos="0 0 -.005"/></worldbody></mujoco>"""
 
 

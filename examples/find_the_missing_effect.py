@@ -12,8 +12,9 @@ import pathlib
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from biotac_mj import approach, load_skin
+from biotac_mj import load_skin
 from biotac_mj.discrepancy import CATALOGUE, Simulator, Trajectory, diagnose
+from biotac_mj.press import approach
 
 # What may hide, and how large (kept apart from the catalogue's own bounds).
 HIDDEN = {
@@ -50,7 +51,7 @@ def presses(count, seed):
                 clock,
                 t,
                 point - np.outer(d, normal),
-                np.tile(mat, (n, 1, 1)),  # noqa: E501
+                np.tile(mat, (n, 1, 1)),
                 np.full((n, 19), 2000.0),
                 np.full(n, 2000.0),
                 None,

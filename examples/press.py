@@ -10,8 +10,8 @@ def main(skin="default", depth=1.5e-3):
     change = record.electrode_change[-1]
     most = abs(change).argmax()
     print(
-        f"force {record.force[-1].round(3)} N at {1e3 * record.depth[-1]:.2f} mm; E{most + 1} changed most, "
-        f"by {change[most]:+.0f} counts"
+        f"force {record.force[-1].round(3)} N at {1e3 * record.depth[-1]:.2f} mm; "
+        f"E{most + 1} changed most, by {change[most]:+.0f} counts"
     )
     return record
 

@@ -389,7 +389,7 @@ def main(arguments=None):
     warp.config.log_level = warp.LOG_WARNING
     frames, screen = [], None
     if options.video:
-        from biotac_mj.offscreen import Offscreen, find_gl
+        from biotac_mj.view.offscreen import Offscreen, find_gl
 
         def frame(data):
             nonlocal screen

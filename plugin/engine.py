@@ -7,18 +7,16 @@ as -1 in the status sensor and raised again by `check`."""
 import atexit
 import ctypes
 import functools
-import importlib
 import sys
 import threading
 import warnings
 
 import mujoco
 
-from . import structs
+from ..coupling import structs
+from ..coupling.config import PLUGIN_NAME
 
 __all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
-
-PLUGIN_NAME = "biotac_mj.skin"
 
 # Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
 # `biotac_mj.coupling.config`.
@@ -86,11 +84,6 @@ _MAX_ERRORS = 100
 _alive = []  # what C points to
 
 
-def _coupling(module):
-    # Late, so that `import biotac_mj` loads neither Warp nor the geometry.
-    return importlib.import_module(f"biotac_mj.coupling.{module}")
-
-
 def _keep(error):
     with _lock:
         if len(_errors) < _MAX_ERRORS:
@@ -132,15 +125,19 @@ def _world(model, data, index):
         with _lock:
             world = _worlds.get(data)
             if world is None:
+                from ..coupling.world import World
+
                 view = structs.ModelView(model)
                 mine = [i for i in range(view.nplugin) if view.plugin[i] == view.plugin[index]]
-                world = _worlds[data] = _coupling("world").World(view, structs.DataView(data, view), mine)
+                world = _worlds[data] = World(view, structs.DataView(data, view), mine)
     return world
 
 
 @_guarded(-1)
 def _nstate(model, index):
-    return _coupling("instance").state_size(structs.ModelView(model), index)
+    from ..coupling.instance import state_size  # late: `import biotac_mj` loads neither Warp nor the geometry
+
+    return state_size(structs.ModelView(model), index)
 
 
 @_guarded(0)
@@ -172,7 +169,9 @@ def _copy(destination, model, source, index):
 
 @_guarded(None)
 def _reset(model, state, plugin_data, index):
-    _coupling("instance").reset_state(structs.ModelView(model), state, index)
+    from ..coupling.instance import reset_state
+
+    reset_state(structs.ModelView(model), state, index)
 
 
 def _compute(model, data, index, capability):
@@ -190,7 +189,7 @@ def _compute(model, data, index, capability):
 
 @_guarded(None)
 def _advance(model, data, index):
-    _world(model, data, index).instances[index].advance()
+    _world(model, data, index).instances[index].commit_step()
 
 
 @_guarded(None)
@@ -231,8 +230,8 @@ def register():
         slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))
         if slot < 0:
             raise RuntimeError(
-                f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: is another copy of "
-                "biotac_mj loaded?"
+                f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: "
+                "is another copy of biotac_mj loaded?"
             )
         _alive.extend((callbacks, names, plugin))
         atexit.register(_fall_silent, slot)

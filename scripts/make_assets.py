@@ -88,8 +88,8 @@ def main():
         skin = dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held_nodes(skin.vert, rigid.values())))
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
         made = (
-            f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then `improve` "
-            "and `with_edge_nodes`"
+            f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, "
+            "then `improve` and `with_edge_nodes`"
         )
         print(write_card(path.with_suffix(".md"), skin, made).read_text())
 

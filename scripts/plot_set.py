@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from biotac_mj.data import TactileSet
-from biotac_mj.press_record import replacing
+from biotac_mj.files import replacing
 
 KINDS = {"press": "tab:blue", "slide": "tab:orange", "twist": "tab:green", "tap": "tab:red"}
 

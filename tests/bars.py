@@ -4,7 +4,6 @@ import numpy as np
 from blocks import box, place, skin
 
 from biotac_mj.skin import GeomSet, Material, SkinModel, SkinOptions, step
-from biotac_mj.skin.data import view
 
 __all__ = ["AREA", "E", "LENGTH", "NOTHING", "NOW", "bar", "cube", "deform", "pull"]
 
@@ -29,7 +28,7 @@ def pull(model, data, stretch, dt):
     place(data, end, to)
     step(model, data, NOTHING, dt)
     assert data.converged.all()
-    return -view(data.force)[end, 0, 0].sum()
+    return -data.force.numpy()[end, 0, 0].sum()
 
 
 def cube(law, element, nu=0.3, modulus=None, young=E, **material):
@@ -44,8 +43,8 @@ def deform(model, data, F, dt):
     """First Piola stress (3, 3) [Pa] after a step to the homogeneous F: mean over the cube of f x X on its
     surface."""
     for array in (data.x, data.x_last):
-        view(array)[:, 0] = model.geometry.vert @ F.T
+        array.numpy()[:, 0] = model.geometry.vert @ F.T
     step(model, data, NOTHING, dt)
     assert data.converged.all()
     fixed = model.fixed
-    return -np.einsum("ni,nj->ij", view(data.force)[fixed, 0], model.geometry.vert[fixed]) / 1e-6
+    return -np.einsum("ni,nj->ij", data.force.numpy()[fixed, 0], model.geometry.vert[fixed]) / 1e-6

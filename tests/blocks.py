@@ -9,7 +9,6 @@ import trimesh
 from biotac_mj.geometry import TetMesh, load_skin
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
-from biotac_mj.skin.data import view
 
 __all__ = ["boundary", "box", "faces_on", "four_nodes", "half_space", "nodal_areas", "place", "shell", "skin"]
 
@@ -130,7 +129,7 @@ def place(data, nodes, position):
     """Puts nodes of all worlds at `position` (n, 3) [m]: fixed ones stay there, which is how tests prescribe
     displacements."""
     for array in (data.x, data.x_last):
-        view(array)[nodes] = np.asarray(position)[:, None]
+        array.numpy()[nodes] = np.asarray(position)[:, None]
 
 
 def four_nodes(name):

@@ -84,7 +84,7 @@ def synthetic_press(shell):
     Hertz's force, made-up counts."""
     import trimesh
 
-    from biotac_mj.press_record import PressRecord
+    from biotac_mj.press.record import PressRecord
 
     n, radius = 12, 3.5e-3
     depth = np.concatenate([[-5e-6], np.linspace(1e-4, 1.5e-3, n - 1)])

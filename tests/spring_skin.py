@@ -93,7 +93,7 @@ class SpringSkin:
     def vert_xpos(self, state):
         return state[4 * len(self.vert) :].reshape(-1, 3)
 
-    def solve(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
         n = len(self.vert)
         new = state.copy()
         memory, moved = new[: 4 * n].reshape(n, 4), self.vert.copy()

@@ -7,16 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
-from biotac_mj.plugin import structs
 
 import biotac_mj
-from biotac_mj.coupling import Config, attach
+from biotac_mj.coupling import Config, attach, structs
 from biotac_mj.coupling.instance import Setup
 from biotac_mj.coupling.show import electrode_colors
 
 WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
-  <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/><geom name="arm" type="capsule" size=".01 .05" pos="0 0 -.08"/>
-    <body name="hand"><joint name="wrist" axis="1 0 0"/><geom name="hand" type="box" size=".01 .01 .01" pos="0 0 .06"/></body></body>
+  <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/>
+    <geom name="arm" type="capsule" size=".01 .05" pos="0 0 -.08"/>
+    <body name="hand"><joint name="wrist" axis="1 0 0"/>
+      <geom name="hand" type="box" size=".01 .01 .01" pos="0 0 .06"/></body></body>
   <body name="cup" pos="0 0 1"><freejoint/><geom name="cup" type="sphere" size=".02" friction="0.4 0 0"/>
     <geom type="sphere" size=".01" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
 

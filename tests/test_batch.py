@@ -18,7 +18,7 @@ from biotac_mj import batch as batches
 from biotac_mj.geometry import SkinGeometry, load_skin
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.readings import PhysicsReadings
-from biotac_mj.skin.material import material as preset
+from biotac_mj.skin.rubber.material import material as preset
 
 DT = 2e-3
 RADIUS = 3.5e-3
@@ -476,8 +476,8 @@ def test_errors_say_what_to_do():
     spec = ball_spec()
     with pytest.raises(
         ValueError,
-        match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; the model's bodies are "
-        "world, ball",
+        match="no BioTac 'biotac_': add it to the spec with biotac_mj.batch.add; "
+        "the model's bodies are world, ball",
     ):
         attach(spec.compile())
     batches.add(spec, skin=shell())

@@ -129,7 +129,7 @@ def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
     description."""
     import warp as wp
 
-    from biotac_mj.skin.clearance import rest_gap
+    from biotac_mj.skin.contact.limits import rest_gap
 
     geoms, pos, mat = accuracy.case_geoms(shape, 0.0)
     point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [

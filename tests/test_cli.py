@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from biotac_mj import cli, press_indenter
-from biotac_mj.skin.material import PRESETS
+from biotac_mj import cli
+from biotac_mj.press import indenter
+from biotac_mj.skin.rubber.material import PRESETS
 
 
 def test_names_in_the_help_are_the_real_ones():
     from biotac_mj.geometry import SKINS
 
-    assert sorted(cli.INDENTERS) == sorted(press_indenter.INDENTERS)
+    assert sorted(cli.INDENTERS) == sorted(indenter.INDENTERS)
     assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
 
 
@@ -43,8 +44,8 @@ def test_help_shows_all_choices(capsys):
 
 def test_help_is_light():
     code = (
-        "import sys; from biotac_mj.cli import parser; parser(); print({'warp', 'trimesh', 'matplotlib'} "
-        "& set(sys.modules))"
+        "import sys; from biotac_mj.cli import parser; parser(); "
+        "print({'warp', 'trimesh', 'matplotlib'} & set(sys.modules))"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"

@@ -19,7 +19,8 @@ GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with
 PAD_DOWN = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
 G = 9.81
 HINGED = """<body name="finger"><joint name="hinge" type="hinge" axis="0 1 0" pos="-.04 0 0" {}/>
-  <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/></body>"""
+  <geom type="capsule" fromto="-.04 0 -.01 0 0 -.01" size=".004" mass="0.02" contype="0" conaffinity="0"/>
+  </body>"""
 
 
 def scene(
@@ -186,7 +187,7 @@ def test_the_skin_is_solved_where_the_integrator_takes_its_bodies(integrator, di
     mujoco.mj_forward(model, data)
     world = sys.modules["biotac_mj.plugin.engine"]._worlds[data._address]
     explicit, before = data.qacc.copy(), data.qvel.copy()
-    used = world.integrator.advance(explicit) if world.integrator.begin(world.data) else explicit
+    used = world.integrator.integrated(explicit) if world.integrator.take_matrices(world.data) else explicit
     mujoco.mj_step(model, data)
     real = (data.qvel - before) / model.opt.timestep
     np.testing.assert_allclose(used, real, rtol=1e-9, atol=1e-9 * abs(real).max())

@@ -561,9 +561,9 @@ def test_a_skin_at_rest_is_what_a_solve_would_leave(options):
     solved, turn = state.copy(), np.eye(3)[None]
     for gap in (2e-4, 1e-5, -3e-4, -3e-4, 2e-4, 1e-3, 1e-5):
         pos = (where + [0, top - RADIUS - gap, 0])[None]
-        short = stepper.solve(state, pos, turn, 2e-3)
+        short = stepper.solve_skin(state, pos, turn, 2e-3)
         solved[stepper._slices["resting"]] = 0.0  # forbids the short cut
-        long = stepper.solve(solved, pos, turn, 2e-3)
+        long = stepper.solve_skin(solved, pos, turn, 2e-3)
         assert short.wrench.any() == (gap < 0) and stepper.resting(short.state) == (gap > 0)
         np.testing.assert_allclose(short.vert_xpos, long.vert_xpos, atol=1e-8)
         np.testing.assert_allclose(short.wrench, long.wrench, rtol=1e-3, atol=1e-6)
@@ -578,6 +578,6 @@ def test_a_geom_inside_the_core_is_refused_though_no_skin_feels_it():
     state = np.empty(stepper.nstate)
     stepper.reset(state)
     with pytest.raises(ValueError, match="inside the rigid core"):
-        stepper.solve(state, np.array([[-2e-3, 0.0, 0.0]]), np.eye(3)[None], 2e-3)
+        stepper.solve_skin(state, np.array([[-2e-3, 0.0, 0.0]]), np.eye(3)[None], 2e-3)
     with pytest.raises(ValueError, match="NaN"):
-        stepper.solve(state, np.array([[np.nan, 0, 0]]), np.eye(3)[None], 2e-3)
+        stepper.solve_skin(state, np.array([[np.nan, 0, 0]]), np.eye(3)[None], 2e-3)

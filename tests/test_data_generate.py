@@ -12,7 +12,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from biotac_mj import approach, cli, press_indenter
+from biotac_mj import cli
 from biotac_mj.data import TactileSet, making, nodes_of
 from biotac_mj.data.clearance import Placed, first_touch, surface_samples
 from biotac_mj.data.generate import GenerateOptions, batches, generate
@@ -21,6 +21,8 @@ from biotac_mj.data.plan import KINDS, plan_motions, sensing_faces
 from biotac_mj.data.readings import sample
 from biotac_mj.data.simulate import _simulate, _walk, simulate
 from biotac_mj.geometry import INDENTERS, load_skin
+from biotac_mj.press import approach
+from biotac_mj.press.indenter import add_indenter, make_indenter
 from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressure
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import SkinModel, SkinOptions
@@ -91,9 +93,9 @@ def test_first_touch_is_where_rays_find_it(skin, name):
     direction = -normal
     points = surface_samples(skin.vert, skin.outer_face, "cpu", order=6)
     from biotac_mj.data.clearance import rotation_matrices
-    from biotac_mj.press import _rotation_from_y
+    from biotac_mj.press.path import rotation_from_y
 
-    quat = _rotation_from_y(direction)
+    quat = rotation_from_y(direction)
     got = first_touch(
         Placed(name, 1),
         points,
@@ -102,10 +104,8 @@ def test_first_touch_is_where_rays_find_it(skin, name):
         direction[None],
     )[0]
     spec = mujoco.MjSpec()
-    shape = press_indenter.make_indenter(name)
-    press_indenter.add_indenter(
-        spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False
-    )
+    shape = make_indenter(name)
+    add_indenter(spec, spec.worldbody.add_body(pos=point - 0.05 * direction, quat=quat), shape, exact=False)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

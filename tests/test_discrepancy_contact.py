@@ -4,10 +4,11 @@ comes out."""
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy.catalogue import by_id
-from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
-from biotac_mj.discrepancy.simulator import load_simulator
-from biotac_mj.discrepancy.trajectories import Trajectory
+from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
+from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, SkinOptions
 

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy.catalogue import by_id
-from biotac_mj.discrepancy.in_film import RoughFilm, drain, left
-from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
-from biotac_mj.discrepancy.trajectories import Trajectory
+from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
+from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.in_film import RoughFilm, drain, left
+from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import SkinData, SkinModel, SkinOptions

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from biotac_mj import cli
-from biotac_mj.discrepancy.catalogue import by_id
-from biotac_mj.discrepancy.in_skin import InSkinSimulator, memory_of
-from biotac_mj.discrepancy.simulator import Simulator, load_simulator
-from biotac_mj.discrepancy.trajectories import Trajectory
+from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
+from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.skin import Material
 
 
@@ -103,7 +105,7 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
 )
 def test_the_command_line_says_what_does_not_go_together(arguments, text, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("biotac_mj.discrepancy.workflow_verb.read_trajectories", lambda path: [])
+    monkeypatch.setattr("biotac_mj.discrepancy.trajectories.report.read_trajectories", lambda path: [])
     Simulator().save("r.yaml")
     assert cli.main(["diagnose", "measured.h5", *arguments]) == 2
     assert text in capsys.readouterr().err

@@ -10,9 +10,9 @@ from scipy import stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
-from biotac_mj.discrepancy.noises import differenced_correlation, pole_of
-from biotac_mj.discrepancy.recorded_report import summary, verdict_dict, write_report
-from biotac_mj.discrepancy.shapes import fit_shapes
+from biotac_mj.discrepancy.recordings.effects.noises import differenced_correlation, pole_of
+from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
+from biotac_mj.discrepancy.recordings.shapes import fit_shapes
 
 REAL = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
 real = pytest.mark.skipif(
@@ -260,7 +260,7 @@ def test_a_tie_says_what_would_tell_it_apart():
 
 
 def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
-    from biotac_mj.discrepancy.load_search import BETWEEN, ForceView
+    from biotac_mj.discrepancy.recordings.load_search import BETWEEN, ForceView
 
     e, force, rng = pressed(11)
     view = ForceView(noisy(e, rng), force, np.arange(len(e)) < 5000, np.arange(19), RATE)
@@ -362,7 +362,7 @@ def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
 
 
 def test_what_is_seen_of_a_force_is_undone():
-    from biotac_mj.discrepancy.loads import Hysteresis, Latency, LoadLowPass, Relaxation
+    from biotac_mj.discrepancy.recordings.effects.loads import Hysteresis, Latency, LoadLowPass, Relaxation
 
     _, force, _ = pressed(3)
     force = np.cumsum(force - force.mean(0), axis=0)
@@ -384,8 +384,8 @@ def test_what_is_seen_of_a_force_is_undone():
 
 def test_the_part_kept_aside_does_not_choose():
     """Choices of amendments are the same whatever the last rows hold."""
-    from biotac_mj.discrepancy.recorded_effect import Session
-    from biotac_mj.discrepancy.recorded_views import choose
+    from biotac_mj.discrepancy.recordings.session import Session
+    from biotac_mj.discrepancy.recordings.views import choose
 
     e, force, rng = pressed(8)
     z = (4095 / e - 1) * np.exp(-0.3 * (1 - np.exp(-np.arange(len(e)) / 2500)))[:, None]
@@ -422,7 +422,7 @@ def test_a_channel_that_is_stuck_in_a_trial_alone_is_left_out_of_it():
 def test_a_trend_that_turns_round_is_not_carried_on():
     """A gain that comes and goes: carried on it would be wrong, and earlier turns inside the part fitted say
     so."""
-    from biotac_mj.discrepancy.recorded_views import Choice, _best
+    from biotac_mj.discrepancy.recordings.views import Choice, _best
 
     asked = [Choice("carried on"), Choice("held"), Choice("none")]
     trials = np.array([[0.0, 0, 0], [0.3, 0.2, 0], [-0.2, -0.2, 0], [0.1, -0.05, 0]])

@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
-from biotac_mj.discrepancy.catalogue import by_id
-from biotac_mj.discrepancy.effect import STAGES, Run, memory
-from biotac_mj.discrepancy.where import phases
+from biotac_mj.discrepancy.trajectories.where import phases
+from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.effect import STAGES, Run, memory
 
 ROOT = pathlib.Path(__file__).parents[1]
 WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)
@@ -98,7 +98,7 @@ def measured(effects, seed=1, **kw):
             t.time,
             t.pos,
             t.mat,
-            np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),  # noqa: E501
+            np.rint(np.clip(r.counts + 3 * rng.standard_normal(r.counts.shape), 0, 4095)),
             np.rint(r.pdc + rng.standard_normal(len(t.time))),
             None,
             r.force + 0.005 * rng.standard_normal(r.force.shape),
@@ -118,13 +118,13 @@ def run_of(n=40):
         heading=np.array([0, 1.0, 0]),
         depth=d,
         place=np.array([-0.01, -0.008, 0.001]),
-        order=0,  # noqa: E501
+        order=0,
         offset=np.zeros((n, 3)),
         force=-np.outer(800 * d, [0, 1.0, 0.2]),
         pressure=3e6 * d,
         log_z=z,
         temperature=np.linspace(0, 1, n),
-        session={},  # noqa: E501
+        session={},
         rest_log_z=z[0],
         counts=4095 / (np.exp(z) / 1e4 + 1),
         pdc=2000 + 3e6 * d / 36.5,
@@ -246,7 +246,7 @@ def test_nothing_is_named_where_nothing_is():
 
 
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
-    from biotac_mj.discrepancy.nuisance import Nuisance
+    from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
 
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
@@ -287,7 +287,7 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     )
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
-    from biotac_mj.discrepancy.workflow_verb import summary, write_report
+    from biotac_mj.discrepancy.trajectories.report import summary, write_report
 
     files = write_report(report, Springs(), tmp_path)
     assert all(f.exists() for f in files) and "kept aside" in summary(report)
@@ -335,10 +335,10 @@ def test_phases_are_told_apart():
 
 
 def test_where_knows_a_trend_over_the_session_from_a_place_and_a_load():
-    from biotac_mj.discrepancy.fitting import fit_effects
-    from biotac_mj.discrepancy.trajectories import measurement_noise
-    from biotac_mj.discrepancy.where import where
-    from biotac_mj.discrepancy.whitening import Comparison
+    from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+    from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
+    from biotac_mj.discrepancy.trajectories.where import where
+    from biotac_mj.discrepancy.trajectories.whitening import Comparison
 
     def cells(effects):
         data = measured(effects)

@@ -117,7 +117,8 @@ def test_a_ball_between_two_fingers_feels_both():
     text = """<mujoco><option timestep="0.004" integrator="implicitfast" gravity="0 0 0"/><worldbody>
       <body name="ball"><freejoint/><geom name="ball" size="0.01" mass="0.02"/></body>
       {}</worldbody></mujoco>"""
-    finger = """<body name="{n}" pos="0 {y} -.012" euler="0 0 {turn}"><joint name="{n}" type="slide" axis="0 -1 0" damping="20"/>
+    finger = """<body name="{n}" pos="0 {y} -.012" euler="0 0 {turn}">
+      <joint name="{n}" type="slide" axis="0 -1 0" damping="20"/>
       <geom type="box" size=".002 .002 .002" pos="0 .01 -.02" mass=".05"/></body>"""
     spec = mujoco.MjSpec.from_string(
         text.format(finger.format(n="l", y=0.0185, turn=0) + finger.format(n="r", y=-0.0185, turn=180))

@@ -178,7 +178,9 @@ def test_an_empty_part_is_named(folder):
 def test_network_counts_in_a_step_of_mujoco(weights):
     spec = mujoco.MjSpec.from_string(
         """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><site name="tip"/>
-        <body name="ball" mocap="true" pos="-0.009 -0.0130 0"><geom name="ball" type="sphere" size="0.0035"/></body></worldbody></mujoco>"""
+        <body name="ball" mocap="true" pos="-0.009 -0.0130 0">
+        <geom name="ball" type="sphere" size="0.0035"/></body>
+        </worldbody></mujoco>"""
     )
     sensor = biotac_mj.SensorBioTac(signal="latent_projection", weights=str(weights), noise=False)
     handle = biotac_mj.attach(

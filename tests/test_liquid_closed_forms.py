@@ -9,13 +9,12 @@ import pytest
 import trimesh
 from blocks import boundary, shell, skin
 
-from biotac_mj import approach
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.fem import FemStepper
 from biotac_mj.coupling.readings import SensorReadings
 from biotac_mj.geometry import load_skin
+from biotac_mj.press import approach
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.data import view
 from biotac_mj.skin.solver import _Step
 
 INNER, OUTER = 6e-3, 10e-3
@@ -173,7 +172,7 @@ def test_no_pressure_where_the_skin_lies_on_the_core(on_core):
 def test_gradient_is_that_of_the_volume(on_core):
     """By differences, with skin on the core; there facets stand for the core's normals, hence 2 %."""
     model, data, geoms = on_core
-    rng, x = np.random.default_rng(0), view(data.x)
+    rng, x = np.random.default_rng(0), data.x.numpy()
     here = _Step(model, data, geoms, None, None, None)
     here._evaluate()
     base, gradient = x.copy(), here.gradient.copy()
@@ -195,13 +194,13 @@ def test_tangent_is_exact(on_core):
     """Of liquid and core contact by differences of their forces, along directions rough and smooth."""
     model, data, geoms = on_core
     here = _Step(model, data, geoms, None, None, None)
-    x = view(data.x)
+    x = data.x.numpy()
     base, rest = x.copy(), model.geometry.vert[:, None]
     rng = np.random.default_rng(1)
 
     def no_elasticity(p):
-        view(data.direction)[...], view(data.product)[...] = p, 0.0
-        return view(data.product)
+        data.direction.numpy()[...], data.product.numpy()[...] = p, 0.0
+        return data.product.numpy()
 
     here._elastic_product = no_elasticity
     for direction in (rng.standard_normal(x.shape), np.sin(rest @ rng.uniform(-300, 300, (3, 3)))):
@@ -232,7 +231,7 @@ def test_tangent_of_the_liquid_alone(coarse):
     model = SkinModel(coarse, "default", SkinOptions(rest_pressure=5e4, core_contact=False))
     data, geoms = SkinData(model), GeomSet([], [])
     here = _Step(model, data, geoms, None, None, None)
-    x = view(data.x)
+    x = data.x.numpy()
     base = x.copy()
     here._evaluate()
     g = here.gradient * here.mask
@@ -284,7 +283,7 @@ def test_filled_sensor_in_the_coupling(coarse):
     readings.reset(memory)
     assert abs(stepper.vert_xpos(state) - coarse.vert).max() > 5e-5
     rest = readings.rest
-    result = stepper.solve(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
+    result = stepper.solve_skin(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
     counts = readings.advance(memory, 0.0, 0.01, result.vert_xpos, result.pressure)
     np.testing.assert_array_equal(
         counts["electrodes"], rest["electrodes"]

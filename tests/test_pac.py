@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import biotac_mj
-from biotac_mj import approach
 from biotac_mj.geometry import load_skin
+from biotac_mj.press import approach
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
 

@@ -13,10 +13,9 @@ import mujoco.rollout
 import numpy as np
 import pytest
 import spring_skin
-from biotac_mj.plugin import structs
 
 import biotac_mj
-from biotac_mj.coupling import SkinResult, attach, register_stepper
+from biotac_mj.coupling import SkinResult, attach, register_stepper, structs
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -234,7 +233,7 @@ class _Free:
     def vert_xpos(self, state):
         return self.vert
 
-    def solve(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
         return SkinResult(
             state, np.array([[0.0, -500 * (geom_pos[0, 1] + 0.018), 0, 0, 0, 0]]), self.tangent, self.vert
         )
@@ -246,8 +245,8 @@ register_stepper("free", _Free)
 class _Breaking(spring_skin.SpringSkin):
     """Does not converge, or raises, once it is pressed with more than 1 N."""
 
-    def solve(self, state, geom_pos, geom_mat, dt):
-        result = super().solve(state, geom_pos, geom_mat, dt)
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
+        result = super().solve_skin(state, geom_pos, geom_mat, dt)
         result.iterations, result.residual = 7, 0.5
         if abs(result.wrench).max() > 1.0:
             if "raise" in self.options:
@@ -302,10 +301,10 @@ def test_an_exception_is_kept_warned_of_and_raised_on_request():
 
 def test_ctrl_c_inside_a_solve_is_raised_by_check():
     class Interrupted(_Free):
-        def solve(self, state, geom_pos, geom_mat, dt):
+        def solve_skin(self, state, geom_pos, geom_mat, dt):
             if geom_pos[0, 1] > -0.0178:
                 raise KeyboardInterrupt
-            return super().solve(state, geom_pos, geom_mat, dt)
+            return super().solve_skin(state, geom_pos, geom_mat, dt)
 
     register_stepper("interrupted", Interrupted)
     model, _ = two_biotacs(1, "interrupted", "none")
@@ -396,7 +395,8 @@ def test_overhead_is_small_beside_the_skin(coupling, limit):
 
 _OUTLIVED = """
 import mujoco, biotac_mj, sys
-spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body><freejoint/><geom size=".01" mass=".01"/></body></worldbody></mujoco>')
+ball = '<body><freejoint/><geom size=".01" mass=".01"/></body>'
+spec = mujoco.MjSpec.from_string('<mujoco><worldbody>' + ball + '</worldbody></mujoco>')
 biotac_mj.attach(spec, pos=[0, 0, 1], skin="coarse", readings="none")
 class Kept:
     pass

@@ -11,11 +11,14 @@ import pytest
 import trimesh
 from matplotlib.image import imread
 
-from biotac_mj import approach, offscreen, press_indenter, press_record, press_report
-from biotac_mj import press as pressing
 from biotac_mj.coupling import SkinResult, register_stepper, stepper
-from biotac_mj.press import PressOptions
+from biotac_mj.files import replacing
+from biotac_mj.press import PressOptions, approach, plan_path, press, render, report
+from biotac_mj.press.indenter import make_indenter
+from biotac_mj.press.path import rotation_from_y
+from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import CHANNELS
+from biotac_mj.view import offscreen
 
 STIFFNESS = 40.0  # of a node's spring [N/m]
 
@@ -33,7 +36,7 @@ class NodeSprings:
     def vert_xpos(self, state):
         return state.reshape(-1, 3)
 
-    def solve(self, state, geom_pos, geom_mat, dt):
+    def solve_skin(self, state, geom_pos, geom_mat, dt):
         x = self.geometry.vert.copy()
         away = x[self.outer] - geom_pos[0]
         distance = np.linalg.norm(away, axis=1)
@@ -107,15 +110,22 @@ def touching_box(size):
 
 @pytest.mark.parametrize(
     ("name", "tip"),
-    [("sphere_7mm", 0.0), ("cylinder_short_7mm", 0.0), ("cube_14mm", 0.0), ("ring_7mm", 0.0), ("geom:capsule:0.002,0.003", 5e-3),
-     ("geom:ellipsoid:0.002,0.003,0.004", 4e-3), ("geom:plane", 0.0)],
-)  # fmt: skip
+    [
+        ("sphere_7mm", 0.0),
+        ("cylinder_short_7mm", 0.0),
+        ("cube_14mm", 0.0),
+        ("ring_7mm", 0.0),
+        ("geom:capsule:0.002,0.003", 5e-3),
+        ("geom:ellipsoid:0.002,0.003,0.004", 4e-3),
+        ("geom:plane", 0.0),
+    ],
+)
 def test_path_starts_5_um_before_a_flat_skin(name, tip):
     size = 5e-3
     options = PressOptions(
         indenter=name, location=(1e-3, 0.0), depth=1e-3, speed=0.01, timestep=4e-3, hold=0.0
     )
-    path = pressing.plan_path(touching_box(size), press_indenter.make_indenter(name), options)
+    path = plan_path(touching_box(size), make_indenter(name), options)
     # the frame's origin is `tip` behind the front of the shape, which touches inside a face
     assert path.position(0.0)[1] == pytest.approx(-size - tip, abs=0.3e-6)
     assert path.depth[0] == -5e-6 and path.depth[-1] == 1e-3
@@ -124,7 +134,7 @@ def test_path_starts_5_um_before_a_flat_skin(name, tip):
 
 def test_slide_goes_across_the_press(shell):
     options = PressOptions(location=(-8e-3, 0.3), depth=1e-3, slide=2e-3, hold=0.02)
-    path = pressing.plan_path(shell, press_indenter.make_indenter("sphere_7mm"), options)
+    path = plan_path(shell, make_indenter("sphere_7mm"), options)
     assert abs(path.direction @ path.slide_direction) < 1e-12
     assert path.slid[-1] == 2e-3 and (np.diff(path.slid) >= 0).all() and path.depth[-1] == 1e-3
     assert (path.slid[path.depth < 1e-3] == 0).all()
@@ -133,9 +143,7 @@ def test_slide_goes_across_the_press(shell):
 def test_quaternion_turns_y_to_the_direction():
     for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
         out = np.empty(3)
-        mujoco.mju_rotVecQuat(
-            out, np.array([0.0, 1, 0]), pressing._rotation_from_y(np.array(direction, float))
-        )
+        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), rotation_from_y(np.array(direction, float)))
         assert np.allclose(out, direction)
 
 
@@ -160,28 +168,28 @@ def test_quaternion_turns_y_to_the_direction():
 def test_bad_input_names_cause_and_remedy(shell, change, text):
     with pytest.raises(ValueError, match=text):
         options = PressOptions(**{"location": (-8e-3, 0.0), **change})
-        pressing.plan_path(shell, press_indenter.make_indenter(options.indenter), options)
+        plan_path(shell, make_indenter(options.indenter), options)
 
 
 def test_indenter_meshes_are_checked(tmp_path):
     with pytest.raises(FileNotFoundError, match="no indenter mesh at .*none.obj"):
-        press_indenter.make_indenter(f"mesh:{tmp_path / 'none.obj'}")
+        make_indenter(f"mesh:{tmp_path / 'none.obj'}")
     ball = trimesh.creation.icosphere(subdivisions=1, radius=3e-3)
     ball.export(tmp_path / "ball.obj")
-    assert press_indenter.make_indenter(f"mesh:{tmp_path / 'ball.obj'}").vert.shape == ball.vertices.shape
+    assert make_indenter(f"mesh:{tmp_path / 'ball.obj'}").vert.shape == ball.vertices.shape
     trimesh.Trimesh(ball.vertices, ball.faces[1:]).export(tmp_path / "open.obj")
     with pytest.raises(ValueError, match="is open.*close its holes"):
-        press_indenter.make_indenter(f"mesh:{tmp_path / 'open.obj'}")
+        make_indenter(f"mesh:{tmp_path / 'open.obj'}")
     trimesh.creation.icosphere(radius=3.0).export(tmp_path / "big.obj")
     with pytest.raises(ValueError, match="must be in metres"):
-        press_indenter.make_indenter(f"mesh:{tmp_path / 'big.obj'}")
+        make_indenter(f"mesh:{tmp_path / 'big.obj'}")
 
 
 # --- the run
 
 
 def test_one_way_press_feels_the_springs(springs, shell):
-    record, picture = pressing.press(PressOptions(**springs), progress=False)
+    record, picture = press(PressOptions(**springs), progress=False)
     assert picture is None and record.depth[-1] == pytest.approx(1e-3)
     expected = hand_force(shell, record)
     assert np.linalg.norm(record.force[0]) == 0 and np.linalg.norm(expected[-1]) > 0.1
@@ -193,7 +201,7 @@ def test_one_way_press_feels_the_springs(springs, shell):
 
 
 def test_two_way_press_gives_way_to_the_force(springs, shell):
-    record, _ = pressing.press(PressOptions(**{**springs, "hold": 0.2}, two_way=True), progress=False)
+    record, _ = press(PressOptions(**{**springs, "hold": 0.2}, two_way=True), progress=False)
     # at rest the servo (50 kN/m) carries the springs' force
     lag = 1e-3 - record.depth[-1]
     assert lag == pytest.approx(np.linalg.norm(record.force[-1]) / 5e4, rel=0.02)
@@ -202,14 +210,14 @@ def test_two_way_press_gives_way_to_the_force(springs, shell):
 
 def test_two_way_plane_is_refused(springs):
     with pytest.raises(ValueError, match="a plane cannot be pushed .* geom:box"):
-        pressing.press(PressOptions(**springs, indenter="geom:plane", two_way=True), progress=False)
+        press(PressOptions(**springs, indenter="geom:plane", two_way=True), progress=False)
 
 
 # --- the files
 
 
 def test_readings_are_read_back(synthetic_press, tmp_path):
-    press_record.write_readings(synthetic_press, tmp_path / "readings.csv")
+    write_readings(synthetic_press, tmp_path / "readings.csv")
     with open(tmp_path / "readings.csv") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [
@@ -237,7 +245,7 @@ def test_readings_are_read_back(synthetic_press, tmp_path):
 
 
 def test_skin_is_read_back(synthetic_press, tmp_path):
-    press_record.write_skin(synthetic_press, tmp_path / "skin.h5")
+    write_skin(synthetic_press, tmp_path / "skin.h5")
     with h5py.File(tmp_path / "skin.h5") as file:
         assert file["vert_xpos"].dtype == np.float32 and file["vert_xpos"].attrs["unit"] == "m"
         assert np.array_equal(file["vert_xpos"], synthetic_press.vert_xpos)
@@ -251,7 +259,7 @@ def test_skin_is_read_back(synthetic_press, tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "file.csv"
     path.write_text("old")
-    with pytest.raises(RuntimeError), press_record.replacing(path) as temporary:
+    with pytest.raises(RuntimeError), replacing(path) as temporary:
         temporary.write_text("new")
         raise RuntimeError
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
@@ -267,7 +275,7 @@ def test_record_refuses_wrong_shapes(synthetic_press):
 
 
 def test_table(synthetic_press):
-    text = press_report.table(synthetic_press, ["a.csv"])
+    text = report.table(synthetic_press, ["a.csv"])
     peak = 4 / 3 * 1.7e6 * np.sqrt(3.5e-3) * 1.5e-3**1.5
     assert (
         f"{peak:.3f} N at 1.500 mm" in text
@@ -286,7 +294,7 @@ def colors(image):
 
 
 def test_picture_without_gl(synthetic_press, tmp_path):
-    press_report.write_picture(synthetic_press, tmp_path / "press.png")
+    report.write_picture(synthetic_press, tmp_path / "press.png")
     image = imread(tmp_path / "press.png")
     # the surfaces, upper left: skin, dimple and indenter each bring their shades; a blank panel has black and
     # white
@@ -300,7 +308,7 @@ def test_no_gl_library_means_no_render(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "")
     monkeypatch.setattr(offscreen, "_works", lambda gl: False)
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='press'/></worldbody></mujoco>")
-    assert offscreen.find_gl() is None and pressing.render(model, mujoco.MjData(model)) is None
+    assert offscreen.find_gl() is None and render(model, mujoco.MjData(model)) is None
     with pytest.raises(ValueError, match="no GL library to render with: install libosmesa6"):
         offscreen.Offscreen(model, 32, 32, None)
 
@@ -312,7 +320,7 @@ def test_probe_rejects_a_library_that_is_not_there():
 def test_render_shows_skin_and_indenter(springs):
     if offscreen.find_gl() is None:
         pytest.skip("no GL library here: nothing to render with")
-    _, picture = pressing.press(PressOptions(**springs), render=pressing.render, progress=False)
+    _, picture = press(PressOptions(**springs), render=render, progress=False)
     assert picture.shape == (640, 900, 3) and colors(picture / 255) > 20
     green = (picture[..., 1] > 1.3 * picture[..., 0]) & (picture[..., 1] > 1.3 * picture[..., 2])
     orange = (picture[..., 0] > 1.3 * picture[..., 1]) & (picture[..., 0] > 1.5 * picture[..., 2])

@@ -358,7 +358,8 @@ def test_sticking_is_in_the_plugins_state():
     def hang(law, height):
         spec = mujoco.MjSpec.from_string(
             f"""<mujoco><option timestep="0.002"/><worldbody><body name="finger"/>
-            <body name="ball" pos="0 0 {touch + height}"><joint type="slide" axis="0 0 1"/><geom type="sphere" size="{radius}" mass="1e-4"/>
+            <body name="ball" pos="0 0 {touch + height}"><joint type="slide" axis="0 0 1"/>
+            <geom type="sphere" size="{radius}" mass="1e-4"/>
             </body></worldbody></mujoco>"""
         )
         pose = {"pos": [-x, 0, 0], "quat": [0.5**0.5, 0.5**0.5, 0, 0]}

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 import biotac_mj
-from biotac_mj.approach import nearest_point, surface_point
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
-from biotac_mj.press_record import write_readings, write_skin
+from biotac_mj.press.approach import nearest_point, surface_point
+from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_linear, step
 from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed_correction import correction
-from biotac_mj.skin.contact import face_samples
+from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.rest_tangent import rest_tangent
 from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
 
@@ -361,7 +361,7 @@ def test_replay_is_bit_equal(coarse):
         states = [state]
         for pos in path:
             before = states[-1].copy()
-            result = stepper.solve(states[-1], pos[None], EYE, 2e-3)
+            result = stepper.solve_skin(states[-1], pos[None], EYE, 2e-3)
             assert (states[-1] == before).all()
             assert (stepper.vert_xpos(result.state) == result.vert_xpos).all()
             states.append(result.state)
@@ -371,7 +371,7 @@ def test_replay_is_bit_equal(coarse):
     first = run(stepper)
     assert (run(stepper) == first).all()
     fresh = stepper_at()  # other caches, other memory
-    assert (fresh.solve(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
+    assert (fresh.solve_skin(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
 
 
 def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):

@@ -6,8 +6,7 @@ import warp as wp
 from blocks import boundary, box, faces_on, half_space, place, shell, skin
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, contact, step
-from biotac_mj.skin.contact import face_samples
-from biotac_mj.skin.data import view
+from biotac_mj.skin.contact.faces import face_samples
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -414,5 +413,5 @@ def test_face_samples_integrate_linear_fields():
 
 def test_view_shares_memory():
     data = SkinData(pad())
-    view(data.x)[0] = 7.0
+    data.x.numpy()[0] = 7.0
     assert (data.vert_xpos[0, 0] == 7.0).all()

@@ -11,7 +11,7 @@ from test_skin_solver import finger
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.device_step import prepare_device, step_device
-from biotac_mj.skin.device_worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
 START = 13.5e-3  # z of the sphere's centre where it touches the ball [m]
@@ -306,7 +306,7 @@ def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
     import warp as wp
 
     from biotac_mj.skin.device_quadratic import Quadratic
-    from biotac_mj.skin.material import Material
+    from biotac_mj.skin.rubber.material import Material
 
     rubber = Material(law, 1e6, 0.49)
     model = SkinModel(load_skin("coarse"), rubber, SkinOptions(element="quadratic"))

@@ -8,7 +8,6 @@ import warp as wp
 from blocks import box, skin
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, elasticity, step
-from biotac_mj.skin.data import view
 
 NOTHING = GeomSet([], [])
 LENGTH, E, RHO = 50e-3, 1e6, 1000.0
@@ -42,7 +41,7 @@ def swing(model, shape, dt, steps, amplitude=1e-4):
     """Lets go of a bar drawn into `shape`; amplitudes along the shape after each step."""
     data = SkinData(model)
     for array in (data.x, data.x_last):
-        view(array)[:, 0] += amplitude * shape
+        array.numpy()[:, 0] += amplitude * shape
     out = []
     weight = model.elasticity.node_volume[:, None] * shape
     for _ in range(steps):
@@ -99,7 +98,7 @@ def test_energy_falls(law):
         model = bar(law, nu=0.3, cells=6, stiffness_damping=damping)
         data, mesh, along = SkinData(model), model.elasticity, model.geometry.vert[:, 0]
         for array in (data.x, data.x_last):
-            view(array)[:, 0] += np.stack([0.1 * along, 2.0 * along**2, 0 * along], 1)  # stretched and bent
+            array.numpy()[:, 0] += np.stack([0.1 * along, 2.0 * along**2, 0 * along], 1)  # stretched and bent
         energies = []
         for _ in range(15):
             share = wp.zeros((model.nelem, 1), dtype=wp.float64)
@@ -129,7 +128,7 @@ def test_uniform_motion_makes_no_force():
     """A finger that flies at constant speed and does not turn stays at rest in its own frame."""
     model = bar("corotational", nu=0.3)
     data, v, dt = SkinData(model), np.array([0.3, -0.2, 0.1]), 2e-3
-    view(data.velocity)[:] = v
+    data.velocity.numpy()[:] = v
     turn = rotation(0.4)
     data.core_mat = turn[None].copy()
     for k in range(1, 6):
@@ -146,7 +145,7 @@ def test_acceleration_needs_its_force():
     data, a, dt = SkinData(model), np.array([1.0, 2.0, -0.5]), 2e-2
     turn = rotation(0.3)
     data.core_mat = turn[None].copy()
-    view(data.velocity)[:] = 0.0
+    data.velocity.numpy()[:] = 0.0
     for k in range(1, 60):
         step(model, data, NOTHING, dt, (0.5 * a * (k * dt) ** 2)[None], turn[None])
         assert data.converged.all()

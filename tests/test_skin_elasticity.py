@@ -9,8 +9,7 @@ from blocks import boundary, box, faces_on, nodal_areas, place, shell, skin
 from skfem.helpers import ddot, identity, mul, sym_grad, trace, transpose
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.data import view
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.types import vec3
 
 NOTHING = GeomSet([], [])
@@ -32,7 +31,7 @@ def block(
 def forces(model, x):
     """Nodal elastic forces (nvert, 3) at positions x, and the data that hold what `product` needs."""
     data = SkinData(model)
-    view(data.x)[:, 0] = x
+    data.x.numpy()[:, 0] = x
     model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
     return data.force.numpy()[:, 0].copy(), data
 

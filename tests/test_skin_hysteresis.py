@@ -10,8 +10,7 @@ from bars import LENGTH, NOTHING, E, bar, cube, deform
 from blocks import nodal_areas
 
 from biotac_mj.skin import Material, SkinData, step
-from biotac_mj.skin.data import view
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.types import vec3
 
 BRANCHES = ((0.6, 0.02), (0.3, 0.08))
@@ -144,13 +143,13 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     model = cube(law, element, hysteresis=((0.7, 0.05), (0.2, 1.0)))
     data, rng = SkinData(model), np.random.default_rng(4)
     memory, rest = data.memory, model.geometry.vert
-    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.2 * rng.standard_normal((3, 3))).T
+    data.x.numpy()[:, 0] = rest @ (np.eye(3) + 0.2 * rng.standard_normal((3, 3))).T
     memory.begin(None)
     memory.commit(data.x, np.array([True]))
-    view(data.x)[:, 0] = rest @ (
+    data.x.numpy()[:, 0] = rest @ (
         np.eye(3) + 0.03 * rng.standard_normal((3, 3))
     ).T + 1e-4 * rng.standard_normal(rest.shape)
-    x, p = view(data.x).copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
+    x, p = data.x.numpy().copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
 
     def force(shift):
         out = wp.zeros_like(data.force)
@@ -241,7 +240,7 @@ def test_a_step_that_fails_slips_nowhere():
     model = bar("corotational", "linear", hysteresis=BRANCHES)
     data = SkinData(model, 2)
     before = data.memory.friction.slip.copy()
-    view(data.x)[:, 1] = model.geometry.vert * [1.2, 1, 1]
+    data.x.numpy()[:, 1] = model.geometry.vert * [1.2, 1, 1]
     data.memory.commit(data.x, np.array([True, False]))
     np.testing.assert_array_equal(data.memory.friction.slip, before)
     data.memory.commit(data.x, np.array([True, True]))
@@ -262,7 +261,8 @@ def test_slip_is_in_the_plugins_state():
 
     spec = mujoco.MjSpec.from_string(
         """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="finger"/>
-        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body></worldbody></mujoco>"""
+        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body>
+        </worldbody></mujoco>"""
     )
     material = {"hysteresis": [[1.0, 0.02]], "stiffening": 0.3, "element": "linear"}
     pose = {"pos": [0.0062, 0, 0], "quat": [0.5**0.5, -(0.5**0.5), 0, 0]}  # pad up

@@ -17,7 +17,7 @@ from biotac_mj.skin import (
     material,
     step,
 )
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.types import mat33, real, vec3
 
 MU, LAM = 1.3, 2.1

@@ -11,8 +11,7 @@ from blocks import nodal_areas, place, shell, skin
 from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.data import view
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.types import vec3
 
 G, TAU = 0.4, 0.7
@@ -116,14 +115,14 @@ def test_the_tangent_is_the_forces_derivative(law, element, beside):
     model = cube(law, element, prony=((G, TAU), (0.1, 3.0)), mullins=(1.6, 2e3, 0.1), **beside)
     data, rng = SkinData(model), np.random.default_rng(4)
     memory, rest = data.memory, model.geometry.vert
-    view(data.x)[:, 0] = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T
+    data.x.numpy()[:, 0] = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T
     memory.begin(0.3)
     memory.commit(data.x, np.array([True]))  # a past, and a largest energy to be below of
-    view(data.x)[:, 0] = rest @ (
+    data.x.numpy()[:, 0] = rest @ (
         np.eye(3) + 0.1 * rng.standard_normal((3, 3))
     ).T + 2e-4 * rng.standard_normal(rest.shape)
     memory.begin(0.2)
-    x, p = view(data.x).copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
+    x, p = data.x.numpy().copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
 
     def force(shift):
         out = wp.zeros_like(data.force)
@@ -218,7 +217,7 @@ def test_memory_is_saved_replayed_and_forgotten():
     went_on = pull(model, data, 1.15, 0.5)
     again = SkinData(model)
     for array in (again.x, again.x_last):
-        view(array)[:, 0] = x
+        array.numpy()[:, 0] = x
     again.memory.load(saved, again.x)
     assert pull(model, again, 1.15, 0.5) == pytest.approx(went_on, rel=1e-9)
     data.reset()
@@ -233,10 +232,10 @@ def test_worlds_remember_each_their_own():
     for stretch, dt in ((1.2, 0.1), (1.2, 0.3), (1.1, 0.1)):
         place(data, end, model.geometry.vert[end])
         for array in (data.x, data.x_last):
-            view(array)[end, 1] = model.geometry.vert[end] * [stretch, 1, 1]
+            array.numpy()[end, 1] = model.geometry.vert[end] * [stretch, 1, 1]
         step(model, data, GeomSet([], [], nworld=2), dt)
         force = pull(model, alone, stretch, dt)
-    reactions = -view(data.force)[end, :, 0].sum(0)
+    reactions = -data.force.numpy()[end, :, 0].sum(0)
     assert abs(reactions[0]) < 1e-9 and reactions[1] == pytest.approx(force, rel=1e-9)
 
 
@@ -290,7 +289,8 @@ def test_memory_is_in_the_plugins_state():
 
     spec = mujoco.MjSpec.from_string(
         """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="finger"/>
-        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body></worldbody></mujoco>"""
+        <body name="ball" mocap="true" pos="0 0 0.0164"><geom type="sphere" size="0.008"/></body>
+        </worldbody></mujoco>"""
     )
     material = {"prony": [[0.5, 0.1]], "element": "linear"}
     pose = {"pos": [0.0062, 0, 0], "quat": [0.5**0.5, -(0.5**0.5), 0, 0]}  # pad up

@@ -10,8 +10,7 @@ from blocks import box, skin
 
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.data import view
-from biotac_mj.skin.material import LAWS
+from biotac_mj.skin.rubber.law import LAWS
 from biotac_mj.skin.types import vec3
 
 
@@ -89,14 +88,14 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     at, along = (wp.array(a[:, None], dtype=vec3, ndim=2) for a in (x, p))
     force(0.0)
     model.elasticity.product(data.elastic, data.mu, data.lam, at, along, data.product)
-    np.testing.assert_allclose(view(data.product)[:, 0], expected, atol=2e-7 * abs(expected).max())
+    np.testing.assert_allclose(data.product.numpy()[:, 0], expected, atol=2e-7 * abs(expected).max())
     # the factor that preconditions is that of the same rubber
     force_at_rest = wp.array(rest[:, None], dtype=vec3, ndim=2)
     model.elasticity.force(data.elastic, data.mu, data.lam, force_at_rest, data.force)
     model.elasticity.product(data.elastic, data.mu, data.lam, force_at_rest, along, data.product)
     K = model.elasticity.rest_stiffness(model.material.mu, model.material.lame)
     np.testing.assert_allclose(
-        view(data.product)[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max()
+        data.product.numpy()[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max()
     )
 
 

@@ -11,9 +11,8 @@ import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, step
-from biotac_mj.skin.contact import Geoms
-from biotac_mj.skin.data import view
-from biotac_mj.skin.shapes import bake_distance_grid, distance_bound
+from biotac_mj.skin.contact.faces import Geoms
+from biotac_mj.skin.contact.shapes import bake_distance_grid, distance_bound
 from biotac_mj.skin.solver import _Step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -78,7 +77,7 @@ def test_a_trial_far_away_does_not_make_the_skin_lose_the_core(model, trial):
         data = SkinData(model)
         solved = _Step(model, data, NOTHING, None, None, None)
         for place in first:
-            view(data.x)[:, 0] = place
+            data.x.numpy()[:, 0] = place
             solved._evaluate()
         return data.core_force[0].copy()
 
@@ -94,7 +93,7 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
     solved = _Step(model, data, NOTHING, None, None, None)
 
     def possible(x):
-        view(data.x)[:, 0] = x
+        data.x.numpy()[:, 0] = x
         solved._evaluate()
         return solved._possible()[0]
 
@@ -118,7 +117,7 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
     def blind(self, state, geoms):
         if state is self.d.core:
             state.clearance.fill_(1.0)
-            view(state.seen)[...] = view(self.d.x)[state.surface.face_np.ravel()]
+            state.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
         contact(self, state, geoms)
 
     def press():

@@ -9,8 +9,8 @@ from scipy.optimize import minimize_scalar
 
 from biotac_mj.geometry import indenter
 from biotac_mj.skin import GeomSet, bake_distance_grid
-from biotac_mj.skin.contact import Geoms
-from biotac_mj.skin.shapes import distance, distance_bound
+from biotac_mj.skin.contact.faces import Geoms
+from biotac_mj.skin.contact.shapes import distance, distance_bound
 
 SIZES = {
     "sphere": (0.8, 0, 0),

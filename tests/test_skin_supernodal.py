@@ -7,8 +7,8 @@ import scipy.sparse.linalg  # noqa: F401
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import Material, SkinModel
-from biotac_mj.skin.dissection import dissect
-from biotac_mj.skin.supernodal import Elimination, SupernodalFactor
+from biotac_mj.skin.precondition.dissection import dissect
+from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 
 
 @pytest.fixture(scope="module", params=[0.3165, 0.4999])

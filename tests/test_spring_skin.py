@@ -13,13 +13,13 @@ def test_tangent_is_the_derivative_of_the_wrench():
     state = np.zeros(skin.nstate)
     skin.reset(state)
     pos, mat = np.array([[-0.01, spring_skin.HEIGHT - 0.0049, 0.0]]), np.eye(3)[None]
-    state = skin.solve(state, pos, mat, 1e-3).state
-    result = skin.solve(state, pos, mat, 1e-3)
+    state = skin.solve_skin(state, pos, mat, 1e-3).state
+    result = skin.solve_skin(state, pos, mat, 1e-3)
     for i in range(6):
         step = np.zeros((1, 6))
         step[0, i] = 1e-7
-        plus = skin.solve(state, *displace(pos, mat, step), 1e-3).wrench[0]
-        minus = skin.solve(state, *displace(pos, mat, -step), 1e-3).wrench[0]
+        plus = skin.solve_skin(state, *displace(pos, mat, step), 1e-3).wrench[0]
+        minus = skin.solve_skin(state, *displace(pos, mat, -step), 1e-3).wrench[0]
         # frictionless turning changes the normals, which the tangent leaves out: a few percent for the
         # rotations
         np.testing.assert_allclose(

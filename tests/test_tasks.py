@@ -57,7 +57,7 @@ def check(domain, task, steps):
     np.testing.assert_array_equal(first, again)
     other, _ = rollout(domain, task, steps, 4)
     assert (other != first).any()
-    touched = [np.abs(env.task.force(env.physics, i)).max() for i in range(len(env.task.biotacs))]
+    touched = [np.abs(env.task.contact_force(env.physics, i)).max() for i in range(len(env.task.biotacs))]
     assert env.action_spec().shape == (len(env.action_spec().name.split("\t")),)
     assert env.task.hidden(env.physics).shape == (len(env.task.biotacs), len(env.task.estimated))
     return touched
@@ -325,9 +325,11 @@ _PIXELS = """
 from dm_control.suite.wrappers import pixels
 from biotac_mj.tasks import load, suite
 for domain, task in suite.tasks():
-    env = pixels.Wrapper(load(domain, task, task_kwargs={"random": 0}), render_kwargs={"height": 48, "width": 64})
+    size = {"height": 48, "width": 64}
+    env = pixels.Wrapper(load(domain, task, task_kwargs={"random": 0}), render_kwargs=size)
     picture = env.reset().observation["pixels"]
-    assert picture.shape == (48, 64, 3) == env.observation_spec()["pixels"].shape and picture.std() > 5, (task, picture)
+    assert picture.shape == (48, 64, 3) == env.observation_spec()["pixels"].shape, task
+    assert picture.std() > 5, (task, picture)
 size = {"height": 48, "width": 64, "camera_id": "side"}
 env = pixels.Wrapper(load("finger", "press", task_kwargs={"random": 0}), render_kwargs=size)
 picture = env.reset().observation["pixels"]
@@ -339,7 +341,7 @@ assert set(beside.reset().observation) > {"pixels", "position", "target"}
 
 def test_dm_controls_pixels():
     """In a process of its own: dm_control chooses its renderer when it is imported."""
-    from biotac_mj.offscreen import find_gl
+    from biotac_mj.view.offscreen import find_gl
 
     gl = find_gl()
     if gl not in ("egl", "osmesa"):

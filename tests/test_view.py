@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from biotac_mj import offscreen, view
+from biotac_mj.view import offscreen, window
 
 
 def test_render_shows_ball_and_electrodes(tmp_path, capsys):
     if offscreen.find_gl() is None:
         with pytest.raises(ValueError, match="no GL library to render with"):
-            view.view(skin="coarse", render=tmp_path / "view.png")
+            window.view(skin="coarse", render=tmp_path / "view.png")
         return
-    view.view(skin="coarse", render=tmp_path / "view.png", seconds=0.1)
+    window.view(skin="coarse", render=tmp_path / "view.png", seconds=0.1)
     assert "wrote" in capsys.readouterr().out
     image = imread(tmp_path / "view.png")[..., :3]
     red, green, blue = np.moveaxis(image, -1, 0)
@@ -47,7 +47,7 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
 
     monkeypatch.setattr(viewer, "launch_passive", launch_passive)
     monkeypatch.setenv("DISPLAY", ":0")
-    view.view(skin="coarse")
+    window.view(skin="coarse")
     data = seen["data"]
     assert (
         np.linalg.norm(Window.cam.lookat) < 0.02 and Window.cam.distance < 0.1
@@ -56,5 +56,5 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
     # the ball of 100 g has come to rest: the pad, up here, carries it
     assert np.abs(data.qvel).max() < 1e-3
     force = np.empty(3)
-    mujoco.mju_rotVecQuat(force, data.sensor("biotac_contact_force").data[:3], view._PAD_UP)
+    mujoco.mju_rotVecQuat(force, data.sensor("biotac_contact_force").data[:3], window._PAD_UP)
     assert force[2] == pytest.approx(-0.1 * 9.81, rel=0.01)

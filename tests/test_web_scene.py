@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from biotac_mj import web_scene
+from biotac_mj.view import web_scene
 
 XML = """<mujoco><asset>
-  <mesh name="wedge" vertex="0 0 0  .02 0 0  0 .03 0  0 0 .04"/><material name="red" rgba="1 0 0 1"/></asset><worldbody>
+  <mesh name="wedge" vertex="0 0 0  .02 0 0  0 .03 0  0 0 .04"/>
+  <material name="red" rgba="1 0 0 1"/></asset><worldbody>
   <geom type="plane" size="1 1 .1" pos="0 0 -1"/>
   <body name="hidden"><geom name="inside" size=".01" pos="9 0 0"/></body>
   <body name="moving" pos=".1 .2 .3" euler="20 30 40"><freejoint/>
-    <geom name="{kind}" type="{kind}" {size} pos=".01 0 .02" euler="10 0 50" material="red"/></body></worldbody></mujoco>"""
+    <geom name="{kind}" type="{kind}" {size} pos=".01 0 .02" euler="10 0 50" material="red"/>
+  </body></worldbody></mujoco>"""
 
 SIZES = {
     "sphere": 'size=".02"',

@@ -13,8 +13,9 @@ viser = pytest.importorskip("viser", reason="needs viser (extra web)")
 import browser
 import zstandard
 
-from biotac_mj import cli, web_view
-from biotac_mj.press_record import write_skin
+from biotac_mj import cli
+from biotac_mj.press.record import write_skin
+from biotac_mj.view import web as web_view
 
 
 def messages(page, seconds=1.0):

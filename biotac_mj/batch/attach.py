@@ -2,24 +2,31 @@
 into `mujoco_warp.step`."""
 
 import dataclasses
+import pathlib
+import typing
 import warnings
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attach import _add_slots, _check_place, _model
+from ..coupling.attachment import _add_slots, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _choices, _grid, rest_geometry
 from ..coupling.fem import _model as skin_model
-from ..coupling.skins import reference
+from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
-from ..plugin.structs import ModelView
+from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import skin_reference
 from ..skin.rubber.material import Material
 from ..skin.rubber.material import material as preset
 from .batch import Batch, Hook
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
 
 __all__ = ["add", "attach", "make"]
 
@@ -29,15 +36,15 @@ _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBi
 
 
 def add(
-    spec,
-    site=None,
-    body=None,
-    pos=(0.0, 0.0, 0.0),
-    quat=(1.0, 0.0, 0.0, 0.0),
-    prefix="biotac_",
-    skin="default",
-    coupling="two-way",
-    geoms=None,
+    spec: mujoco.MjSpec,
+    site: str | None = None,
+    body: str | None = None,
+    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
+    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    coupling: str = "two-way",
+    geoms: list | None = None,
 ) -> str:
     """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
 
@@ -60,7 +67,7 @@ def add(
     _check_place(spec, site, body, prefix)
     own = spec.site(site).parent if site is not None else spec.worldbody if body is None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    child = _model(reference(skin)[1])
+    child = _model(skin_reference(skin)[1])
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:
         spec.attach(child, site=spec.site(site), prefix=prefix)
@@ -97,21 +104,21 @@ def _mover(body):
 
 
 def attach(
-    mjm,
-    m,
-    d,
-    prefix="biotac_",
-    skin="default",
-    material=None,
-    liquid=None,
-    friction=None,
-    priority=0,
-    coupling="two-way",
-    geoms=None,
-    rounding=None,
-    seed=0,
-    readings=True,
-    options=None,
+    mjm: mujoco.MjModel,
+    m: "mjw.Model",
+    d: "mjw.Data",
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    coupling: str = "two-way",
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    seed: int = 0,
+    readings: bool | dict = True,
+    options: dict | None = None,
 ) -> Batch:
     """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on
     `mjw.step(m, d)` steps them too.
@@ -162,20 +169,20 @@ def attach(
 
 
 def make(
-    mjm,
-    nworld,
-    device=None,
-    prefix="biotac_",
-    skin="default",
-    material=None,
-    liquid=None,
-    friction=None,
-    priority=0,
-    geoms=None,
-    rounding=None,
-    seed=0,
-    readings=True,
-    options=None,
+    mjm: mujoco.MjModel,
+    nworld: int,
+    device: str | None = None,
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    seed: int = 0,
+    readings: bool | dict = True,
+    options: dict | None = None,
 ) -> PoseBatch:
     """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step,
     such as mjx.
@@ -216,7 +223,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         single = dataclasses.asdict(single)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     config = Config(
-        skin=reference(skin)[0],
+        skin=skin_reference(skin)[0],
         material=single,
         liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
         geoms=settings["geoms"],
@@ -230,16 +237,16 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
-            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; the model's bodies are "
-            f"{names}"
+            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
+            f"the model's bodies are {names}"
         )
     touching = Touching(ModelView(mjm._address), core, config)
-    geometry = reference(skin)[1]
+    geometry = skin_reference(skin)[1]
     fem = skin_model(geometry, *_choices(config), device)
     if fem.options.dynamics != "quasistatic":
         raise ValueError(
-            "a batch's skins are quasi-static: leave options['skin']['dynamics'] out, or use "
-            "biotac_mj.attach for inertia"
+            "a batch's skins are quasi-static: "
+            "leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia"
         )
     grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
     frictions = _frictions(mjm, touching.geom, mu, priority)
@@ -289,8 +296,8 @@ def _check_model(mjm, coupling):
         )
     if mjm.opt.disableflags & _SPRINGLESS == _SPRINGLESS:
         raise ValueError(
-            "mujoco_warp asks for no passive forces where springs and dampers are both disabled: enable one "
-            "of the flags"
+            "mujoco_warp asks for no passive forces where springs and dampers are both disabled: "
+            "enable one of the flags"
         )
     if coupling == "two-way" and mjm.opt.disableflags & _ROWLESS:
         raise ValueError(
@@ -308,8 +315,8 @@ def _warn_of_damping(mjm, touching):
         warnings.warn(
             f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the "
             "batch solves its skins where "
-            "the body would go without the integrator's damping; take smaller steps, less damping, or "
-            "biotac_mj.attach on the CPU",
+            "the body would go without the integrator's damping; "
+            "take smaller steps, less damping, or biotac_mj.attach on the CPU",
             stacklevel=3,
         )
 
@@ -335,8 +342,8 @@ def _slots(mjm, m, d, touching, prefix):
     )
     if needed and d.njmax < rows + 7:
         raise ValueError(
-            f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: make the Data with a "
-            "larger njmax"
+            f"njmax is {d.njmax} and the equality constraints alone have {rows} rows: "
+            "make the Data with a larger njmax"
         )
     active0, active = m.eq_active0.numpy().copy(), d.eq_active.numpy().copy()
     for root, weld in place.items():

@@ -9,11 +9,20 @@ Once per step, when mujoco_warp asks for passive forces, as `coupling/world.py` 
 The readings are written when it asks for the velocity sensors.
 """
 
+import typing
+
+import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.touching import Touching
 from . import dynamics
+from .skin import BatchSkin
 from .skins import Skins
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
 
 __all__ = ["Batch", "Hook"]
 
@@ -25,7 +34,17 @@ class Batch(Skins):
       active: False leaves the skins out of `mjw.step` and `mjw.forward`: nothing is solved, nothing acts.
     """
 
-    def __init__(self, mjm, touching, slots, skin, film, acquisition, addresses, two_way):
+    def __init__(
+        self,
+        mjm: mujoco.MjModel,
+        touching: Touching,
+        slots: dict,
+        skin: BatchSkin,
+        film: object,
+        acquisition: object,
+        addresses: list,
+        two_way: bool,
+    ):
         super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, addresses)
         self.active = True
         self.moving = two_way and mjm.nv > 0  # whether forces change where anything goes
@@ -42,7 +61,7 @@ class Batch(Skins):
             )
             self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
 
-    def predict(self, m, d):
+    def predict(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Where the bodies go without acceleration, and their Jacobians; finds this step's rows."""
         arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof]
         self._launch(
@@ -56,7 +75,7 @@ class Batch(Skins):
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
 
-    def act(self, m, d):
+    def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Puts the linear models into the forces and the rows."""
         model = [self.wrench0, self.tangent0, self.pos0, self.mat0]
         self._launch(
@@ -74,7 +93,7 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def solve(self, m, d, accelerated):
+    def solve_skins(self, m: "mjw.Model", d: "mjw.Data", accelerated: bool) -> None:
         """Solves the skins where the bodies go, with d.qacc or without acceleration."""
         pos, mat = self._start_pos, self._start_mat
         if accelerated:
@@ -92,22 +111,22 @@ class Hook:
     """What a mujoco_warp Model calls: all batches of the Model step together, after callbacks that were there
     before."""
 
-    def __init__(self, m):
+    def __init__(self, m: "mjw.Model"):
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
         self._outside = None
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
 
     @classmethod
-    def of(cls, m):
+    def of(cls, m: "mjw.Model") -> "Hook":
         """The Model's hook, made when first asked for."""
         there = getattr(m.callback.passive, "__self__", None)
         return there if isinstance(there, cls) else cls(m)
 
-    def add(self, batch):
+    def add(self, batch: Batch) -> None:
         self.batches.append(batch)
 
-    def passive(self, m, d):
+    def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:
             self._passive(m, d)
         batches = [b for b in self.batches if b.active]
@@ -122,13 +141,13 @@ class Hook:
                 batch.act(m, d)
             _accelerate(m, d)
         for batch in batches:
-            batch.solve(m, d, batch.moving)
+            batch.solve_skins(m, d, batch.moving)
         if moving:
             wp.copy(d.qfrc_passive, self._outside)
             for batch in moving:
                 batch.act(m, d)
 
-    def sensor(self, m, d, stage):
+    def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
         from mujoco_warp._src.types import Stage
 
         if self._sensor:

@@ -1,8 +1,10 @@
 """The skins of all worlds behind one small door: geoms where they will be in, wrenches, tangents and liquid
 out, all on the device."""
 
+import numpy as np
 import warp as wp
 
+from ..coupling.stepper import Geom
 from ..skin import GeomSet, SkinData, SkinModel
 from ..skin.device_step import prepare_device, step_device
 from . import skin_kernels as kernels
@@ -24,7 +26,8 @@ class BatchSkin:
 
     Attributes (wp.arrays on the model's device, double precision where nothing else is said):
       data: the SkinData: positions, materials and liquids.
-      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before `step`.
+      pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before
+        `solve_skins`.
       x: (nvert, nworld) nodes [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
@@ -35,7 +38,16 @@ class BatchSkin:
         of the last step.
     """
 
-    def __init__(self, model: SkinModel, nworld, geoms, grids, friction, materials=None, tangents=True):
+    def __init__(
+        self,
+        model: SkinModel,
+        nworld: int,
+        geoms: list[Geom],
+        grids: list,
+        friction: np.ndarray,
+        materials: list | None = None,
+        tangents: bool = True,
+    ):
         self.model, self.nworld, self._tangents = model, nworld, tangents
         self.data = SkinData(model, nworld, materials, resident=True)
         self.geoms = GeomSet(
@@ -67,11 +79,11 @@ class BatchSkin:
             self._rest = self.data.rest_vert
 
     @property
-    def nbytes(self):
+    def nbytes(self) -> int:
         """Device memory that grows with the number of worlds [bytes]."""
         return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
-    def step(self):
+    def solve_skins(self) -> None:
         """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA
         graph.
 
@@ -109,7 +121,7 @@ class BatchSkin:
                 [self.tangent],
             )
 
-    def reset(self, mask):
+    def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
         m, d, n = self.model, self.data, self.nworld
         self._launch(

@@ -1,10 +1,13 @@
 """BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the
 bodies."""
 
+import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.touching import Touching
 from . import kernels
+from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
 
@@ -27,7 +30,15 @@ class Skins:
         in the BioTac frame.
     """
 
-    def __init__(self, touching, skin, film, acquisition, dt, addresses):
+    def __init__(
+        self,
+        touching: Touching,
+        skin: BatchSkin,
+        film: object,
+        acquisition: object,
+        dt: float,
+        addresses: list,
+    ):
         self.nworld, self.skin, self.film, self.acquisition = skin.nworld, skin, film, acquisition
         self.device, self.dt = skin.model.device, float(dt)
         self._core = int(touching.core)
@@ -49,7 +60,7 @@ class Skins:
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.reset()
 
-    def reset(self, world_mask=None):
+    def reset(self, world_mask: wp.array | np.ndarray | None = None) -> None:
         """Puts skins, sensors and their clocks of some worlds back to rest, as mjw.reset_data does with the
         rest of the world.
 
@@ -66,8 +77,8 @@ class Skins:
             mask = wp.array(np.asarray(world_mask, bool), dtype=bool, device=self.device)
         if mask.shape != (self.nworld,) or mask.dtype is not wp.bool:
             raise ValueError(
-                f"world_mask has shape {mask.shape} and type {mask.dtype}: pass ({self.nworld},) of bool, "
-                "True resets"
+                f"world_mask has shape {mask.shape} and type {mask.dtype}: "
+                f"pass ({self.nworld},) of bool, True resets"
             )
         self.skin.reset(mask)
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
@@ -76,24 +87,24 @@ class Skins:
             self.acquisition.reset(mask)
 
     @property
-    def vert_xpos(self):
+    def vert_xpos(self) -> np.ndarray:
         """(nworld, nvert, 3) nodes of the skins in the BioTac frame [m], a copy on the host."""
         return np.swapaxes(self.skin.x.numpy(), 0, 1).copy()
 
     @property
-    def wrench(self):
+    def wrench(self) -> np.ndarray:
         """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a
         copy on the host."""
         return np.swapaxes(self.wrench0.numpy(), 0, 1).copy()
 
     @property
-    def nbytes(self):
+    def nbytes(self) -> int:
         """Device memory that grows with the number of worlds, of skins and sensors together [bytes]."""
         return self.skin.nbytes + (
             self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0
         )
 
-    def solve_at(self, pos, mat, geom_pos, geom_quat):
+    def solve_at(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
         """Solves the skins for touching bodies at pos, mat [group, world] in the BioTac frame. Launches only.
 
         Args:
@@ -104,13 +115,13 @@ class Skins:
         self._launch(
             kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
         )
-        skin.step()
+        skin.solve_skins()
         models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
         self._launch(
             kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models
         )
 
-    def sense(self, sensordata):
+    def sense(self, sensordata: wp.array) -> None:
         """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches
         only."""
         state, skin = self._no_state, self.skin
@@ -122,7 +133,7 @@ class Skins:
         self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs], [sensordata])
 
     @property
-    def groups(self):
+    def groups(self) -> tuple:
         """(ngroup, nworld)."""
         return self.wrench0.shape
 
@@ -144,7 +155,9 @@ class PoseBatch(Skins):
       sensordata: (nworld, 55) wp.array float, the channels of `readings` one after another.
     """
 
-    def __init__(self, mjm, touching, skin, film, acquisition):
+    def __init__(
+        self, mjm: mujoco.MjModel, touching: Touching, skin: BatchSkin, film: object, acquisition: object
+    ):
         widths = list(CHANNELS.values())
         super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
@@ -155,7 +168,7 @@ class PoseBatch(Skins):
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
-    def step(self, xpos, xmat, xipos):
+    def step(self, xpos: np.ndarray, xmat: np.ndarray, xipos: np.ndarray) -> None:
         """Solves the skins where the bodies are, and writes `xfrc_applied` and `sensordata`. Launches only.
 
         Args:
@@ -183,7 +196,7 @@ class PoseBatch(Skins):
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
         self.sense(self.sensordata)
 
-    def readings(self):
+    def readings(self) -> dict:
         """{channel: (nworld, dim)} views of `sensordata`."""
         ends = np.cumsum(list(CHANNELS.values())).tolist()
         return {

@@ -3,10 +3,12 @@ reference."""
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from ..geometry.indenters import INDENTERS
+from ..skin.rubber.material import Material
 from .configurations import Configuration
 from .fit import Calibration
 from .forward import simulate
@@ -61,8 +63,13 @@ class Comparison:
 
 
 def plan_indentations(
-    count: int, indenters=INDENTERS, seed: int = 0, samples: int = 10, skin: str = "coarse", progress=None
-):
+    count: int,
+    indenters: list | tuple | None = INDENTERS,
+    seed: int = 0,
+    samples: int = 10,
+    skin: str = "coarse",
+    progress: Callable | None = None,
+) -> list:
     """`count` random indentations for each indenter: place on the pad, depth, direction up to 25 degrees off
     the normal, and a slide.
 
@@ -102,7 +109,12 @@ def references(plans, progress=None, **options) -> list[Indentation]:
 
 
 def evaluate(
-    configuration: Configuration, material, indentations, calibration=None, device="cpu", progress=None
+    configuration: Configuration,
+    material: Material,
+    indentations: list,
+    calibration: object = None,
+    device: str = "cpu",
+    progress: Callable | None = None,
 ) -> Comparison:
     """Walks every indentation with one configuration and material.
 
@@ -158,7 +170,7 @@ def evaluate(
     )
 
 
-def comparison_table(comparisons, reference: str) -> str:
+def comparison_table(comparisons: list, reference: str) -> str:
     """The paper's table, with its published numbers in the last column."""
     names = list(comparisons[0].force)
     lines = [
@@ -196,7 +208,7 @@ def comparison_table(comparisons, reference: str) -> str:
     line("nodal, mean norm [m]", [f"{c.nodal_mean:.2e}" for c in comparisons], f"{PAPER['nodal_mean']:.2e}")
     line("steps not converged", [f"{c.nonconverged}/{c.steps}" for c in comparisons], "")
     lines.append(
-        "(in brackets: of each indentation's largest reference force; the paper compared with ANSYS over "
-        "other indentations)"
+        "(in brackets: of each indentation's largest reference force; "
+        "the paper compared with ANSYS over other indentations)"
     )
     return "\n".join(lines)

@@ -36,7 +36,7 @@ CONFIGURATIONS = {
 }
 
 
-def configuration(name: str, skin: str = "coarse", **options) -> Configuration:
+def configuration(name: str, skin: str = "coarse", **options: object) -> Configuration:
     """One of the paper's four configurations.
 
     Args:
@@ -59,7 +59,7 @@ def configuration(name: str, skin: str = "coarse", **options) -> Configuration:
         )
     if skin != "coarse":
         raise ValueError(
-            f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: make others with "
-            "scripts/make_solids.py"
+            f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: "
+            "make others with scripts/make_solids.py"
         )
     return Configuration(name, SkinGeometry.load(asset_path(f"skins/{body}_coarse.npz")), options)

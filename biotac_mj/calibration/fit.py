@@ -42,13 +42,13 @@ class Parameter:
     upper: float
     logarithmic: bool = False
 
-    def scaled(self, value):
+    def scaled(self, value: float) -> float:
         return np.log(value) if self.logarithmic else 2 * value / (self.upper - self.lower)
 
-    def value(self, scaled):
+    def value(self, scaled: float) -> float:
         return float(np.exp(scaled)) if self.logarithmic else float(scaled * (self.upper - self.lower) / 2)
 
-    def slope(self, value):
+    def slope(self, value: float) -> float:
         """d value / d scaled."""
         return value if self.logarithmic else (self.upper - self.lower) / 2
 
@@ -151,11 +151,11 @@ class Calibration:
 def forces_and_jacobian(
     configuration: Configuration,
     material: Material,
-    parameters,
-    values,
+    parameters: list,
+    values: np.ndarray,
     indentation: Indentation,
-    device="cpu",
-):
+    device: str = "cpu",
+) -> tuple[np.ndarray, np.ndarray]:
     """The model's forces and their derivatives by the parameters' scaled forms, columns as worlds of one
     batch.
 
@@ -198,7 +198,7 @@ def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
-    parameters=("E", "nu", "mu"),
+    parameters: list | tuple = ("E", "nu", "mu"),
     max_iterations: int = 20,
     device: str = "cpu",
     progress: bool = False,
@@ -243,8 +243,8 @@ def calibrate(
     for p, value in zip(parameters, begin):
         if not p.lower <= value <= p.upper:
             raise ValueError(
-                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: change the "
-                "start or the bounds"
+                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: "
+                "change the start or the bounds"
             )
     scale_force = np.sqrt((indentation.force**2).sum(1).mean())
     if not scale_force > 0:
@@ -274,8 +274,8 @@ def calibrate(
     for p, column in zip(parameters, np.moveaxis(there, -1, 0)):
         if np.sqrt((column**2).sum(1).mean()) < 1e-6 * scale_force:
             raise ValueError(
-                f"the force of this indentation does not depend on {p.name}: leave it out, or load the skin "
-                "so that it shows"
+                f"the force of this indentation does not depend on {p.name}: "
+                "leave it out, or load the skin so that it shows"
             )
     # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and
     # this straightens their valley

@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..press_indenter import make_indenter
+from ..press.indenter import make_indenter
 from ..skin import GeomSet, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
 from .indentation import Indentation
 
@@ -37,10 +38,10 @@ class Response:
 def simulate(
     geometry: SkinGeometry,
     options: SkinOptions,
-    materials,
+    materials: list,
     indentation: Indentation,
-    device="cpu",
-    progress=None,
+    device: str = "cpu",
+    progress: Callable | None = None,
 ) -> Response:
     """Walks the indentation once, every material as a world of one batch.
 
@@ -78,7 +79,7 @@ def simulate(
     return Response(np.swapaxes(force, 0, 1), peak, mean, data.nonconverged.copy(), steps)
 
 
-def displacement_norms(displacement, weight):
+def displacement_norms(displacement: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Largest and mean norm of nodal displacements (..., m, 3) [m], the mean weighted with (m,)."""
     norm = np.linalg.norm(displacement, axis=-1)
     return norm.max(-1), norm @ weight / weight.sum()

@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 
 __all__ = [
     "COLUMNS",
@@ -57,8 +57,8 @@ class Indentation:
                 )
             if not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of indentation {self.name!r} contains NaN or infinite numbers: remove those "
-                    "samples"
+                    f"{name} of indentation {self.name!r} contains NaN or infinite numbers: "
+                    "remove those samples"
                 )
             object.__setattr__(self, name, value)
         if n < 4:
@@ -67,8 +67,8 @@ class Indentation:
             )
         if not (np.diff(self.time) > 0).all():
             raise ValueError(
-                f"time_s of indentation {self.name!r} does not increase: sort the rows and remove repeated "
-                "ones"
+                f"time_s of indentation {self.name!r} does not increase: "
+                "sort the rows and remove repeated ones"
             )
         if np.abs(self.tip).max() > _REACH:
             raise ValueError(
@@ -79,14 +79,14 @@ class Indentation:
 
 
 def plan_indentation(
-    indenter="sphere_7mm",
-    location=(-0.010, 0.3),
-    depth=1.2e-3,
-    slide=1.2e-3,
-    slide_direction=(1, 0, 0),
-    direction=None,
-    samples=24,
-    skin="coarse",
+    indenter: str = "sphere_7mm",
+    location: tuple = (-0.010, 0.3),
+    depth: float = 1.2e-3,
+    slide: float = 1.2e-3,
+    slide_direction: tuple | np.ndarray = (1, 0, 0),
+    direction: tuple | np.ndarray | None = None,
+    samples: int = 24,
+    skin: str = "coarse",
 ) -> Indentation:
     """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along
     it.
@@ -103,8 +103,8 @@ def plan_indentation(
       ValueError: see `press.plan_path`.
     """
     from ..geometry import load_skin
-    from ..press import PressOptions, plan_path
-    from ..press_indenter import make_indenter
+    from ..press.indenter import make_indenter
+    from ..press.path import PressOptions, plan_path
 
     stride = (depth + slide) / samples
     options = PressOptions(
@@ -125,7 +125,10 @@ def plan_indentation(
 
 
 def plan_shear(
-    indenter="sphere_7mm", corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4, **place
+    indenter: str = "sphere_7mm",
+    corners: tuple = ((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)),
+    stride: float = 2e-4,
+    **place: object,
 ) -> Indentation:
     """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a
     press that squeezes the skin on the core, in which the force hardly depends on nu.
@@ -148,7 +151,9 @@ def plan_shear(
     return dataclasses.replace(plan, time=0.02 * np.arange(len(tip)), tip=tip, force=np.zeros_like(tip))
 
 
-def read_indentation(path, indenter: str | None = None, direction=None) -> Indentation:
+def read_indentation(
+    path: pathlib.Path | str, indenter: str | None = None, direction: tuple | np.ndarray | None = None
+) -> Indentation:
     """Reads force-deflection data.
 
     CSV: a header with COLUMNS (others are ignored) and a row per sample. The indenter's orientation is
@@ -168,13 +173,13 @@ def read_indentation(path, indenter: str | None = None, direction=None) -> Inden
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no force-deflection data at {path}: give a CSV file with columns {', '.join(COLUMNS)}, or a "
-            "press's skin.h5"
+            f"no force-deflection data at {path}: "
+            f"give a CSV file with columns {', '.join(COLUMNS)}, or a press's skin.h5"
         )
     return _read_press(path, indenter) if path.suffix == ".h5" else _read_csv(path, indenter, direction)
 
 
-def write_indentation(indentation: Indentation, path) -> None:
+def write_indentation(indentation: Indentation, path: pathlib.Path | str) -> None:
     """Writes COLUMNS and the orientation as CSV (to a temporary name, then renamed)."""
     n = len(indentation.time)
     rows = np.column_stack(
@@ -215,12 +220,12 @@ def _column(path, header, rows, name):
         if other:
             given = other[len(stem) :].lstrip("_") or "none"
             raise ValueError(
-                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; convert the "
-                "numbers and rename it"
+                f"column {other!r} of {path} has unit {given}: it must be {name!r}, in {unit}; "
+                "convert the numbers and rename it"
             )
         raise ValueError(
-            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; it has "
-            f"{', '.join(header)}"
+            f"{path} has no column {name!r}: its header must have {', '.join(COLUMNS)}; "
+            f"it has {', '.join(header)}"
         )
     index, values = header.index(name), []
     for number, row in enumerate(rows, start=2):
@@ -235,16 +240,16 @@ def _column(path, header, rows, name):
 
 
 def _orientation(path, header, rows, direction):
-    from ..press import _rotation_from_y
+    from ..press.path import rotation_from_y
 
     if direction is not None:
         direction = np.asarray(direction, float)
         if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction):
             raise ValueError(
-                f"direction {np.asarray(direction).tolist()} is no direction: give three numbers that are "
-                "not all zero"
+                f"direction {np.asarray(direction).tolist()} is no direction: "
+                "give three numbers that are not all zero"
             )
-        return _rotation_from_y(direction / np.linalg.norm(direction))
+        return rotation_from_y(direction / np.linalg.norm(direction))
     if "quat_w" not in header:
         return np.array([1.0, 0, 0, 0])
     quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T

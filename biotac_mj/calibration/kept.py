@@ -3,8 +3,9 @@ where it was."""
 
 import pathlib
 import pickle
+from collections.abc import Callable
 
-from ..press_record import replacing
+from ..files import replacing
 
 __all__ = ["Kept"]
 
@@ -17,7 +18,7 @@ class Kept:
       settings: what the results depend on, compared with `==`.
     """
 
-    def __init__(self, path, settings):
+    def __init__(self, path: pathlib.Path | str, settings: dict):
         self._path, self._content = pathlib.Path(path), {"settings": settings, "parts": {}}
         try:
             content = pickle.loads(self._path.read_bytes())
@@ -39,7 +40,7 @@ class Kept:
     def names(self) -> list:
         return list(self._content["parts"])
 
-    def get(self, name, make):
+    def get(self, name: str, make: Callable) -> object:
         """The part of this name, made by `make()` unless it is there."""
         parts = self._content["parts"]
         if name not in parts:

@@ -18,13 +18,13 @@ STAND_IN = "own rubber with liquid, in place of ANSYS"
 
 def stand_in(
     indentation: Indentation,
-    material="rubber",
-    skin="default",
-    noise=0.0,
-    seed=0,
-    liquid=None,
-    element=None,
-    device="cpu",
+    material: str = "rubber",
+    skin: str = "default",
+    noise: float = 0.0,
+    seed: int = 0,
+    liquid: bool | None = None,
+    element: str | None = None,
+    device: str = "cpu",
 ) -> Indentation:
     """The same way with the forces and displacements of a skin that we know.
 

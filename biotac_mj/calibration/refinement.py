@@ -29,8 +29,8 @@ def refined(geometry: SkinGeometry) -> SkinGeometry:
     """
     if geometry.element != "quadratic":
         raise ValueError(
-            f"skin {geometry.name!r} has four-node tetrahedra: pass one with ten nodes (`with_edge_nodes` "
-            "makes them)"
+            f"skin {geometry.name!r} has four-node tetrahedra: "
+            "pass one with ten nodes (`with_edge_nodes` makes them)"
         )
     barycentric = np.vstack([np.eye(4), np.eye(4)[EDGES].mean(1)])
     middle = barycentric[PARTS][:, EDGES].mean(2)  # (8 parts, 6 edges, 4)

@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
+from ..skin.rubber.material import Material
 from .fit import Calibration
 
 __all__ = ["calibration_table", "read_material", "write_json", "write_picture"]
@@ -23,28 +25,28 @@ def calibration_table(result: Calibration) -> str:
     """The result in words."""
     liquid = "with liquid" if result.liquid else "without liquid"
     lines = [
-        f"{result.configuration} on skin {result.skin}, {result.law}, {result.element} elements, {liquid}, "
-        f"pressed by {result.indenter}"
+        f"{result.configuration} on skin {result.skin}, {result.law}, {result.element} elements, "
+        f"{liquid}, pressed by {result.indenter}"
     ]
     lines.append(f"{'parameter':<20}{'start':>13}{'fitted':>13}   95 % confidence")
     for i, name in enumerate(result.parameters):
         low, high = result.interval[i]
         note = "  on its bound: the interval means little" if result.at_bound[i] else ""
         lines.append(
-            f"{name:<20}{result.start[i]:>13.6g}{result.value[i]:>13.6g}   {low:.6g} .. {high:.6g} "
-            f"{_UNITS.get(name, '')}{note}"
+            f"{name:<20}{result.start[i]:>13.6g}{result.value[i]:>13.6g}   {low:.6g} .. "
+            f"{high:.6g} {_UNITS.get(name, '')}{note}"
         )
     lines.append(
-        f"force error: RMS {result.rms:.4f} N, mean {result.mean:.4f} N, of {result.peak:.3f} N at most "
-        "(the paper: mean 0.125 N)"
+        f"force error: RMS {result.rms:.4f} N, mean {result.mean:.4f} N, "
+        f"of {result.peak:.3f} N at most (the paper: mean 0.125 N)"
     )
     values = ", ".join(f"{axis} {p:.3g}" for axis, p in zip("xyz", result.whiteness["p_value"]))
     verdict = "white" if result.whiteness["white"] else "not white: the model leaves something unexplained"
     lines.append(f"residual: Ljung-Box over {result.whiteness['lags']} lags, p = {values}: {verdict}")
     how = "converged" if result.success else f"did NOT converge ({result.message})"
     lines.append(
-        f"the fit {how} after {result.evaluations} batches; steps of the skin that did not converge: "
-        f"{result.nonconverged}"
+        f"the fit {how} after {result.evaluations} batches; "
+        f"steps of the skin that did not converge: {result.nonconverged}"
     )
     return "\n".join(lines)
 
@@ -66,14 +68,14 @@ def plain(value):
     return value
 
 
-def write_json(content, path) -> None:
+def write_json(content: dict, path: pathlib.Path | str) -> None:
     """A dataclass or dict as JSON, to a temporary name, then renamed; numbers that are not finite become
     null."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
 
 
-def read_material(path):
+def read_material(path: pathlib.Path | str) -> Material:
     """The material in a calibration's JSON.
 
     Raises:
@@ -97,7 +99,7 @@ def read_material(path):
         ) from error
 
 
-def write_picture(result: Calibration, path) -> None:
+def write_picture(result: Calibration, path: pathlib.Path | str) -> None:
     """Measured and fitted force over time, and what is left."""
     import matplotlib
 

@@ -5,7 +5,7 @@ import numpy as np
 __all__ = ["covariance", "ljung_box"]
 
 
-def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
+def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Covariance of least-squares parameters, for white residuals and for autocorrelated ones.
 
     Gauss-Newton for white residuals: s^2 (J^T J)^-1. For others the sandwich (J^T J)^-1 S (J^T J)^-1 with S
@@ -29,8 +29,8 @@ def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
     scale = np.sqrt(np.diag(normal))
     if (scale == 0).any() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
         raise ValueError(
-            "the forces do not tell the parameters apart: fit fewer, or use an indentation with more shear "
-            "and sliding"
+            "the forces do not tell the parameters apart: "
+            "fit fewer, or use an indentation with more shear and sliding"
         )
     inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     score = np.einsum("tip,ti->tp", jacobian, residual)
@@ -43,7 +43,7 @@ def covariance(jacobian, residual) -> tuple[np.ndarray, np.ndarray, int]:
     return white, n / (n - p) * inverse @ total @ inverse, lags
 
 
-def ljung_box(residual, lags: int | None = None) -> dict:
+def ljung_box(residual: np.ndarray, lags: int | None = None) -> dict:
     """Ljung and Box's test (Biometrika 65, 1978) that a residual (n, m) is white, each component for itself.
 
     Args:

@@ -1,5 +1,6 @@
 """What `biotac calibrate` and `biotac compare` do with their arguments."""
 
+import argparse
 import pathlib
 
 import tqdm
@@ -29,7 +30,7 @@ def _material(text):
     return material(text) if text in PRESETS or not text.endswith(".json") else read_material(text)
 
 
-def calibrate_verb(args) -> None:
+def calibrate_verb(args: argparse.Namespace) -> None:
     """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be."""
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
@@ -65,7 +66,7 @@ def calibrate_verb(args) -> None:
     print(f"wrote {out / 'calibration.json'} and {out / 'calibration.png'}")
 
 
-def compare_verb(args) -> None:
+def compare_verb(args: argparse.Namespace) -> None:
     """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be.
 
     Called again with the same settings and folder it goes on where it was stopped.
@@ -115,8 +116,8 @@ def compare_verb(args) -> None:
             else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
         )
         reference = (
-            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, skin "
-            f"{args.reference_skin})"
+            f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, "
+            f"skin {args.reference_skin})"
         )
     results = []
     for body in chosen:
@@ -127,8 +128,8 @@ def compare_verb(args) -> None:
     for result in results:
         m = result.material
         print(
-            f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, mu "
-            f"{m.friction:.4f}"
+            f"{result.configuration}: E {m.youngs_modulus:.4g} Pa, nu {m.poissons_ratio:.4f}, "
+            f"mu {m.friction:.4f}"
         )
     print(comparison_table(results, reference))
     print(f"wrote {out / 'compare.json'}")

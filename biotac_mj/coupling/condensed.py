@@ -4,9 +4,11 @@ import functools
 
 import numpy as np
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..skin.condensed import CondensedSkin, Memory
+from .config import Config
 from .fem import FemStepper
-from .stepper import SkinResult
+from .stepper import Geom, SkinResult
 
 __all__ = ["CondensedStepper"]
 
@@ -22,7 +24,7 @@ class CondensedStepper(FemStepper):
     contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then
     sample, geom and anchor)."""
 
-    def __init__(self, config, geometry, geoms):
+    def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
         g = len(geoms)
         sizes = {
@@ -49,15 +51,23 @@ class CondensedStepper(FemStepper):
     def _search(self):
         return self._skin.search
 
-    def reset(self, state):
+    def reset(self, state: np.ndarray) -> None:
         state[:] = 0
         self._write(state, Memory.rest(len(self._geoms)))
 
-    def vert_xpos(self, state):
+    def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
         return (self._skin.rest + self._skin.displacement(self._read(state)))[:n]
 
-    def solve(self, state, geom_pos, geom_mat, dt, core_pos=None, core_mat=None) -> SkinResult:
+    def solve_skin(
+        self,
+        state: np.ndarray,
+        geom_pos: np.ndarray,
+        geom_mat: np.ndarray,
+        dt: float,
+        core_pos: np.ndarray | None = None,
+        core_mat: np.ndarray | None = None,
+    ) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
@@ -78,14 +88,14 @@ class CondensedStepper(FemStepper):
             measured=out.measured,
         )
 
-    def resting(self, state):
+    def resting(self, state: np.ndarray) -> bool:
         return not self._part(state, "forces")[0]
 
-    def stay(self, state, geom_pos, geom_mat):
-        super().stay(state, geom_pos, geom_mat)
+    def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
+        super().stay_at_rest(state, geom_pos, geom_mat)
         self._part(state, "head")[:] = _AT_REST
 
-    def key(self, state) -> bytes:
+    def key(self, state: np.ndarray) -> bytes:
         """All that a solve depends on: a state is mostly unused."""
         forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
         head = state[: self._slices["forces"].start]

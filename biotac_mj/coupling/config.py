@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 
-__all__ = ["COUPLINGS", "TIERS", "Config"]
+__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
 
+PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 
@@ -55,8 +57,8 @@ class Config:
             raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
-                f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: leave one "
-                "of them out"
+                f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
+                "leave one of them out"
             )
         if not self.friction >= 0:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
@@ -68,7 +70,7 @@ class Config:
         return {f.name: json.dumps(getattr(self, f.name)) for f in dataclasses.fields(self)}
 
     @classmethod
-    def parse(cls, read) -> "Config":
+    def parse(cls, read: Callable[[str], str]) -> "Config":
         """Settings from read(attribute) -> text, "" where the model gives none.
 
         Raises:
@@ -82,7 +84,7 @@ class Config:
                     values[field.name] = json.loads(text)
                 except json.JSONDecodeError as error:
                     raise ValueError(
-                        f"plugin setting {field.name}={text!r} is not JSON ({error}): strings need quotes, "
-                        "as in '\"default\"'"
+                        f"plugin setting {field.name}={text!r} is not JSON ({error}): "
+                        "strings need quotes, as in '\"default\"'"
                     ) from error
         return cls(**values)

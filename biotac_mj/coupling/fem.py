@@ -7,12 +7,14 @@ import functools
 import numpy as np
 import warp as wp
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
 from ..skin.condensed_search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.stress_memory import StressMemory
 from ..skin.types import vec3
-from .stepper import SkinResult
+from .config import Config
+from .stepper import Geom, SkinResult
 
 __all__ = ["FemStepper", "rest_geometry"]
 
@@ -20,12 +22,9 @@ _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 _CLEAR = 1e-3
-_RESTS = (
-    1e-8,
-    1.0,
-    # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
-    # error
-)
+# a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
+# error
+_RESTS = 1e-8, 1.0
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
@@ -37,7 +36,7 @@ class FemStepper:
     geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
     liquid's pressure and, with implicit dynamics, nodal velocities."""
 
-    def __init__(self, config, geometry, geoms):
+    def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
         self._material, self._options = _choices(config)
         solved, element = solved_geometry(geometry, self._material, self._options)
@@ -96,7 +95,7 @@ class FemStepper:
     def _part(self, state, name):
         return state[self._slices[name]]
 
-    def reset(self, state):
+    def reset(self, state: np.ndarray) -> None:
         state[:] = 0
         vert, pressure = self._nodes, 0.0
         if _filled(self._options):
@@ -105,10 +104,18 @@ class FemStepper:
         self._part(state, "pressure")[:] = pressure
         self._part(state, "resting")[:] = not (self.inertial or self._material.remembers)
 
-    def vert_xpos(self, state):
+    def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
-    def solve(self, state, geom_pos, geom_mat, dt, core_pos=_STILL[0], core_mat=_STILL[1]) -> SkinResult:
+    def solve_skin(
+        self,
+        state: np.ndarray,
+        geom_pos: np.ndarray,
+        geom_mat: np.ndarray,
+        dt: float,
+        core_pos: np.ndarray = _STILL[0],
+        core_mat: np.ndarray = _STILL[1],
+    ) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
@@ -157,11 +164,11 @@ class FemStepper:
         x = wp.array(rest[:, None], dtype=vec3, device="cpu")
         return NearSearch(self._model, self._geom_set, rest, x, x.numpy())
 
-    def resting(self, state) -> bool:
+    def resting(self, state: np.ndarray) -> bool:
         """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
         return bool(self._part(state, "resting")[0])
 
-    def clear(self, state, geom_pos, geom_mat) -> bool:
+    def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
         """Whether the skin rests and the geoms at (ngeom, 3), (ngeom, 3, 3) are further from it than they
         come in a step [BioTac frame]."""
         return (
@@ -170,7 +177,7 @@ class FemStepper:
             and self._search.clear(geom_pos, geom_mat, _CLEAR)
         )
 
-    def stay(self, state, geom_pos, geom_mat):
+    def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
         last, new = self._part(state, "geom_pos"), np.ravel(geom_pos)
         started = self._part(state, "started")
@@ -202,11 +209,11 @@ class FemStepper:
         self.reset(new)
         for name in ("started", "geom_pos", "geom_mat"):
             self._part(new, name)[:] = self._part(state, name)
-        self.stay(new, geom_pos, geom_mat)
+        self.stay_at_rest(new, geom_pos, geom_mat)
         n = 1 + max((g.group for g in self._geoms), default=-1)
         return SkinResult(new, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.vert_xpos(new))
 
-    def key(self, state) -> bytes:
+    def key(self, state: np.ndarray) -> bytes:
         """All that a solve depends on: a state is mostly unused."""
         start, end = self._slices["contacts"].start, self._slices["contacts"].stop
         used = start + 1 + 5 * int(state[start])
@@ -254,7 +261,7 @@ class FemStepper:
             self._part(state, "memory")[:] = d.memory.state()
 
 
-def rest_geometry(config, geometry):
+def rest_geometry(config: Config, geometry: SkinGeometry) -> SkinGeometry:
     """The geometry with the nodes where the skin rests on its filling: what the sensor sees when nothing
     touches."""
     choice, options = _choices(config)

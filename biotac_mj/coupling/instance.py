@@ -12,10 +12,11 @@ import threading
 import mujoco
 import numpy as np
 
-from . import skins
+from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
 from .stepper import SkinResult, make_readings, make_stepper
+from .structs import DataView, ModelView
 from .touching import Touching
 
 __all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
@@ -32,7 +33,7 @@ class _Skin:
     scratch memory."""
 
     def __init__(self, config, geoms):
-        self.geometry = skins.load(config.skin)
+        self.geometry = load_skin(config.skin)
         self.stepper = make_stepper(config, self.geometry, geoms)
         self.readings = make_readings(config, self.geometry)
         self.lock = threading.Lock()
@@ -71,7 +72,7 @@ def _skin(config, touching):
         return _cached_skin(_SkinKey(config, touching))
 
 
-def forget_skins():
+def forget_skins() -> None:
     """Makes the next model build its skins anew; those of living models stay."""
     with _cache_lock:
         _cached_skin.cache_clear()
@@ -85,13 +86,13 @@ class Setup:
       ValueError: no body refers to the instance, or its settings do not fit the model.
     """
 
-    def __init__(self, model, index, compiling=False):
+    def __init__(self, model: ModelView, index: int, compiling: bool = False):
         self.model, self.index = model, index
         cores = np.flatnonzero(model.body_plugin == index)
         if len(cores) != 1:
             raise ValueError(
-                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: make it with "
-                "biotac_mj.attach"
+                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: "
+                "make it with biotac_mj.attach"
             )
         self.core = int(cores[0])
         self.config = Config.parse(lambda attribute: model.config(index, attribute))
@@ -100,10 +101,10 @@ class Setup:
         self.ngroup = len(self.touching.body)
 
     @property
-    def nstate(self):
+    def nstate(self) -> int:
         return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
-    def parts(self, state):
+    def parts(self, state: np.ndarray) -> tuple:
         """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin
         state, as views."""
         a = _HEAD + _MODEL * self.ngroup
@@ -111,7 +112,7 @@ class Setup:
         c = b + self.skin.readings.nstate
         return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:c]
 
-    def reset(self, state):
+    def reset(self, state: np.ndarray) -> None:
         head, models, skin, readings = self.parts(state)
         head[:], models[:] = 0.0, 0.0
         models[:, [45, 49, 53]] = 1.0  # a rotation, though nothing touches
@@ -120,7 +121,7 @@ class Setup:
             self.skin.stepper.reset(skin)
             self.skin.readings.reset(readings)
 
-    def named(self, kind):
+    def named(self, kind: str) -> dict:
         """{name inside the BioTac: id} of the model's objects of a kind, whatever prefixes and suffixes later
         attachments added."""
         before, _, after = self.model.name("body", self.core).rpartition("core")
@@ -135,13 +136,13 @@ class Setup:
         }
 
 
-def state_size(model, index):
+def state_size(model: ModelView, index: int) -> int:
     """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
     model."""
     return Setup(model, index, compiling=True).nstate
 
 
-def reset_state(model, address, index):
+def reset_state(model: ModelView, address: int, index: int) -> None:
     """Writes the rest state at an address, as mj_resetData asks."""
     setup = Setup(model, index)
     buffer = (ctypes.c_double * setup.nstate).from_address(address)
@@ -151,7 +152,7 @@ def reset_state(model, address, index):
 class Instance:
     """The BioTac `index` of a model in one mjData."""
 
-    def __init__(self, model, data, index):
+    def __init__(self, model: ModelView, data: DataView, index: int):
         self.setup = setup = Setup(model, index)
         self.model, self.data, self.index, self.touching = model, data, index, setup.touching
         sensors = setup.named("sensor")
@@ -172,8 +173,8 @@ class Instance:
         start, size = int(model.plugin_stateadr[index]), int(model.plugin_statenum[index])
         if size < setup.nstate:
             raise ValueError(
-                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: compile "
-                "it again from its XML or MjSpec"
+                f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: "
+                "compile it again from its XML or MjSpec"
             )
         self._state = slice(start, start + size)
         self._result = self._reading = self._pose = self._geom_pose = None
@@ -182,12 +183,12 @@ class Instance:
         self._shown = None
 
     @property
-    def state(self):
+    def state(self) -> np.ndarray:
         """(nstate,) view of the plugin state."""
         return self.data.plugin_state[self._state]
 
     @property
-    def horizon(self):
+    def horizon(self) -> float:
         """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set
         their own poses: explicit."""
         return (
@@ -196,16 +197,16 @@ class Instance:
             else self.model.opt.timestep
         )
 
-    def begin(self):
+    def forget_last_solve(self) -> None:
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
         self._error, self._result, self._reading = False, None, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
-                "the integrator discrete overwrites the skin's stiffness: choose implicitfast, implicit or "
-                "Euler, or coupling='one-way'"
+                "the integrator discrete overwrites the skin's stiffness: "
+                "choose implicitfast, implicit or Euler, or coupling='one-way'"
             )
 
-    def last_model(self):
+    def last_model(self) -> tuple:
         """Linear model of the last step: wrench (ngroup, 6), tangent (ngroup, 6, 6), pose (ngroup, 3),
         (ngroup, 3, 3)."""
         models = self.setup.parts(self.state)[1]
@@ -217,29 +218,29 @@ class Instance:
         )
 
     @property
-    def inertial(self):
+    def inertial(self) -> bool:
         """Whether the skin's inertia counts, so that it must know how the BioTac moves."""
         return getattr(self.setup.skin.stepper, "inertial", False)
 
-    def clear(self, pos, mat):
+    def is_out_of_reach(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether the skin is at rest and so clear of bodies at (ngroup, 3), (ngroup, 3, 3) that they do not
         reach it within the step."""
         stepper, skin = self.setup.skin.stepper, self.setup.parts(self.state)[2]
-        if not hasattr(stepper, "clear") or not stepper.resting(skin):
+        if not hasattr(stepper, "is_out_of_reach") or not stepper.resting(skin):
             return False
         self._geom_pose = self.touching.geom_pose(pos, mat)
         with self.setup.skin.lock:
-            return stepper.clear(skin, *self._geom_pose)
+            return stepper.is_out_of_reach(skin, *self._geom_pose)
 
-    def rest(self, pos, mat):
-        """Instead of `solve`, after `clear` has found the skin so of bodies at these poses: costs next to
-        nothing."""
+    def stay_at_rest(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Instead of `solve_for_pose`, of a skin that is out of reach of bodies at these poses: costs next
+        to nothing."""
         skin = self.setup.skin
         with skin.lock:
             self._result = skin.untouched
         self._pose, self._reading = (pos, mat), None
 
-    def solve(self, pos, mat, core=()):
+    def solve_for_pose(self, pos: np.ndarray, mat: np.ndarray, core: tuple = ()) -> SkinResult:
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
         the result for the readings.
 
@@ -256,7 +257,7 @@ class Instance:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
-                result = skin.stepper.solve(before, *geom_pose, dt, *core)
+                result = skin.stepper.solve_skin(before, *geom_pose, dt, *core)
             if not result.converged:  # go on with what was last known to be good
                 wrench, _, pos, mat = self.last_model()
                 tangent = np.zeros((self.setup.ngroup, 6, 6))
@@ -287,11 +288,12 @@ class Instance:
             self._reading = state, counts
         return self._reading
 
-    def sense(self):
+    def sense(self) -> None:
         """Writes the readings into sensordata."""
         out, result = self.data.sensordata, self._result
         if self._error or result is None:
-            return self._flag()
+            self._flag()
+            return
         for name, counts in self._counts()[1].items():
             if name in self.sensor:
                 out[self.sensor[name]] = counts
@@ -308,7 +310,7 @@ class Instance:
                 tier,
             )
 
-    def failed(self):
+    def failed(self) -> None:
         """After an exception: the step's skin is unknown; the status sensor says -1."""
         self._error, self._result, self._reading = True, None, None
         self._flag()
@@ -317,7 +319,7 @@ class Instance:
         if "status" in self.sensor:
             self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan, self._tier)
 
-    def advance(self):
+    def commit_step(self) -> None:
         """Commits the solved step."""
         result = self._result
         if self._error or result is None:
@@ -329,13 +331,13 @@ class Instance:
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:] = self._pose[0], self._pose[1].reshape(n, 9)
         if result.state is None:
-            self.setup.skin.stepper.stay(skin, *self._geom_pose)
+            self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:
             skin[:] = result.state
         readings_state[:] = readings
         self._solved.clear()
 
-    def visualize(self):
+    def visualize(self) -> None:
         """Shows the deformed outer surface and colours the electrodes; MuJoCo calls it while it updates a
         scene."""
         from .show import Shown

@@ -11,7 +11,7 @@ import ctypes
 import mujoco
 import numpy as np
 
-from ..plugin.structs import LIBRARY
+from .structs import LIBRARY, DataView, ModelView
 
 __all__ = ["Integrator", "FixedPoint"]
 
@@ -35,7 +35,7 @@ class Integrator:
       the damping of actuators.
     """
 
-    def __init__(self, model, bodies):
+    def __init__(self, model: ModelView, bodies: set | list):
         self.model = model
         trees = np.unique([t for t in model.body_treeid[list(bodies)] if t >= 0])
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees))
@@ -51,7 +51,7 @@ class Integrator:
         entry = np.flatnonzero(row >= 0)
         return entry, row[entry], place[column[entry]]
 
-    def begin(self, data):
+    def take_matrices(self, data: DataView) -> bool:
         """Takes M and D at this step's state, after MuJoCo's actuation stage; returns whether a' differs from
         a."""
         size, h = len(self.dofs), self.model.opt.timestep
@@ -79,13 +79,13 @@ class Integrator:
         self._inertia, self._step = inertia, np.linalg.solve(inertia - h * derivative, inertia)
         return True
 
-    def advance(self, acceleration):
+    def integrated(self, acceleration: np.ndarray) -> np.ndarray:
         """(nv,) a' of a (nv,)."""
         out = acceleration.copy()
         out[self.dofs] = self._step @ acceleration[self.dofs]
         return out
 
-    def slope(self, jacobian, stiffness):
+    def slope(self, jacobian: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
         """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, where
         only the rows hold them.
 
@@ -107,7 +107,7 @@ class FixedPoint:
     def __init__(self):
         self._x, self._residual = [], []
 
-    def next(self, x, residual):
+    def next(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """The x (n,) to try after x (n,) left the residual g(x) - x (n,)."""
         self._x, self._residual = [*self._x[-_MEMORY:], x], [*self._residual[-_MEMORY:], residual]
         moved, changed = np.diff(self._x, axis=0).T, np.diff(self._residual, axis=0).T

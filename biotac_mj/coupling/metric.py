@@ -14,6 +14,9 @@ touch gets one."""
 import mujoco
 import numpy as np
 
+from .structs import DataView, ModelView
+from .touching import Touching
+
 __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
@@ -33,7 +36,7 @@ class Metric:
       ValueError: the model has fewer slots than bodies that can touch.
     """
 
-    def __init__(self, model, touching, slots):
+    def __init__(self, model: ModelView, touching: Touching, slots: list):
         self.model, self.core = model, touching.core
         self.body = touching.body
         tree = model.body_treeid
@@ -43,8 +46,8 @@ class Metric:
             raise ValueError(
                 f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has "
                 f"room for {len(slots)}: "
-                "attach it after adding the objects, pass attach(slots=...), or name the geoms that may "
-                "touch with attach(geoms=[...])"
+                "attach it after adding the objects, pass attach(slots=...), "
+                "or name the geoms that may touch with attach(geoms=[...])"
             )
         self.root = roots
         self._layout = None
@@ -53,7 +56,7 @@ class Metric:
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
             model.eq_active0[slot] = 1
 
-    def jacobians(self, data):
+    def jacobians(self, data: DataView) -> np.ndarray:
         """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in
         that frame."""
         frame = data.xmat[self.core].reshape(3, 3)
@@ -67,7 +70,7 @@ class Metric:
             else np.zeros((0, 6, self.model.nv))
         )
 
-    def begin(self, data):
+    def find_rows(self, data: DataView) -> None:
         """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them."""
         model = self.model
         self._rows = {}
@@ -106,7 +109,7 @@ class Metric:
         self._all = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) == np.ptp(rows) + 1 else rows
         return places
 
-    def release(self):
+    def release(self) -> None:
         """Leaves the rows without any stiffness."""
         for root, filled in self._filled.items() if self.slot else ():
             if filled:
@@ -114,7 +117,7 @@ class Metric:
         if self.slot:
             self._filled = dict.fromkeys(self._rows, False)
 
-    def write(self, jacobian, tangent, horizon):
+    def write(self, jacobian: np.ndarray, tangent: np.ndarray, horizon: float) -> None:
         """Puts the stiffness of tangents (ngroup, 6, 6) over `horizon` [s] into the rows."""
         if not self.slot:
             return

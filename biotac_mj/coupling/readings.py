@@ -2,9 +2,13 @@
 
 import functools
 
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction
 from ..sensor.readings import PhysicsReadings
+from .config import Config
 from .fem import rest_geometry
 
 __all__ = ["SensorReadings"]
@@ -18,7 +22,7 @@ class SensorReadings:
     The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """
 
-    def __init__(self, config, geometry):
+    def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
         self._options = dict(config.options.get("readings", {}))
         self.nstate = Acquisition.nstate
@@ -32,17 +36,17 @@ class SensorReadings:
         return PhysicsReadings(geometry, seed=self._seed, film=film, **self._options)
 
     @functools.cached_property
-    def rest(self):
-        import numpy as np
-
+    def rest(self) -> dict:
         state = np.zeros(self.nstate)
         self._physics.reset(state)
         return self._physics.readings(state)
 
-    def reset(self, state):
+    def reset(self, state: np.ndarray) -> None:
         self._physics.reset(state)
 
-    def advance(self, state, time, dt, vert_xpos, pressure):
+    def advance(
+        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+    ) -> dict:
         self._physics.advance(state, time, dt, vert_xpos, pressure)
         return self._physics.readings(state)
 

@@ -3,6 +3,8 @@ batches alike."""
 
 import dataclasses
 
+from ..geometry.skin_geometry import SkinGeometry
+
 __all__ = ["SIGNALS", "SensorBioTac"]
 
 SIGNALS = ("physics", "latent_projection")
@@ -36,8 +38,8 @@ class SensorBioTac:
             raise ValueError(f"unknown signal {self.signal!r}: choose one of {', '.join(SIGNALS)}")
         if self.signal == "physics" and self.weights is not None:
             raise ValueError(
-                f"weights {self.weights!r} are given but the signal is 'physics': take "
-                "signal='latent_projection'"
+                f"weights {self.weights!r} are given but the signal is 'physics': "
+                "take signal='latent_projection'"
             )
 
     def options(self) -> dict:
@@ -45,17 +47,17 @@ class SensorBioTac:
         out = {"sensor": self.sensor, "noise": self.noise, "film_every_step": self.film_every_step}
         return out if self.weights is None else out | {"weights": str(self.weights)}
 
-    def settings(self, options=None) -> dict:
+    def settings(self, options: dict | None = None) -> dict:
         """Arguments for `biotac_mj.attach` and `tasks.BioTac`: readings and options; `options` are further
         ones to keep."""
         name = "biotac" if self.signal == "physics" else self.signal
         return {"readings": name, "options": {**(options or {}), "readings": self.options()}}
 
-    def batch(self):
+    def batch(self) -> dict:
         """Argument `readings` of `biotac_mj.batch`."""
         return self.options() | ({} if self.signal == "physics" else {"signal": self.signal})
 
-    def readings(self, geometry, seed=0):
+    def readings(self, geometry: SkinGeometry, seed: int = 0) -> object:
         """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
         if self.signal == "physics":
             from ..sensor.readings import PhysicsReadings

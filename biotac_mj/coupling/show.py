@@ -9,7 +9,7 @@ _FULL_SCALE = 300.0  # change of an electrode at full colour [counts]
 _NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]), np.array([0.1, 0.3, 0.85])
 
 
-def electrode_colors(change):
+def electrode_colors(change: np.ndarray) -> np.ndarray:
     """(n, 4) RGBA of (n,) changes in counts: red where the film gets thinner (counts fall), blue where it
     bulges, grey at rest."""
     amount = np.clip(np.abs(change) / _FULL_SCALE, 0.0, 1.0)[:, None]
@@ -20,7 +20,7 @@ def electrode_colors(change):
 class Shown:
     """The visible parts of one `Instance`."""
 
-    def __init__(self, instance):
+    def __init__(self, instance: object):
         self.instance = instance
         setup, model = instance.setup, instance.model
         self.node = np.unique(setup.skin.geometry.outer_face)
@@ -32,7 +32,7 @@ class Shown:
         self.site = np.array([sites[f"e{i}"] for i in range(1, 20) if f"e{i}" in sites], dtype=np.int64)
         self.rest = setup.skin.readings.rest.get("electrodes")
 
-    def update(self):
+    def update(self) -> None:
         instance = self.instance
         skin, state = instance.setup.skin, instance.setup.parts(instance.state)[2]
         if self.vert is not None:

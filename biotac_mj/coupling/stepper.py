@@ -3,9 +3,13 @@ deformed skin and give counts."""
 
 import dataclasses
 import importlib
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from .config import Config
 
 __all__ = [
     "Geom",
@@ -50,7 +54,7 @@ class SkinResult:
 
     Attributes:
       state: (nstate,) the new state, committed by the caller; None: the skin rests as before (see
-        `SkinStepper.stay`).
+        `SkinStepper.stay_at_rest`).
       wrench: (ngroup, 6) of the skin ON each touching body, force then torque about the BioTac frame's origin
         [N, N m].
       tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric
@@ -75,14 +79,16 @@ class SkinResult:
 class SkinStepper(Protocol):
     """A skin. Making one must be cheap: MuJoCo asks for `nstate` while it compiles, when contact exclusions
     are not yet known, perhaps with more geoms than there will be (so more geoms may not need less state).
-    Heavy work belongs into the first `reset` or `solve`."""
+    Heavy work belongs into the first `reset` or `solve_skin`."""
 
     nstate: int
 
     def reset(self, state: np.ndarray) -> None:
         """Writes the rest state into state (nstate,)."""
 
-    def solve(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float) -> SkinResult:
+    def solve_skin(
+        self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray, dt: float
+    ) -> SkinResult:
         """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its
         arguments alone, which keeps `state` as it is. A stepper with a true attribute `inertial` gets
         core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
@@ -96,11 +102,11 @@ class SkinStepper(Protocol):
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""
 
-    def clear(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
+    def is_out_of_reach(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
         """Whether the skin rests and no geom at these poses reaches it by a step's acceleration."""
 
-    def stay(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
-        """Makes `state`, of a skin that is `clear`, what `solve` would return."""
+    def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
+        """Makes `state`, of a skin that is out of reach, what `solve_skin` would return."""
 
 
 class Readings(Protocol):
@@ -144,13 +150,13 @@ _readings = {
 }
 
 
-def register_stepper(name, factory):
+def register_stepper(name: str, factory: Callable) -> None:
     """Makes factory(config, geometry, geoms) -> SkinStepper known under a name that `attach(stepper=...)`
     takes."""
     _steppers[name] = factory
 
 
-def register_readings(name, factory):
+def register_readings(name: str, factory: Callable) -> None:
     """Makes factory(config, geometry) -> Readings known under a name that `attach(readings=...)` takes."""
     _readings[name] = factory
 
@@ -162,7 +168,7 @@ def _factory(table, name):
     return table[name]
 
 
-def check_names(config):
+def check_names(config: Config) -> None:
     """Raises ValueError if the settings name a stepper or readings that nobody registered."""
     for table, name, what in (
         (_steppers, config.stepper, "stepper"),
@@ -170,12 +176,12 @@ def check_names(config):
     ):
         if name not in table:
             raise ValueError(
-                f"unknown {what} {name!r}: choose one of {', '.join(sorted(table))}, or register one in "
-                "biotac_mj.coupling.stepper"
+                f"unknown {what} {name!r}: "
+                f"choose one of {', '.join(sorted(table))}, or register one in biotac_mj.coupling.stepper"
             )
 
 
-def make_stepper(config, geometry, geoms) -> SkinStepper:
+def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> SkinStepper:
     """The skin that `config.stepper` names, of the tier that `config.tier` names.
 
     Raises:
@@ -187,7 +193,7 @@ def make_stepper(config, geometry, geoms) -> SkinStepper:
     return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 
-def make_readings(config, geometry) -> Readings:
+def make_readings(config: Config, geometry: SkinGeometry) -> Readings:
     """The readings that `config.readings` names.
 
     Raises:

@@ -5,7 +5,9 @@ import math
 import mujoco
 import numpy as np
 
+from .config import Config
 from .stepper import Geom
+from .structs import DataView, ModelView
 
 __all__ = ["Touching", "displace", "displacement", "rotation"]
 
@@ -33,7 +35,7 @@ class Touching:
         skin cannot touch.
     """
 
-    def __init__(self, model, core, config, compiling=False):
+    def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
         self.core = core
         ids = _select(model, core, config.geoms)
         if (
@@ -63,7 +65,7 @@ class Touching:
                 parts.append(g.vert.tobytes() + g.face.tobytes())
         return b"|".join(parts)
 
-    def predict(self, data, horizon):
+    def predict(self, data: DataView, horizon: float) -> tuple:
         """Poses of the touching bodies in the BioTac frame when everything goes on at its present velocity
         for `horizon` [s].
 
@@ -79,7 +81,7 @@ class Touching:
         self._check(pos, mat)
         return pos, mat
 
-    def core_motion(self, data, horizon):
+    def core_motion(self, data: DataView, horizon: float) -> tuple:
         """Poses (2, 3), (2, 3, 3) of the BioTac in the world, now and after `horizon` [s] at its present
         velocity."""
         now, then = (self._ahead(data, self._body[:1], self._root[:1], h) for h in (0.0, horizon))
@@ -95,7 +97,7 @@ class Touching:
             mat = rotation(horizon * spin) @ mat
         return pos, mat
 
-    def geom_pose(self, pos, mat):
+    def geom_pose(self, pos: np.ndarray, mat: np.ndarray) -> tuple:
         """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms on bodies at (ngroup, 3), (ngroup, 3, 3).
 
         Raises:
@@ -129,7 +131,7 @@ def _cross(a, b):
     return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
 
 
-def rotation(vector):
+def rotation(vector: np.ndarray) -> np.ndarray:
     """(n, 3, 3) rotation matrices of (n, 3) rotation vectors (Rodrigues)."""
     angle2 = (vector * vector).sum(axis=1)[:, None, None]
     k = (vector @ _SKEW).reshape(-1, 3, 3)
@@ -151,7 +153,7 @@ def _matrix(quat):
     return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
-def displacement(pos, mat, pos0, mat0):
+def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray) -> np.ndarray:
     """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0
     (n, 3, 3) to pos, mat."""
     turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
@@ -163,7 +165,7 @@ def displacement(pos, mat, pos0, mat0):
     return np.concatenate([pos - pos0 - _cross(vector, pos0), vector], axis=1)
 
 
-def displace(pos, mat, motion):
+def displace(pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> tuple:
     """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
     turn = rotation(motion[:, 3:])
     return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
@@ -177,8 +179,8 @@ def _select(model, core, names):
         for i in ids:
             if weld[model.geom_bodyid[i]] == own and own:
                 raise ValueError(
-                    f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: leave it "
-                    "out of geoms"
+                    f"geom {model.name('geom', i)!r} is fixed to the BioTac and cannot touch it: "
+                    "leave it out of geoms"
                 )
         return np.array(sorted(ids), dtype=np.int64)
     parent = model.body_weldid[

@@ -12,6 +12,7 @@ import numpy as np
 
 from .instance import Instance
 from .integrator import FixedPoint, Integrator
+from .structs import DataView, ModelView
 from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
@@ -30,7 +31,7 @@ _SCALE = np.array([1.0, 1.0, 1.0, *[1 / _LEVER] * 3])  # compares torques with f
 class World:
     """The instances of the plugin in one mjData."""
 
-    def __init__(self, model, data, indices):
+    def __init__(self, model: ModelView, data: DataView, indices: list[int]):
         self.model, self.data = model, data
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
@@ -42,20 +43,20 @@ class World:
             model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
         )
 
-    def passive(self, index):
+    def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
         instance = self.instances[index]
         if not instance.two_way:
-            instance.begin()
+            instance.forget_last_solve()
             core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
-            instance.solve(*instance.touching.predict(self.data, instance.horizon), core)
+            instance.solve_for_pose(*instance.touching.predict(self.data, instance.horizon), core)
         elif index == self.first:
             for other in self.coupled:
-                other.begin()
+                other.forget_last_solve()
             self._step()
 
-    def failed(self, index):
+    def failed(self, index: int) -> None:
         """After an exception: no skin that was being solved is known, and none acts."""
         instance = self.instances[index]
         for other in self.coupled if instance.two_way else [instance]:
@@ -77,7 +78,7 @@ class World:
         self._damped = None
         for skin in skins:
             if skin.idle:
-                skin.rest()
+                skin.leave_at_rest()
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
@@ -102,11 +103,11 @@ class World:
         self._forces(skins, outside)
         found = self.data.acceleration()
         if self._damped is None:  # known only after the actuation stage
-            self._damped = self.integrator.begin(self.data)
+            self._damped = self.integrator.take_matrices(self.data)
         if not self._damped:
             return found
         if not any(s.tangent.any() for s in skins):
-            return self.integrator.advance(found)
+            return self.integrator.integrated(found)
         jacobian, tangent, wrench0, correction = (
             np.concatenate([getattr(s, name) for s in skins])
             for name in ("jacobian", "tangent", "wrench0", "correction")
@@ -114,7 +115,7 @@ class World:
         stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
-            moved = self.integrator.advance(found)
+            moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
             wrong = excess - correction
             poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
@@ -145,10 +146,10 @@ class _Coupled:
 
     def __init__(self, instance, data):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
-        instance.metric.begin(data)
+        instance.metric.find_rows(data)
         self.pose = instance.touching.predict(data, self.horizon)
         # the skin rests, and what comes is too far for this step's accelerations to matter
-        self.idle = instance.clear(*self.pose)
+        self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
         if self.idle:
             return
@@ -161,9 +162,9 @@ class _Coupled:
         self.solved = self.written = False
         self.converged = True
 
-    def rest(self):
+    def leave_at_rest(self):
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
-        self.instance.rest(*self.pose)
+        self.instance.stay_at_rest(*self.pose)
         self.let_go()
 
     def follow(self, acceleration):
@@ -172,7 +173,7 @@ class _Coupled:
         pose = displace(*self.pose, motion)
         if self.solved and (not self.converged or self._distance(pose) < TOLERANCE):
             return False
-        result = self.instance.solve(*pose, self._core_motion(acceleration))
+        result = self.instance.solve_for_pose(*pose, self._core_motion(acceleration))
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
         self.solved, self.converged, self.written = True, result.converged, False
         if not self.tangent.any():

@@ -46,18 +46,18 @@ class Placed:
       geoms: GeomSet with that one geom.
     """
 
-    def __init__(self, name: str, nworld: int, device="cpu", friction: float = 0.0):
+    def __init__(self, name: str, nworld: int, device: str = "cpu", friction: float = 0.0):
         shape, grid = make_object(name), grid_of(name)
         self.geoms = GeomSet([shape.type], [shape.size], friction=[friction], rounding=[shape.rounding],
                              grids=[] if grid is None else [grid], nworld=nworld, device=device)  # fmt: skip
         self._pos = np.zeros(3) if grid is not None else np.asarray(shape.pos)
         self._mat = np.eye(3) if grid is not None else rotation_matrices(shape.quat)
 
-    def place(self, pos, mat):
+    def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
         self.geoms.set_pose(*self.pose(pos, mat))
 
-    def pose(self, pos, mat):
+    def pose(self, pos: np.ndarray, mat: np.ndarray) -> object:
         """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's
         frame."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
@@ -76,13 +76,20 @@ class Placed:
         return out.numpy()
 
 
-def surface_samples(vert, face, device, order: int = 3) -> wp.array:
+def surface_samples(vert: np.ndarray, face: np.ndarray, device: str, order: int = 3) -> wp.array:
     """Vertices of a surface and order^2 points in each face, on a device."""
     inside = np.einsum("sk,fkd->fsd", face_samples(order), np.asarray(vert)[face]).reshape(-1, 3)
     return wp.array(np.concatenate([np.asarray(vert)[np.unique(face)], inside]), dtype=vec3, device=device)
 
 
-def first_touch(placed: Placed, points: wp.array, start, mat, direction, reach: float = 0.12) -> np.ndarray:
+def first_touch(
+    placed: Placed,
+    points: wp.array,
+    start: np.ndarray,
+    mat: np.ndarray,
+    direction: np.ndarray,
+    reach: float = 0.12,
+) -> np.ndarray:
     """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of
     the points.
 
@@ -101,7 +108,7 @@ def first_touch(placed: Placed, points: wp.array, start, mat, direction, reach: 
     return np.where(begun & (travel < reach) & (gap < 1e-5), travel, np.nan)
 
 
-def rotation_matrices(quat) -> np.ndarray:
+def rotation_matrices(quat: np.ndarray) -> np.ndarray:
     """(..., 3, 3) of unit quaternions (..., 4), w x y z."""
     w, x, y, z = np.moveaxis(np.asarray(quat, float), -1, 0)
     return np.stack(

@@ -7,7 +7,7 @@ import numpy as np
 __all__ = ["read_columns"]
 
 
-def read_columns(path, names) -> np.ndarray:
+def read_columns(path: pathlib.Path | str, names: list | tuple | None) -> np.ndarray:
     """(n, len(names)) numbers of a text file, blanks, tabs, commas or semicolons between them; lines that
     begin with # or % are comments.
 

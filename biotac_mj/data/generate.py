@@ -9,9 +9,9 @@ import time
 
 import numpy as np
 
+from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
-from ..press_record import replacing
 from .objects import OBJECTS
 from .plan import KINDS
 from .store import TactileSet, shard_path
@@ -77,8 +77,8 @@ class GenerateOptions:
         kinds = {name.split(":")[0] for name in self.devices}
         if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
             raise ValueError(
-                f"device is {self.device!r}: choose cpu, cuda:0, or several GPUs once each, as in "
-                "cuda:0,cuda:1"
+                f"device is {self.device!r}: "
+                "choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1"
             )
         if not 0 <= self.labelled <= self.count:
             raise ValueError(
@@ -95,13 +95,13 @@ class GenerateOptions:
         unknown = [name for name in self.objects if name not in OBJECTS]
         if unknown or not self.objects:
             raise ValueError(
-                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: choose from "
-                f"{', '.join(OBJECTS)}"
+                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: "
+                f"choose from {', '.join(OBJECTS)}"
             )
         if self.labelled and not set(self.objects) & set(INDENTERS):
             raise ValueError(
-                "labelled interactions are made with the eight indenters: add one of them to the objects, "
-                "or take 0 labelled"
+                "labelled interactions are made with the eight indenters: "
+                "add one of them to the objects, or take 0 labelled"
             )
 
     @property
@@ -170,7 +170,10 @@ def batches(options: GenerateOptions) -> list[Batch]:
 
 
 def generate(
-    out, options: GenerateOptions = GenerateOptions(), workers: int | None = None, progress: bool = True
+    out: pathlib.Path | str,
+    options: GenerateOptions = GenerateOptions(),
+    workers: int | None = None,
+    progress: bool = True,
 ) -> Report:  # noqa: B008 - frozen
     """Makes a set in folder `out`, or what is missing of it.
 
@@ -227,7 +230,7 @@ def _is_there(path, settings):
     different = [f"{k} {found.get(k)!r} there, {v!r} now" for k, v in settings.items() if found.get(k) != v]
     if different:
         raise ValueError(
-            f"{path} was generated with other options ({'; '.join(different)}): use another --out, or "
-            "delete that set"
+            f"{path} was generated with other options ({'; '.join(different)}): "
+            "use another --out, or delete that set"
         )
     return True

@@ -35,7 +35,9 @@ RUPPEL_COLUMNS = (
 )
 
 
-def read_nvidia(path, rate: float = 100.0, objects=None) -> list[Interaction]:
+def read_nvidia(
+    path: pathlib.Path | str, rate: float = 100.0, objects: list | None = None
+) -> list[Interaction]:
     """NVIDIA's biotac{1,2,3}.hdf5 (Sundaralingam et al., ICRA 2019; Narang et al., 2021): one interaction for
     each trajectory.
 
@@ -104,7 +106,7 @@ def read_nvidia(path, rate: float = 100.0, objects=None) -> list[Interaction]:
     return out
 
 
-def read_ruppel(path, object="sphere_4mm") -> list[Interaction]:  # noqa: A002 - the column's name
+def read_ruppel(path: pathlib.Path | str, object: str = "sphere_4mm") -> list[Interaction]:  # noqa: A002 - the column's name
     """Ruppel et al.'s CSV (IAS-15, 2019): time, contact point, force, pac0, pac1, pdc, tac, tdc, e1..e19; a
     sphere of 2 mm radius.
 
@@ -164,7 +166,11 @@ def read_ruppel(path, object="sphere_4mm") -> list[Interaction]:  # noqa: A002 -
 
 
 def read_text(
-    path, force=None, rate: float = 100.0, block: float | None = None, object="plate"
+    path: pathlib.Path | str,
+    force: pathlib.Path | str | None = None,
+    rate: float = 100.0,
+    block: float | None = None,
+    object: str = "plate",
 ) -> list[Interaction]:  # noqa: A002
     """A log of 19 columns e1..e19 without times, and perhaps one of 3 columns Fx Fy Fz [N] beside it
     (`data.columns`).
@@ -186,8 +192,8 @@ def read_text(
     newtons = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
     if newtons is not None and len(newtons) != len(counts):
         raise ValueError(
-            f"{path} has {len(counts)} rows and {force} has {len(newtons)}: they must be samples of the "
-            "same instants"
+            f"{path} has {len(counts)} rows and {force} has {len(newtons)}: "
+            "they must be samples of the same instants"
         )
     n = len(counts)
     size = n if block is None else max(1, int(round(block * rate)))
@@ -212,7 +218,9 @@ def read_text(
 FORMATS = {"nvidia": read_nvidia, "ruppel": read_ruppel, "text": read_text}
 
 
-def import_recordings(paths, out, format: str | None = None, seed: int = 0, **options) -> int:  # noqa: A002
+def import_recordings(
+    paths: list, out: pathlib.Path | str, format: str | None = None, seed: int = 0, **options: object
+) -> int:  # noqa: A002
     """Reads files and writes a set, a shard for each file, split by interaction.
 
     Args:
@@ -303,8 +311,8 @@ def _numbers(path, rows, first, names):
         for name, cell in zip(names, row):
             if not (_is_number(cell) and np.isfinite(float(cell))):
                 raise ValueError(
-                    f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; correct or "
-                    "remove the line"
+                    f"line {first + i} of {path}: {name} is {cell!r}, not a finite number; "
+                    "correct or remove the line"
                 )
     raise ValueError(f"{path} has rows of different length: every row needs {len(names)} columns")
 

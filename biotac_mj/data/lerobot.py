@@ -24,7 +24,9 @@ _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 
 
-def export_lerobot(data, out, counts: str = "counts", progress: bool = True) -> pathlib.Path:
+def export_lerobot(
+    data: pathlib.Path | str, out: pathlib.Path | str, counts: str = "counts", progress: bool = True
+) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
     Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc,
@@ -103,8 +105,8 @@ class _Export:
         step = np.concatenate(steps)
         if not len(step) or np.ptp(step) > 1e-4:
             raise ValueError(
-                "the time steps of the set are not even: LeRobot's layout has one frame rate; resample the "
-                "recordings first"
+                "the time steps of the set are not even: LeRobot's layout has one frame rate; "
+                "resample the recordings first"
             )
         rate = 1 / step.mean()
         return int(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)

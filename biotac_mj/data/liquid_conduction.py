@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.core_surface import CoreSurface
 
 __all__ = ["LiquidConduction", "column_tetrahedra"]
@@ -47,7 +48,13 @@ class LiquidConduction:
       ValueError: an electrode that the liquid does not cover.
     """
 
-    def __init__(self, geometry, excitation, conductivity=0.4, residual_film=4e-5):
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        excitation: np.ndarray,
+        conductivity: float = 0.4,
+        residual_film: float = 4e-5,
+    ):
         self.geometry, self.conductivity, self.residual_film = geometry, conductivity, residual_film
         self._layers = _LAYERS
         core = CoreSurface(geometry.core_vert, geometry.core_face)
@@ -75,15 +82,15 @@ class LiquidConduction:
         missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in range(23) if (disc == e).sum() < 10]
         if missing:
             raise ValueError(
-                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move "
-                "the electrode"
+                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
+                "move the electrode"
             )
         self._pair = self._near(np.arange(len(keep)))
         self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
         self._elem = np.ascontiguousarray(self.elem.T)
         self._set_unknowns(disc)
 
-    def impedance(self, vert_xpos) -> np.ndarray:
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
         """(19,) [ohm] of e1..e19 for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1..X4 sink, the
         others float."""
         from cholespy import CholeskySolverD, MatrixType
@@ -105,7 +112,7 @@ class LiquidConduction:
         solver.solve(current, potential)
         return potential[np.arange(19), np.arange(19)] / self.conductivity
 
-    def matrix(self, nodes):
+    def matrix(self, nodes: np.ndarray) -> object:
         """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
         (scikit-fem, linear tetrahedra)."""
         import skfem
@@ -114,12 +121,12 @@ class LiquidConduction:
         mesh = skfem.MeshTet(np.ascontiguousarray(1e3 * nodes.T), self._elem, validate=False, sort_t=False)
         return 1e-3 * laplace.assemble(skfem.Basis(mesh, skfem.ElementTetP1(), intorder=1))
 
-    def nodes(self, gap):
+    def nodes(self, gap: np.ndarray) -> np.ndarray:
         """(4 n, 3) nodes of the columns [m] for thicknesses gap (n,) [m]."""
         film = np.maximum(gap, self.residual_film)
         return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
 
-    def gap(self, vert_xpos, rest=False) -> np.ndarray:
+    def gap(self, vert_xpos: np.ndarray, rest: bool = False) -> np.ndarray:
         """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets
         no skin takes its nearest node's height, or nan at `rest`."""
         column, face = self._pair
@@ -174,7 +181,7 @@ class LiquidConduction:
         self._size = 19 + len(free) + above
 
 
-def column_tetrahedra(triangle, n, layers):
+def column_tetrahedra(triangle: np.ndarray, n: int, layers: int | tuple) -> np.ndarray:
     """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
     column.
 

@@ -83,8 +83,8 @@ def _make_on_all(out, options, settings, todo, workers, update, tell, seen="cuda
                 ]
                 if gone:
                     raise RuntimeError(
-                        f"the process of {', '.join(gone)} ended: run the command again, what is there is "
-                        "kept"
+                        f"the process of {', '.join(gone)} ended: "
+                        "run the command again, what is there is kept"
                     ) from None
                 continue
             if what == "step":

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from ..geometry.indenters import INDENTERS
-from ..press_indenter import Indenter, make_indenter
+from ..press.indenter import Indenter, make_indenter
 from ..skin.contact.shapes import DistanceGrid, bake_distance_grid
 
 __all__ = ["OBJECTS", "grid_of", "make_object"]
@@ -37,13 +37,11 @@ OBJECTS = (*INDENTERS, *PEGS, *TABLE)
 
 def _box(name, half, turn):
     """A rounded box, turned about its centre and moved so that what is then foremost lies at the origin."""
-    from ..press import _rotation_from_y
+    from ..press.path import rotation_from_y
 
     half, inner = np.array(half), np.array(half) - _EDGE
     quat = (
-        _UPRIGHT
-        if turn is None
-        else _rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
+        _UPRIGHT if turn is None else rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
     )
     rotation = trimesh.transformations.quaternion_matrix(quat)[:3, :3]
     reach = np.abs(rotation[1]) @ inner + _EDGE
@@ -88,8 +86,8 @@ def make_object(name: str) -> Indenter:
         return make_indenter(name)
     if name not in OBJECTS:
         raise ValueError(
-            f"unknown object {name!r}: choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or "
-            "mesh:FILE"
+            f"unknown object {name!r}: "
+            f"choose from {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
         )
     if name in TABLE:
         half = 3 * [_TABLE]

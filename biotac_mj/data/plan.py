@@ -2,12 +2,13 @@
 the core."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..approach import nearest_point
 from ..geometry.skin_geometry import SkinGeometry
+from ..press.approach import nearest_point
 from ..sensor.core_surface import CoreSurface
 from .clearance import Placed, first_touch, rotation_matrices, surface_samples
 
@@ -59,7 +60,13 @@ def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
 
 
 def plan_motions(
-    geometry: SkinGeometry, name: str, seeds, steps: int, kinds=KINDS, device="cpu", progress=None
+    geometry: SkinGeometry,
+    name: str,
+    seeds: list,
+    steps: int,
+    kinds: tuple | list = KINDS,
+    device: str = "cpu",
+    progress: Callable | None = None,
 ) -> list[Motion]:
     """One motion for each seed; the same seed gives the same motion whatever the others are.
 
@@ -137,7 +144,7 @@ class _Planner:
         return out
 
     def _draw(self, rng):
-        from ..press import _rotation_from_y
+        from ..press.path import rotation_from_y
 
         kind = str(rng.choice(self.kinds, p=self.share))
         corner = self.geometry.vert[self.faces[rng.choice(len(self.faces), p=self.area)]]
@@ -148,7 +155,7 @@ class _Planner:
         side = np.cos(round_) * first + np.sin(round_) * second
         direction = -np.cos(tilt) * normal + np.sin(tilt) * side
         spin = rng.uniform(0, 2 * np.pi)
-        mat = _rotation(direction, spin) @ rotation_matrices(_rotation_from_y(direction))
+        mat = _rotation(direction, spin) @ rotation_matrices(rotation_from_y(direction))
         heading = rng.uniform(0, 2 * np.pi)
         slide = np.cos(heading) * first + np.sin(heading) * second
         return dict(

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
@@ -35,7 +36,9 @@ class Readings:
     failed: np.ndarray
 
 
-def sample(time, impedance, pressure, seed: int, temperature=None) -> np.ndarray:
+def sample(
+    time: np.ndarray, impedance: np.ndarray, pressure: np.ndarray, seed: int, temperature: float | None = None
+) -> np.ndarray:
     """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time; of PAC's 22 the
     latest.
 
@@ -59,7 +62,9 @@ def sample(time, impedance, pressure, seed: int, temperature=None) -> np.ndarray
     return np.array(rows, np.float32)
 
 
-def read_motion(film: FilmConduction, vert_xpos, time, pressure, seed: int) -> Readings:
+def read_motion(
+    film: FilmConduction, vert_xpos: np.ndarray, time: np.ndarray, pressure: np.ndarray, seed: int
+) -> Readings:
     """Film and acquisition along one interaction.
 
     Args:
@@ -80,12 +85,12 @@ def read_motion(film: FilmConduction, vert_xpos, time, pressure, seed: int) -> R
 _here = {}  # what a worker keeps: the film of the set's skin
 
 
-def prepare_worker(geometry, sensor):
+def prepare_worker(geometry: SkinGeometry, sensor: str) -> None:
     """Makes the film of a skin in this process."""
     _here["film"] = FilmConduction(geometry, sensor=sensor)
 
 
-def read_in_worker(displacement, time, pressure, seed) -> Readings:
+def read_in_worker(displacement: np.ndarray, time: np.ndarray, pressure: np.ndarray, seed: int) -> Readings:
     """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store."""
     film = _here["film"]
     return read_motion(film, film.geometry.vert + displacement * DISPLACEMENT_SCALE, time, pressure, seed)
@@ -102,8 +107,12 @@ class _Now:
 
 @contextlib.contextmanager
 def readings_pool(
-    geometry: SkinGeometry, sensor: str | None, workers: int, start=prepare_worker, start_args=None
-):
+    geometry: SkinGeometry,
+    sensor: str | None,
+    workers: int,
+    start: Callable = prepare_worker,
+    start_args: tuple | None = None,
+) -> object:
     """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0
     workers: this process.
 

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS
 
 __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
@@ -114,14 +115,14 @@ class Interaction:
                 )
             if not name.startswith("measured") and not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of {where} contains NaN or infinite numbers: drop those steps, or keep the "
-                    "last good ones"
+                    f"{name} of {where} contains NaN or infinite numbers: "
+                    "drop those steps, or keep the last good ones"
                 )
         if n > 1 and not (np.diff(self.time) > 0).all():
             raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")
         return self
 
 
-def nodes_of(geometry) -> np.ndarray:
+def nodes_of(geometry: SkinGeometry) -> np.ndarray:
     """(nouter,) sorted nodes of a skin's outer surface: those that `contact_force` is stored for."""
     return np.unique(geometry.outer_face)

@@ -1,6 +1,7 @@
 """The skin under a batch of motions: every interaction is a world."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -40,12 +41,14 @@ class Fields:
     pressure: np.ndarray
     converged: np.ndarray
 
-    def vert_xpos(self, vert, i) -> np.ndarray:
+    def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
         """(n, nvert, 3) nodes of interaction i as they are stored [m]; vert: the skin at rest."""
         return vert + self.displacement[i] * DISPLACEMENT_SCALE
 
 
-def simulate(model: SkinModel, names, motions, progress=None) -> Fields:
+def simulate(
+    model: SkinModel, names: list | tuple, motions: list, progress: Callable | None = None
+) -> Fields:
     """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
     batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
     the last good state and is marked.
@@ -98,7 +101,9 @@ def _simulate(model, names, motions, progress):
     return fields
 
 
-def simulate_condensed(model: SkinModel, names, motions, progress=None) -> Fields:
+def simulate_condensed(
+    model: SkinModel, names: list | tuple, motions: list, progress: Callable | None = None
+) -> Fields:
     """The same with the condensed skin, one interaction after another on one core; it has no contact forces
     of nodes.
 
@@ -143,7 +148,7 @@ class Scene:
       geoms: GeomSet of the different objects, in the order in which they first appear.
     """
 
-    def __init__(self, names, device="cpu", friction=0.0):
+    def __init__(self, names: list | tuple, device: str = "cpu", friction: float = 0.0):
         kinds = list(dict.fromkeys(names))
         self._which = np.array([kinds.index(name) for name in names])
         self._placed = [Placed(name, 1) for name in kinds]
@@ -158,7 +163,7 @@ class Scene:
             device=device,
         )
 
-    def place(self, pos, mat):
+    def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Puts each world's object at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
         pos, mat = np.asarray(pos, float), np.asarray(mat, float)
         at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._placed), 1))

@@ -23,13 +23,13 @@ class Split:
         for name in ("train", "validation", "test"):
             if not len(getattr(self, name)):
                 raise ValueError(
-                    f"the {name} part of the split is empty: more interactions are needed, or another "
-                    "object or fractions"
+                    f"the {name} part of the split is empty: "
+                    "more interactions are needed, or another object or fractions"
                 )
         return self
 
 
-def assign(count: int, seed: int = 0, fractions=FRACTIONS) -> np.ndarray:
+def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarray:
     """(count,) of "train", "validation", "test" in random order and the given fractions, rounded."""
     fractions = np.asarray(fractions, float)
     if fractions.shape != (3,) or (fractions < 0).any() or abs(fractions.sum() - 1) > 1e-9:
@@ -41,7 +41,7 @@ def assign(count: int, seed: int = 0, fractions=FRACTIONS) -> np.ndarray:
     return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
 
 
-def split_by_interaction(data, seed: int = 0, fractions=FRACTIONS) -> Split:
+def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIONS) -> Split:
     """Random interactions; labelled and unlabelled ones are divided each on their own, so that both appear in
     every part.
 
@@ -59,7 +59,9 @@ def split_by_interaction(data, seed: int = 0, fractions=FRACTIONS) -> Split:
     return Split(*(np.flatnonzero(part == name) for name in ("train", "validation", "test"))).check()
 
 
-def split_by_object(data, unseen="ring_7mm", seed: int = 0, validation: float = 0.2) -> Split:
+def split_by_object(
+    data: object, unseen: str | list | tuple = "ring_7mm", seed: int = 0, validation: float = 0.2
+) -> Split:
     """All interactions of the unseen object (or objects) test; of the others a share chooses and the rest
     train.
 

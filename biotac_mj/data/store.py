@@ -9,8 +9,8 @@ import pathlib
 import h5py
 import numpy as np
 
+from ..files import replacing, versions
 from ..geometry.skin_geometry import SkinGeometry
-from ..press_record import replacing, versions
 from ..sensor.channels import CHANNELS
 from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
 
@@ -66,8 +66,8 @@ def write_shard(
     for one in interactions:
         if [name for name in COLUMNS if getattr(one, name) is not None] != columns:
             raise ValueError(
-                f"interaction {one.id!r} has other columns than {interactions[0].id!r}: write them to "
-                "different sets"
+                f"interaction {one.id!r} has other columns than {interactions[0].id!r}: "
+                "write them to different sets"
             )
     length = np.array([len(one.time) for one in interactions])
     stop = np.cumsum(length)
@@ -205,8 +205,8 @@ class TactileSet:
         files = sorted(self.path.glob("shard-*.h5")) if self.path.is_dir() else [self.path]
         if not files or not files[0].is_file():
             raise FileNotFoundError(
-                f"no shards (shard-*.h5) at {self.path}: make a set with `biotac generate` or `biotac "
-                "import-data`"
+                f"no shards (shard-*.h5) at {self.path}: "
+                "make a set with `biotac generate` or `biotac import-data`"
             )
         self._files = []
         try:
@@ -234,8 +234,8 @@ class TactileSet:
             if missing or not _same_skin(first, file):
                 what = f"columns {', '.join(missing)}" if missing else "skin"
                 raise ValueError(
-                    f"{file.filename} differs from {first.filename} in its {what}: keep different sets in "
-                    "different folders"
+                    f"{file.filename} differs from {first.filename} in its {what}: "
+                    "keep different sets in different folders"
                 )
         nstep = [len(f["step/time"]) for f in self._files]
         self._offsets = np.concatenate([[0], np.cumsum(nstep)])
@@ -254,8 +254,8 @@ class TactileSet:
         names, count = np.unique(self.id, return_counts=True)
         if (count > 1).any():
             raise ValueError(
-                f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: one of them "
-                "is left from another run"
+                f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: "
+                "one of them is left from another run"
             )
 
     def __len__(self):
@@ -346,20 +346,20 @@ def _open(path):
         file = h5py.File(path)
     except OSError as error:
         raise ValueError(
-            f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; delete it and run the "
-            "command again"
+            f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; "
+            "delete it and run the command again"
         ) from error
     try:
         if file.attrs.get("schema") != SCHEMA:
             raise ValueError(
-                f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; generate "
-                "or import it again"
+                f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; "
+                "generate or import it again"
             )
         channels = tuple(str(name) for name in file.attrs["channels"])
         if channels != CHANNELS:
             raise ValueError(
-                f"{path} has its channels in the order {' '.join(channels)}: {' '.join(CHANNELS)} is "
-                "needed; reorder the counts"
+                f"{path} has its channels in the order {' '.join(channels)}: "
+                f"{' '.join(CHANNELS)} is needed; reorder the counts"
             )
     except BaseException:
         file.close()

@@ -10,10 +10,12 @@ Sizes of the effects are those measured on real sensors (a real unloaded sensor 
 
 import dataclasses
 import importlib.util
+from collections.abc import Callable
 
 import numpy as np
 
 from ..geometry import load_skin
+from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, counts_from_impedance, impedance_from_counts
 from ..sensor.film import EXCITATION
 from .liquid_conduction import LiquidConduction
@@ -103,15 +105,15 @@ class SyntheticSensor:
       ValueError: scikit-fem or cholespy is missing.
     """
 
-    def __init__(self, seed: int = 0, skin: str = "fine", device="cpu"):
+    def __init__(self, seed: int = 0, skin: str = "fine", device: str = "cpu"):
         from ..skin import SkinModel, SkinOptions
         from ..skin.rubber.material import Material
 
         for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
             if importlib.util.find_spec(module) is None:
                 raise ValueError(
-                    f"the synthetic measured sensor needs {name}: pip install 'biotac-mj[data]', or take "
-                    "--labelled 0"
+                    f"the synthetic measured sensor needs {name}: "
+                    "pip install 'biotac-mj[data]', or take --labelled 0"
                 )
         v = self.variation = SensorVariation.draw(seed)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
@@ -119,7 +121,7 @@ class SyntheticSensor:
         self.seed = seed
         self.model = SkinModel(load_skin(skin), material, options, device)
 
-    def simulate(self, names, motions, progress=None):
+    def simulate(self, names: list | tuple, motions: list, progress: Callable | None = None) -> object:
         """Its skin under the same motions of the same objects: simulate.Fields, of its own mesh."""
         from .simulate import simulate
 
@@ -200,7 +202,7 @@ class Meter:
         return REST_TEMPERATURE - self._warm_up * (1 - warm) + warm * wander
 
 
-def relax(time, value, share, tau) -> np.ndarray:
+def relax(time: np.ndarray, value: np.ndarray, share: float, tau: float) -> np.ndarray:
     """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of share (value - its low-pass), exact
     between samples (linear).
 
@@ -222,7 +224,7 @@ def relax(time, value, share, tau) -> np.ndarray:
 _meter = {}  # what a worker keeps
 
 
-def start_worker(geometry, sensor, meter: Meter | None):
+def start_worker(geometry: SkinGeometry, sensor: str, meter: Meter | None) -> None:
     """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to
     make."""
     from . import readings
@@ -231,7 +233,9 @@ def start_worker(geometry, sensor, meter: Meter | None):
     _meter["one"] = meter
 
 
-def measure_in_worker(displacement, time, pressure, number: int, seed: int) -> np.ndarray:
+def measure_in_worker(
+    displacement: np.ndarray, time: np.ndarray, pressure: np.ndarray, number: int, seed: int
+) -> np.ndarray:
     """`Meter.measure` of contact `number` of the session; displacement (n, nvert, 3) int16 of the synthetic
     sensor's skin."""
     meter = _meter["one"]

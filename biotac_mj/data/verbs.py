@@ -30,8 +30,8 @@ def generate_verb(args) -> None:
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
     print(
-        f"{report.interactions} interactions, {report.steps} time steps, {report.nonconverged} of them not "
-        "converged"
+        f"{report.interactions} interactions, {report.steps} time steps, "
+        f"{report.nonconverged} of them not converged"
     )
     if report.recordings:
         print(f"{report.recordings} recordings of the synthetic measured sensor beside them")

@@ -2,20 +2,20 @@
 shrinks."""
 
 _HOME = {
-    "CATALOGUE": "catalogue",
-    "Effect": "effect",
-    "Param": "effect",
-    "RecordedEffect": "recorded_effect",
-    "Recording": "recording",
-    "Report": "workflow",
-    "Simulator": "simulator",
-    "Trajectory": "trajectories",
-    "diagnose": "workflow",
-    "diagnose_recording": "plain",
-    "load_simulator": "simulator",
-    "read_recording": "recording",
-    "read_trajectories": "trajectories",
-    "write_trajectories": "trajectories",
+    "CATALOGUE": "..effects.catalogue",
+    "Effect": "..effects.effect",
+    "Param": "..effects.effect",
+    "RecordedEffect": ".recordings.effects.effect",
+    "Recording": ".recordings.recording",
+    "Report": ".trajectories.workflow",
+    "Simulator": ".trajectories.simulator",
+    "Trajectory": ".trajectories.trajectory",
+    "diagnose": ".trajectories.workflow",
+    "diagnose_recording": ".recordings.search",
+    "load_simulator": ".trajectories.sensor_file",
+    "read_recording": ".recordings.recording",
+    "read_trajectories": ".trajectories.trajectory",
+    "write_trajectories": ".trajectories.trajectory",
 }
 
 __all__ = list(_HOME)
@@ -25,5 +25,5 @@ def __getattr__(name):
     if name in _HOME:
         import importlib
 
-        return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+        return getattr(importlib.import_module(_HOME[name], __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

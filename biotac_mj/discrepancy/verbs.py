@@ -15,9 +15,9 @@ def diagnose_verb(args):
             "columns of raw counts)"
         )
     if args.electrodes:
-        from .plain import diagnose_recording
-        from .recorded_report import summary, write_report
-        from .recording import read_recording
+        from .recordings.recording import read_recording
+        from .recordings.report import summary, write_report
+        from .recordings.search import diagnose_recording
 
         recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
         diagnosis = diagnose_recording(recording, args.locked, progress=not args.quiet)
@@ -25,6 +25,6 @@ def diagnose_verb(args):
         print(summary(diagnosis))
         print("  " + " ".join(str(f) for f in files[:2]))
         return
-    from .workflow_verb import diagnose_data
+    from .trajectories.report import diagnose_data
 
     diagnose_data(args)

@@ -36,13 +36,13 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         or (box[0][1] < box[1][1]).any()
     ):
         raise ValueError(
-            "the outer surface of the skin does not enclose the inner one: mesh the skin as one shell "
-            "around one cavity"
+            "the outer surface of the skin does not enclose the inner one: "
+            "mesh the skin as one shell around one cavity"
         )
     return outer, inner
 
 
-def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
+def held_nodes(vert: np.ndarray, bodies: object, tolerance: float = HELD) -> np.ndarray:
     """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m,
     3)), ...].
 
@@ -58,7 +58,7 @@ def held_nodes(vert: np.ndarray, bodies, tolerance: float = HELD) -> np.ndarray:
     return np.flatnonzero(near).astype(np.int32)
 
 
-def lin_electrodes_on(core_vert, core_face) -> tuple[np.ndarray, np.ndarray]:
+def lin_electrodes_on(core_vert: np.ndarray, core_face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19,
     3).
 
@@ -76,7 +76,9 @@ def lin_electrodes_on(core_vert, core_face) -> tuple[np.ndarray, np.ndarray]:
     return position, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> SkinGeometry:
+def assemble(
+    name: str, mesh: TetMesh, core: object, nail: object, clamp: object, electrodes: object = None
+) -> SkinGeometry:
     """A checked SkinGeometry from a shell and three rigid bodies (vert [m], face).
 
     Raises:
@@ -97,8 +99,8 @@ def assemble(name: str, mesh: TetMesh, core, nail, clamp, electrodes=None) -> Sk
     fixed = held_nodes(mesh.vert, (core, nail, clamp))
     if not len(fixed):
         raise ValueError(
-            f"no skin node lies within {HELD} m of core, nail or clamp: are skin and rigid bodies in the "
-            "same frame and units?"
+            f"no skin node lies within {HELD} m of core, nail or clamp: "
+            "are skin and rigid bodies in the same frame and units?"
         )
     position, normal = lin_electrodes_on(*core) if electrodes is None else electrodes
     return SkinGeometry(

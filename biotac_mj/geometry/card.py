@@ -75,7 +75,7 @@ def _ray_lengths(surface, origin, direction):
     return length
 
 
-def write_card(path, skin: SkinGeometry, made: str) -> pathlib.Path:
+def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathlib.Path:
     """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came
     about."""
     n = skin_numbers(skin)

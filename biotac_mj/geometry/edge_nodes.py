@@ -1,6 +1,7 @@
 """Ten-node tetrahedra: a node on every edge of a four-node mesh, and the way back to four nodes."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,7 +18,7 @@ EDGES = np.array(
 _FOLD = 0.3
 
 
-def with_edge_nodes(geometry: SkinGeometry, project=None) -> SkinGeometry:
+def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> SkinGeometry:
     """Puts a node on every edge of a skin of four-node tetrahedra.
 
     The nodes of `geometry` come first and keep their numbers. Every boundary face f becomes four (4 f .. 4 f

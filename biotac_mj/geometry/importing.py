@@ -16,7 +16,7 @@ __all__ = ["import_mesh", "read_obj", "read_tet_mesh", "write_obj"]
 _MESHES = (".tet", ".msh", ".vtu")
 
 
-def import_mesh(path, name: str | None = None) -> SkinGeometry:
+def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeometry:
     """A skin from a folder, or from a mesh file whose folder also holds the rigid bodies.
 
     The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of
@@ -37,22 +37,22 @@ def import_mesh(path, name: str | None = None) -> SkinGeometry:
             raise FileNotFoundError(f"no mesh in {path}: it needs one file ending in {', '.join(_MESHES)}")
         if len(found) > 1:
             raise ValueError(
-                f"{path} holds several meshes ({', '.join(p.name for p in found)}): pass the path of one of "
-                "them"
+                f"{path} holds several meshes ({', '.join(p.name for p in found)}): "
+                "pass the path of one of them"
             )
         path = found[0]
     mesh = read_tet_mesh(path).check()
     size = np.ptp(mesh.vert, axis=0).max()
     if not 0.005 <= size <= 0.1:
         raise ValueError(
-            f"{path.name}: the largest dimension is {size:.4g} m, not between 0.005 and 0.1 m (5 to 100 "
-            "mm): scale the file to metres"
+            f"{path.name}: the largest dimension is {size:.4g} m, "
+            "not between 0.005 and 0.1 m (5 to 100 mm): scale the file to metres"
         )
     core, nail, clamp = _rigid_bodies(path.parent)
     return assemble(name or path.parent.name, mesh, core, nail, clamp)
 
 
-def read_tet_mesh(path) -> TetMesh:
+def read_tet_mesh(path: pathlib.Path | str) -> TetMesh:
     """Reads `.tet` (lines `v x y z w` and `t a b c d`, 0-based), `.msh` or `.vtu`; nodes of no tetrahedron
     are dropped for the last two.
 
@@ -76,8 +76,8 @@ def read_tet_mesh(path) -> TetMesh:
     elem = mesh.cells_dict.get("tetra")
     if elem is None:
         raise ValueError(
-            f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: mesh the "
-            "volume with 4-node tetrahedra"
+            f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: "
+            "mesh the volume with 4-node tetrahedra"
         )
     if (elem >= len(mesh.points)).any() or (elem < 0).any():
         return TetMesh(mesh.points, elem)  # check() explains
@@ -110,8 +110,8 @@ def _read_tet(path) -> TetMesh:
             )
     if not vert or not elem:
         raise ValueError(
-            f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: lines must read `v x y z w` and "
-            "`t a b c d` (0-based)"
+            f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: "
+            "lines must read `v x y z w` and `t a b c d` (0-based)"
         )
     return TetMesh(np.array(vert), np.array(elem))
 
@@ -123,7 +123,7 @@ def _lines(path):
         raise ValueError(f"{path} is not a text file ({error}): export it again") from error
 
 
-def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
+def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
     """The connected bodies of a Wavefront .obj, polygons cut into triangles, equal positions merged: [(vert
     (n, 3), face (m, 3)), ...].
 
@@ -149,8 +149,8 @@ def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
             ) from error
     if not face or np.max(face) >= len(vert) or np.min(face) < 0:
         raise ValueError(
-            f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): export the rigid "
-            "bodies again as .obj"
+            f"{path} holds no usable faces ({len(vert)} vertices, {len(face)} triangles): "
+            "export the rigid bodies again as .obj"
         )
     vert, index = np.unique(np.array(vert), axis=0, return_inverse=True)
     face = index.reshape(-1)[np.array(face)]
@@ -165,7 +165,7 @@ def read_obj(path) -> list[tuple[np.ndarray, np.ndarray]]:
     return bodies
 
 
-def write_obj(path, vert, face) -> pathlib.Path:
+def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
     """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

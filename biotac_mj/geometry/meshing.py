@@ -19,7 +19,7 @@ _REGULAR = np.linalg.inv(
 )
 
 
-def surface_mesh(body, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def surface_mesh(body: object, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Closed triangle mesh of a `Body`: vert (n, 3), face (m, 3), symmetric in z; a contour on a grid of
     `spacing` [mm], projected."""
     import pyvista
@@ -35,7 +35,9 @@ def surface_mesh(body, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     return vert, face if volume > 0 else face[:, ::-1]
 
 
-def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coarsen: bool = True) -> TetMesh:
+def mesh_between(
+    outer: object, inner: object, edge: float, spacing: float, epsilon: float, coarsen: bool = True
+) -> TetMesh:
     """Tetrahedra (here in mm) between two bodies: fTetWild, then `improve`.
 
     Args:
@@ -71,7 +73,7 @@ def mesh_between(outer, inner, edge: float, spacing: float, epsilon: float, coar
     return improve(TetMesh(mesh.vert, mesh.elem), bodies)
 
 
-def improve(mesh: TetMesh, bodies, iterations: int = 150, power: float = 8.0) -> TetMesh:
+def improve(mesh: TetMesh, bodies: object, iterations: int = 150, power: float = 8.0) -> TetMesh:
     """Moves nodes to round the tetrahedra; nodes of the boundary part i stay on bodies[i] (parts by
     decreasing enclosed volume).
 

@@ -145,7 +145,7 @@ class Body:
     """A smooth solid, negative inside: sections along x, a turned tip, a flat end and perhaps a facet.
     Millimetres."""
 
-    def __init__(self, sections, tip: float, end: float, end_edge: float, facet=None):
+    def __init__(self, sections: tuple, tip: float, end: float, end_edge: float, facet: tuple | None = None):
         from scipy.interpolate import PchipInterpolator
 
         table = np.asarray(sections, dtype=float)

@@ -93,7 +93,7 @@ class SkinGeometry:
         ten-node tetrahedron e."""
         return self.elem if self.element == "linear" else self.elem[:, PARTS].reshape(-1, 4)
 
-    def save(self, path) -> pathlib.Path:
+    def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
         bit-equal."""
         path = pathlib.Path(path)
@@ -110,7 +110,7 @@ class SkinGeometry:
         return path
 
     @classmethod
-    def load(cls, path) -> "SkinGeometry":
+    def load(cls, path: pathlib.Path | str) -> "SkinGeometry":
         """Reads what `save` wrote.
 
         Raises:

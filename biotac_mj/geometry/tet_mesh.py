@@ -94,8 +94,8 @@ class TetMesh:
         bad = np.flatnonzero(~np.isfinite(self.vert).all(axis=1))
         if len(bad):
             raise ValueError(
-                f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: the file is "
-                "damaged, export it again"
+                f"{len(bad)} vertices are NaN or infinite, the first is vertex {bad[0]}: "
+                "the file is damaged, export it again"
             )
         bad = np.flatnonzero(((self.elem < 0) | (self.elem >= len(self.vert))).any(axis=1))
         if len(bad):
@@ -131,8 +131,8 @@ class TetMesh:
         unused = np.setdiff1d(np.arange(len(self.vert)), self.elem)
         if len(unused):
             raise ValueError(
-                f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: remove "
-                "them and renumber"
+                f"{len(unused)} vertices belong to no tetrahedron, the first is vertex {unused[0]}: "
+                "remove them and renumber"
             )
         return self
 
@@ -145,8 +145,8 @@ def check_closed(face: np.ndarray, name: str = "surface") -> None:
     if (count == 1).any():
         where = edge[first[count == 1][0]].tolist()
         raise ValueError(
-            f"the {name} is open: {np.sum(count == 1)} edges have one face only, the first joins vertices "
-            f"{where}: fill the holes"
+            f"the {name} is open: {np.sum(count == 1)} edges have one face only, "
+            f"the first joins vertices {where}: fill the holes"
         )
     if (count > 2).any():
         where = edge[first[count > 2][0]].tolist()

@@ -95,8 +95,8 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         for name in ("displacement", "counts", "measured_counts", "contact_force"):
             if name not in data.columns:
                 raise ValueError(
-                    f"{path} has no column {name}, only {', '.join(data.columns)}: make a set with `biotac "
-                    "generate --labelled N`"
+                    f"{path} has no column {name}, only {', '.join(data.columns)}: "
+                    "make a set with `biotac generate --labelled N`"
                 )
         for file in data._files:
             channels = [c.decode() if isinstance(c, bytes) else str(c) for c in file.attrs["channels"]]
@@ -117,8 +117,8 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
             field[a : a + 2048] = 1e3 * data["displacement"][keep[a : a + 2048]]
         if not np.isfinite(field).all():
             raise ValueError(
-                f"{path} holds displacements that are not finite: make the set again, or leave those "
-                "interactions out"
+                f"{path} holds displacements that are not finite: "
+                "make the set again, or leave those interactions out"
             )
         measured = data["measured_counts"][keep][:, :19]
         labelled = np.asarray(data.labelled[:stop])

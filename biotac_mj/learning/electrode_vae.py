@@ -39,8 +39,8 @@ class ElectrodeVAE(nn.Module):
         if linear is not None:
             if tuple(linear.shape) != (latent, channels):
                 raise ValueError(
-                    f"linear has shape {tuple(linear.shape)}: the code of {latent} from {channels} channels "
-                    "needs that shape"
+                    f"linear has shape {tuple(linear.shape)}: "
+                    f"the code of {latent} from {channels} channels needs that shape"
                 )
             self.skip_in, self.skip_out = (
                 nn.Linear(channels, latent, bias=False),

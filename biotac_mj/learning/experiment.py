@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import FULL_SCALE
 from .arrays import load_arrays
 from .config import LearningConfig
@@ -74,8 +74,8 @@ def train_all(
         if name not in FORWARD:
             raise ValueError(f"unknown model {name!r}: choose from {', '.join(FORWARD)}")
     print(
-        f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps read in "
-        f"{time.time() - begun:.0f} s"
+        f"{len(arrays.objects)} interactions, "
+        f"{len(arrays.owner)} time steps read in {time.time() - begun:.0f} s"
     )
     with tqdm(jobs, disable=not progress, desc="train") as bar:
         for split, seed in bar:

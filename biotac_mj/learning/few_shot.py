@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.stats import t as t_quantile
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import FULL_SCALE
 from .arrays import load_arrays
 from .local import counts_change
@@ -117,8 +117,8 @@ def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, see
     labelled = np.flatnonzero(arrays.labelled)
     if len(labelled) < 10:
         raise ValueError(
-            f"{path} has {len(labelled)} labelled interactions: at least 10 are needed to adapt on some and "
-            "judge on others"
+            f"{path} has {len(labelled)} labelled interactions: "
+            "at least 10 are needed to adapt on some and judge on others"
         )
     predicted = _log_changes(model, arrays)
     rows = arrays.rows(labelled, labelled=True)

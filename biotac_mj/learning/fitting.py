@@ -104,8 +104,8 @@ def cycle(
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
-                    f"the loss is {float(value)} at step {step}: look for values that are not finite in the "
-                    "data, or lower the rate"
+                    f"the loss is {float(value)} at step {step}: "
+                    "look for values that are not finite in the data, or lower the rate"
                 )
             if validate is not None:
                 module.eval()

@@ -66,16 +66,16 @@ def build_hierarchy(vert, elem, factors=(4, 4, 4, 2)) -> list[Level]:
     graph = _symmetric(edge, length, n)
     if connected_components(graph, directed=False)[0] > 1:
         raise ValueError(
-            "the mesh is not connected: a graph network on it would not see all of it; import a mesh of one "
-            "piece"
+            "the mesh is not connected: a graph network on it would not see all of it; "
+            "import a mesh of one piece"
         )
     levels, here = [], vert
     for factor in factors:
         m = int(np.ceil(len(here) / factor))
         if m < 5:
             raise ValueError(
-                f"{n} nodes are too few for factors {tuple(factors)}: the coarsest level would have {m} "
-                "nodes, fewer than 5"
+                f"{n} nodes are too few for factors {tuple(factors)}: "
+                f"the coarsest level would have {m} nodes, fewer than 5"
             )
         keep, owner = _farthest(graph, m)
         up = _interpolation(graph, here, keep)

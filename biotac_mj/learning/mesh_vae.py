@@ -30,8 +30,8 @@ class MeshVAE(nn.Module):
         super().__init__()
         if len(levels) != len(channels) + 1:
             raise ValueError(
-                f"{len(levels)} levels for {len(channels)} stages of channels: one more level than stages "
-                "is needed"
+                f"{len(levels)} levels for {len(channels)} stages of channels: "
+                "one more level than stages is needed"
             )
         self.nvert, self.latent, self.order = levels[0].laplacian.shape[0], latent, order
         self.coarsest = levels[-1].laplacian.shape[0]

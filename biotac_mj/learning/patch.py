@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from ..data.columns import read_columns
+from ..files import replacing
 from ..geometry import load_skin
-from ..press_record import replacing
 from ..sensor.channels import CHANNELS
 from .inverse import PATCH, contact_centre, log_change_of
 from .weights import load_inverse, shipped

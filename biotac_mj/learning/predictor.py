@@ -62,8 +62,8 @@ class ForwardModel(nn.Module):
             )
         if not torch.isfinite(displacement).all():
             raise ValueError(
-                "displacement holds values that are not finite: the skin's step did not converge; keep the "
-                "last good state"
+                "displacement holds values that are not finite: the skin's step did not converge; "
+                "keep the last good state"
             )
         pod, local = self.pod(displacement), None
         if self.local:

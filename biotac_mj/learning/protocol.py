@@ -22,15 +22,15 @@ def interaction_errors(predicted, truth, owner):
     predicted, truth, owner = np.asarray(predicted, float), np.asarray(truth, float), np.asarray(owner)
     if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 19 or len(owner) != len(truth):
         raise ValueError(
-            f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: (n, 19), (n, 19) and "
-            "(n,) are needed"
+            f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: "
+            "(n, 19), (n, 19) and (n,) are needed"
         )
     if not len(truth):
         raise ValueError("there are no rows to judge: the test part of the split is empty")
     if not (np.isfinite(predicted).all() and np.isfinite(truth).all()):
         raise ValueError(
-            "predicted or truth holds values that are not finite: look for NaN in the data set's "
-            "measured_counts"
+            "predicted or truth holds values that are not finite: "
+            "look for NaN in the data set's measured_counts"
         )
     rms = np.sqrt(((predicted - truth) ** 2).mean(1))
     which, index = np.unique(owner, return_inverse=True)

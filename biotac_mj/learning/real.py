@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import FULL_SCALE
 from .force import fit_force, ridge
 from .recording import load_recording

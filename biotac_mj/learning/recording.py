@@ -44,8 +44,8 @@ def load_recording(electrodes, force=None) -> Recording:
     if (low < 0).any() or (high > FULL_SCALE).any():
         bad = [f"e{i + 1} ({low[i]:g}..{high[i]:g})" for i in np.flatnonzero((low < 0) | (high > FULL_SCALE))]
         raise ValueError(
-            f"{electrodes}: counts of {', '.join(bad)} are outside 0..4095: raw 12-bit counts are needed, "
-            "not tared or scaled ones"
+            f"{electrodes}: counts of {', '.join(bad)} are outside 0..4095: "
+            "raw 12-bit counts are needed, not tared or scaled ones"
         )
     if not (low < high).any():
         raise ValueError(f"{electrodes}: no channel changes: this is not a recording of a touch")
@@ -57,7 +57,7 @@ def load_recording(electrodes, force=None) -> Recording:
         force = read_columns(force, ("Fx", "Fy", "Fz"))
         if len(force) != len(counts):
             raise ValueError(
-                f"{electrodes} has {len(counts)} rows and the force file {len(force)}: they must be samples "
-                "of the same instants"
+                f"{electrodes} has {len(counts)} rows and the force file {len(force)}: "
+                "they must be samples of the same instants"
             )
     return Recording(counts, force, ((counts <= 0) | (counts >= FULL_SCALE)).mean(0))

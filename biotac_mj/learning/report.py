@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 
@@ -72,40 +72,40 @@ def table(result) -> str:
         where = kind if kind == split else f"{kind}: {split}"
         seeds = " ".join(map(str, found["seeds"]))
         lines.append(
-            f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; RMS "
-            "per interaction, counts"
+            f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; "
+            "RMS per interaction, counts"
         )
         lines.append(
-            "  "
-            f"{'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}{'+-':>8}{'paper':>8}"
+            f"  {'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}"
+            f"{'+-':>8}{'paper':>8}"
         )
         for name, row in sorted(found["models"].items(), key=lambda item: item[1]["median"]):
             low, high = row["quartiles"]
             least, most = min(row["seed_medians"]), max(row["seed_medians"])
             spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
+            half = "-" if row["interval_half_width"] is None else round(row["interval_half_width"], 1)
             lines.append(
-                "  "
-                f"{name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}{row['interval_coverage']:>9.2f}"
-                f"{'-' if row['interval_half_width'] is None else round(row['interval_half_width'], 1):>8}{PAPER[kind].get(name, ''):>8}"
+                f"  {name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}"
+                f"{row['interval_coverage']:>9.2f}{half:>8}{PAPER[kind].get(name, ''):>8}"
             )
         lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")
         for name, test in found["tests"].items():
             better, middle = 100 * test["better"], test["median_difference"]
             lines.append(
-                f"  {name}: better on {better:.0f} % of {test['n']}, median of differences {middle:+.2f}, p "
-                f"= {test['p']:.2g}"
+                f"  {name}: better on {better:.0f} % of {test['n']}, median of differences {middle:+.2f}, "
+                f"p = {test['p']:.2g}"
             )
         for name, error in found["mesh_mm"].items():
             lines.append(
-                f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, {error['all']['moved']:.4f} mm where "
-                "it moves more than 0.05"
+                f"  mesh, {name}: {error['all']['mean']:.4f} mm mean, "
+                f"{error['all']['moved']:.4f} mm where it moves more than 0.05"
             )
         lines += _objects(found["mesh_mm"])
         for name, error in found["inverse_mm"].items():
             centre = f", patch centre {error['centre_median']:.2f} mm" if "centre_median" in error else ""
             lines.append(
-                f"  inverse, {name}: {error['mean']:.4f} mm mean, {error['moved']:.4f} mm where it "
-                f"moves{centre}"
+                f"  inverse, {name}: {error['mean']:.4f} mm mean, "
+                f"{error['moved']:.4f} mm where it moves{centre}"
             )
     lines.append(
         f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}"

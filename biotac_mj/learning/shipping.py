@@ -4,13 +4,17 @@ import json
 import pathlib
 import shutil
 
-from ..press_record import replacing
+from ..files import replacing
 from .report import UNIT
 from .weights import describe
 
 __all__ = ["ship"]
 
 _MOST = 16 * 2**20  # bytes, all weights together
+_DIRECTION = {
+    "forward": "deformed skin -> electrodes",
+    "inverse": "electrodes -> deformed skin and contact force",
+}
 
 
 def ship(folder, result, target) -> list[pathlib.Path]:
@@ -30,8 +34,8 @@ def ship(folder, result, target) -> list[pathlib.Path]:
     size = sum(path.stat().st_size for path in sources.values())
     if size > _MOST:
         raise ValueError(
-            f"the weights are {size / 2**20:.1f} MB: 16 MB at most are shipped; take fewer members or "
-            "components"
+            f"the weights are {size / 2**20:.1f} MB: 16 MB at most are shipped; "
+            "take fewer members or components"
         )
     target.mkdir(parents=True, exist_ok=True)
     written = []
@@ -48,19 +52,18 @@ def _card(name, meta, size, result):
     lines = [
         f"# Weights `{name}.safetensors`",
         "",
-        "Trained on **synthetic** data: touches of the simulated skin, counts of a synthetic sensor with "
-        "another mesh, material and",
+        "Trained on **synthetic** data: "
+        "touches of the simulated skin, counts of a synthetic sensor with another mesh, material and",
         "conduction (`docs/data.md`). No real sensor was involved; expect more error on one.",
         "",
         "| | |",
         "|---|---|",
-        "| direction | "
-        f"{'deformed skin -> electrodes' if name == 'forward' else 'electrodes -> deformed skin and contact force'} |",
+        f"| direction | {_DIRECTION[name]} |",
         f"| skin | `{meta['skin']}`, {meta['nvert']} nodes, fingerprint {meta['mesh']} |",
         f"| channels | {meta['channels'][0]}..{meta['channels'][-1]} |",
         f"| size | {size / 2**20:.2f} MB |",
-        f"| set | {result['interactions']} interactions, {result['labelled']} labelled; seed 0, 72 % of "
-        "them |",
+        f"| set | {result['interactions']} interactions, {result['labelled']} labelled; "
+        "seed 0, 72 % of them |",
     ]
     if name == "forward":
         lines.append(
@@ -79,8 +82,8 @@ def _card(name, meta, size, result):
                 f"{k} {row['median']:.1f} ({row['median'] / UNIT:.4f})" for k, row in rows.items()
             )
             lines.append(
-                f"- unseen {split}: median RMS per interaction in counts (/ 2048): {text}; noise "
-                f"{found['noise_floor']:.1f}"
+                f"- unseen {split}: median RMS per interaction in counts (/ 2048): {text}; "
+                f"noise {found['noise_floor']:.1f}"
             )
         else:
             row = found["inverse_mm"][meta.get("model", "pod_inverse")]
@@ -88,7 +91,7 @@ def _card(name, meta, size, result):
                 f", patch centre {row['centre_median']:.2f} mm (median)" if "centre_median" in row else ""
             )
             lines.append(
-                f"- unseen {split}: nodes {row['mean']:.4f} mm, where the skin moves {row['moved']:.4f} "
-                f"mm{centre}"
+                f"- unseen {split}: nodes {row['mean']:.4f} mm, "
+                f"where the skin moves {row['moved']:.4f} mm{centre}"
             )
     return "\n".join(lines) + "\n"

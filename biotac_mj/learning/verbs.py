@@ -31,8 +31,8 @@ def _add_train(verbs, verb):
         nargs="+",
         default=["trajectory", "ring_7mm"],
         metavar="NAME",
-        help="trajectory (72/18/10 %% of interactions), or the object that training never sees, "
-        "several with +",
+        help="trajectory (72/18/10 %% of interactions), "
+        "or the object that training never sees, several with +",
     )
     v.add_argument("--only", nargs="+", metavar="NAME", help="of our models (default: all)")
     v.add_argument(
@@ -84,8 +84,8 @@ def _add_evaluate(verbs, verb):
         verbs,
         "evaluate",
         _evaluate,
-        "Judge learned models: trained ones on a data set, or electrode code and force regression on a "
-        "recording of a real sensor.",
+        "Judge learned models: trained ones on a data set, "
+        "or electrode code and force regression on a recording of a real sensor.",
     )
     v.add_argument("folder", nargs="?", metavar="DIR", help="what `biotac train` wrote")
     v.add_argument(
@@ -134,8 +134,8 @@ def _evaluate(args):
         _evaluate_models(args)
     else:
         raise ValueError(
-            "nothing to evaluate: give a folder that `biotac train` wrote, or --electrodes FILE (and "
-            "--force FILE)"
+            "nothing to evaluate: give a folder that `biotac train` wrote, "
+            "or --electrodes FILE (and --force FILE)"
         )
 
 
@@ -181,8 +181,8 @@ def _contact_patch(args):
     one = contact_patch(args.source, args.out, args.tare, args.row, args.skin, args.weights)
     x, y, z = one["centre_mm"]
     print(
-        f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, force about "
-        f"{one['force']:.2f} N"
+        f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, "
+        f"force about {one['force']:.2f} N"
     )
     print(f"deepest {one['deepest_mm']:.2f} mm; written: {args.out}/contact.png, contact.json (all rows)")
 

@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 import torch
 
-from ..press_record import replacing
+from ..files import replacing
 from ..sensor.channels import CHANNELS
 
 __all__ = [
@@ -103,8 +103,8 @@ def _read(path, names=None):
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no weights {path}: give a file that `biotac train` wrote, forward-SPLIT or "
-            "inverse-SPLIT.safetensors"
+            f"no weights {path}: give a file that `biotac train` wrote, "
+            "forward-SPLIT or inverse-SPLIT.safetensors"
         )
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -120,13 +120,13 @@ def _load(path, geometry, direction):
     meta, tensors = _read(path)
     if meta.get("format") != _FORMAT or meta.get("direction") != direction:
         raise ValueError(
-            f"{path} holds no {direction} model of {_FORMAT}: it says {meta.get('format')}, "
-            f"{meta.get('direction')}"
+            f"{path} holds no {direction} model of {_FORMAT}: "
+            f"it says {meta.get('format')}, {meta.get('direction')}"
         )
     if meta["channels"] != list(CHANNELS[:19]):
         raise ValueError(
-            f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(CHANNELS[:19])} is "
-            "needed"
+            f"{path} was trained with channels {' '.join(meta['channels'])}: "
+            f"{' '.join(CHANNELS[:19])} is needed"
         )
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(

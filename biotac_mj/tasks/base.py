@@ -103,7 +103,7 @@ class TouchTask(composer.Task, abc.ABC):
     def before_step(self, physics, action, random_state):
         self.machine.command(physics, action)
 
-    def force(self, physics, index=0):
+    def contact_force(self, physics, index=0):
         """(3,) force on a BioTac in its frame [N]."""
         return self.biotacs[index].read(physics, "contact_force")[:3]
 

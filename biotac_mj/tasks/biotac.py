@@ -82,8 +82,8 @@ class BioTac(composer.Entity):
         for key in ("site", "body", "pos", "quat", "prefix"):
             if key in settings:
                 raise ValueError(
-                    f"BioTac got {key}={settings[key]!r}: an Entity is placed with "
-                    "robot.attach(BioTac(...), site)"
+                    f"BioTac got {key}={settings[key]!r}: "
+                    "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
         options = {**(options or {})}
         options["readings"] = {**options.get("readings", {}), "noise": False}
@@ -152,7 +152,7 @@ class BioTac(composer.Entity):
 
     def vert_xpos(self, physics) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
-        from ..coupling.attach import Handle
+        from ..coupling.attachment import Handle
 
         return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(
             physics.model.ptr, physics.data.ptr

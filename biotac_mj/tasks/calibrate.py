@@ -183,8 +183,8 @@ def main(arguments=None):
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))
             fit = Estimator.fit(touch, hidden, np.repeat(range(len(made)), [len(m[0]) for m in made]))
             print(
-                f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, spread "
-                f"{hidden.std(0)}"
+                f"{name}: {len(touch)} frames, RMS error on held-out episodes {fit.error}, "
+                f"spread {hidden.std(0)}"
             )
             found = {f"{name}/{part}": getattr(fit, part) for part in ("scale", "weight", "error")}
         _add(options.out, found | {f"{name}/fitted_on": np.array(kind)})

@@ -79,11 +79,11 @@ class FollowEdge(TouchTask):
 
     def hidden(self, physics):
         offset, turn, _ = self._pose(physics)  # offset: how far the rim is to the finger's left
-        return np.array([[offset, turn, self.force(physics)[1]]])
+        return np.array([[offset, turn, self.contact_force(physics)[1]]])
 
     def get_reward(self, physics):
         offset, _, tangent = self._pose(physics)
         velocity = physics.bind(self.machine.joints[:2]).qvel
         on_rim = rewards.tolerance(offset, (-0.7e-3, 0.7e-3), 2.3e-3, "linear", 0.0)
-        pressing = rewards.tolerance(self.force(physics)[1], _FORCES, 0.15, "linear", 0.0)
+        pressing = rewards.tolerance(self.contact_force(physics)[1], _FORCES, 0.15, "linear", 0.0)
         return float(on_rim * pressing * np.clip(-velocity @ tangent / _SPEED, 0, 1))

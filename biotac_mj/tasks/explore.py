@@ -65,7 +65,7 @@ class Explore(TouchTask):
         self._belief[:] = 1 / len(OBJECTS)
 
     def hidden(self, physics):
-        return self.force(physics)[None, 1:2]
+        return self.contact_force(physics)[None, 1:2]
 
     def get_reward(self, physics):
         return float(self._belief[self.chosen])

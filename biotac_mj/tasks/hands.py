@@ -39,8 +39,8 @@ class Mount:
         x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
         if abs(x @ y) > 1e-6 or not x.any() or not y.any():
             raise ValueError(
-                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: a "
-                "BioTac's pad looks sideways"
+                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: "
+                "a BioTac's pad looks sideways"
             )
         x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
         out = np.empty(4)
@@ -178,8 +178,8 @@ def _mounts(hand, variant):
     if variant == "authentic":
         if hand != "shadow_hand":
             raise ValueError(
-                f"only the shadow_hand comes with authentic BioTac fingers, not {hand!r}: leave the variant "
-                "out"
+                f"only the shadow_hand comes with authentic BioTac fingers, not {hand!r}: "
+                "leave the variant out"
             )
         return HANDS["shadow_hand_authentic"]
     return HANDS[hand]

@@ -48,7 +48,7 @@ class _Grip(TouchTask):
 
     def hidden(self, physics):
         # what the object's weight pulls is towards the tips, -x of the BioTacs
-        return np.array([self.force(physics, i)[[1, 0]] for i in range(2)]) * [1, -1]
+        return np.array([self.contact_force(physics, i)[[1, 0]] for i in range(2)]) * [1, -1]
 
     def grip(self, physics):
         """Mean normal force of the fingers [N]."""

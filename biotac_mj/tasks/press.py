@@ -49,12 +49,12 @@ class Press(TouchTask):
         self.machine.place(physics, np.append(random_state.uniform(-5e-3, 5e-3, size=2), 0.0))
 
     def hidden(self, physics):
-        return self.force(physics)[None, 1:2]
+        return self.contact_force(physics)[None, 1:2]
 
     def get_reward(self, physics):
         target = self.target(physics)
         return float(
             rewards.tolerance(
-                self.force(physics)[1], (0.9 * target, 1.1 * target), 0.9 * target, "linear", 0.0
+                self.contact_force(physics)[1], (0.9 * target, 1.1 * target), 0.9 * target, "linear", 0.0
             )
         )

@@ -74,9 +74,9 @@ class RollBall(TouchTask):
 
     def hidden(self, physics):
         # where the ball is under the finger
-        return np.append(self.ball(physics) - self.machine.position(physics)[:2], self.force(physics)[1])[
-            None
-        ]
+        return np.append(
+            self.ball(physics) - self.machine.position(physics)[:2], self.contact_force(physics)[1]
+        )[None]
 
     def get_reward(self, physics):
         return float(

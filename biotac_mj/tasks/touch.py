@@ -129,9 +129,9 @@ class CalibrationWarning(UserWarning):
 def fitted_on(config) -> dict:
     """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material,
     liquid, friction, readings."""
-    from ..coupling import skins
+    from ..geometry import load_skin
 
-    skin, digest = skins.load(config.skin), hashlib.sha256()
+    skin, digest = load_skin(config.skin), hashlib.sha256()
     for array in (skin.vert, skin.elem, skin.outer_face, skin.fixed, skin.electrode_pos):
         digest.update(np.ascontiguousarray(array).tobytes())
     return {

@@ -1,0 +1,232 @@
+"""`attach`: puts a BioTac into any MjSpec."""
+
+import dataclasses
+import importlib.resources
+import pathlib
+import weakref
+
+import mujoco
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import skin_reference
+from .config import PLUGIN_NAME, Config
+from .stepper import check_names
+
+__all__ = ["Handle", "attach"]
+
+CHANNELS = ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
+
+
+@dataclasses.dataclass(frozen=True)
+class Handle:
+    """Where an attached BioTac is in its model.
+
+    Attributes:
+      prefix: of all its names.
+      body: name of its body, whose frame is the BioTac frame.
+      config: its settings.
+    """
+
+    prefix: str
+    body: str
+    config: Config
+
+    def sensor(self, channel: str) -> str:
+        """Name of a channel's sensor: electrodes, pdc, pac, tac, tdc, contact_force or status.
+
+        Raises:
+          ValueError: no such channel.
+        """
+        if channel not in CHANNELS:
+            raise ValueError(f"a BioTac has no channel {channel!r}: choose one of {', '.join(CHANNELS)}")
+        return self.prefix + channel
+
+    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray:
+        """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m]
+        on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
+        converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
+        measured)."""
+        return np.array(data.sensor(self.sensor(channel)).data)
+
+    def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
+        index = int(model.body_plugin[model.body(self.body).id])
+        setup = _setup(model, index)
+        start = model.plugin_stateadr[index]
+        return setup.skin.stepper.vert_xpos(
+            setup.parts(data.plugin_state[start : start + setup.nstate])[2]
+        ).copy()
+
+
+_setups = weakref.WeakKeyDictionary()  # of each living model
+
+
+def _setup(model, index):
+    from .instance import Setup
+    from .structs import ModelView
+
+    setups = _setups.setdefault(model, {})
+    if index not in setups:
+        setups[index] = Setup(ModelView(model._address), index)
+    return setups[index]
+
+
+def attach(
+    spec: mujoco.MjSpec,
+    site: str | None = None,
+    body: str | None = None,
+    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
+    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    prefix: str = "biotac_",
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str | dict | None = None,
+    liquid: bool | None = None,
+    coupling: str = "two-way",
+    geoms: list | None = None,
+    rounding: dict | None = None,
+    friction: float | None = None,
+    priority: int = 0,
+    seed: int = 0,
+    device: str = "cpu",
+    stepper: str = "fem",
+    tier: str = "full",
+    readings: str = "biotac",
+    options: dict | None = None,
+    slots: int | None = None,
+) -> Handle:
+    """Adds a BioTac with its skin, sensors and engine plugin to a model.
+
+    Args:
+      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching
+        bodies as there are now (see `slots`).
+      site, body: name of the site or the body it is fixed to; neither is the world.
+      pos, quat: pose [m] of the BioTac frame there.
+      prefix: of every name it adds, so that a model may hold several.
+      skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
+      slots: how many bodies may touch two-way; None counts the bodies of `spec`.
+      liquid, friction: None takes the material's choice.
+      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings,
+      options: see `Config`.
+
+    Raises:
+      ValueError: unknown site, body, coupling, geom or skin; the prefix is taken; site and body both given.
+      FileNotFoundError: no such file.
+    """
+    _check_place(spec, site, body, prefix)
+    text, geometry = skin_reference(skin)
+    if stepper == "fem":
+        liquid, friction = _material_choices(material, liquid, friction)
+    config = Config(
+        skin=text,
+        stepper=stepper,
+        tier=tier,
+        readings=readings,
+        material=material,
+        liquid=liquid is None or bool(liquid),
+        coupling=coupling,
+        geoms=geoms,
+        rounding=dict(rounding or {}),
+        priority=int(priority),
+        seed=int(seed),
+        device=device,
+        options=dict(options or {}),
+        **({} if friction is None else {"friction": float(friction)}),
+    )
+    check_names(config)
+    names = [g.name for g in spec.geoms]
+    for name in (*(config.geoms or ()), *config.rounding):
+        if name not in names:
+            raise ValueError(
+                f"no geom {name!r} to touch: the model has "
+                f"{', '.join(n for n in names if n) or 'no named geom'}"
+            )
+    if slots is None:
+        slots = max(
+            4, len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
+        )
+    child = _model(geometry)
+    child.body("core").pos, child.body("core").quat = pos, quat
+    if site is not None:
+        spec.attach(child, site=spec.site(site), prefix=prefix)
+    else:
+        parent = spec.worldbody if body is None else spec.body(body)
+        spec.attach(child, frame=parent.add_frame(), prefix=prefix)
+    core = spec.body(prefix + "core")
+    _activate(spec, core, prefix + "skin", config)
+    if config.coupling == "two-way":
+        _add_slots(spec, core, prefix, slots)
+    return Handle(prefix, core.name, config)
+
+
+def _material_choices(material, liquid, friction):
+    from ..skin.rubber.material import Material
+    from ..skin.rubber.material import material as preset
+
+    chosen = Material(**material) if isinstance(material, dict) else preset(material or "default")
+    return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction
+
+
+def _check_place(spec, site, body, prefix):
+    if site is not None and body is not None:
+        raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
+    for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
+        if name is not None and name not in [p.name for p in present]:
+            raise ValueError(
+                f"no {kind} {name!r} to attach to: the model has "
+                f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
+            )
+    if any(b.name == prefix + "core" for b in spec.bodies):
+        raise ValueError(
+            f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
+        )
+
+
+def _model(geometry):
+    """mjcf/biotac.xml with the meshes, electrodes and outer surface of a skin."""
+    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
+        spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
+    for part in ("core", "nail", "clamp"):
+        mesh, vert, face = (
+            spec.mesh(part),
+            getattr(geometry, f"{part}_vert"),
+            getattr(geometry, f"{part}_face"),
+        )
+        if len(face) == 0:
+            spec.delete(next(g for g in spec.geoms if g.name == part))
+            spec.delete(mesh)
+            continue
+        mesh.file = ""
+        mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
+    for i, position in enumerate(geometry.electrode_pos, start=1):
+        spec.site(f"e{i}").pos = position
+    node, face = np.unique(geometry.outer_face, return_inverse=True)
+    skin = spec.skins[0]
+    skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()
+    skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
+    return spec
+
+
+def _activate(spec, body, name, config):
+    if PLUGIN_NAME not in [p.plugin_name for p in spec.plugins]:
+        spec.activate_plugin(PLUGIN_NAME)
+    plugin = spec.add_plugin(name=name, plugin_name=PLUGIN_NAME, active=True)
+    plugin.config = config.strings()
+    # an instance that no body refers to would be lost when this model is attached to another
+    body.plugin.active, body.plugin.name, body.plugin.plugin_name = True, name, PLUGIN_NAME
+
+
+def _add_slots(spec, core, prefix, count):
+    for i in range(count):
+        spec.add_equality(
+            name=f"{prefix}couple{i}",
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=core.name,
+            active=False,
+            # as good as nothing wherever the plugin does not write the rows: no stiffness, no damping, least
+            # impedance
+            solref=[0.0, 0.0],
+            solimp=[1e-4, 1e-4, 1.0, 0.5, 1.0],
+        )

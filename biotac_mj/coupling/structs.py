@@ -1,0 +1,232 @@
+"""mjModel and mjData seen from an engine plugin: numpy views on MuJoCo's own memory, laid out by
+`mujoco.introspect`.
+
+A plugin's callbacks get bare addresses. The field layouts of the installed MuJoCo come from its own
+introspection tables, so that a new release that adds fields needs no change here."""
+
+import ctypes
+import pathlib
+
+import mujoco
+import numpy as np
+from mujoco.introspect import ast_nodes, enums, structs
+
+__all__ = ["LIBRARY", "DataView", "ModelView", "c_structs"]
+
+LIBRARY = ctypes.CDLL(
+    str(next(pathlib.Path(mujoco.__file__).parent.glob("libmujoco.*")))
+)  # already loaded: this only finds it
+LIBRARY.mj_getPluginConfig.restype = ctypes.c_char_p
+LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p)
+LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
+LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
+LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+for _stage in ("mj_referenceConstraint", "mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint"):
+    getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
+LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
+
+_SCALARS = {
+    "mjtNum": ctypes.c_double,
+    "double": ctypes.c_double,
+    "float": ctypes.c_float,
+    "int": ctypes.c_int,
+    "int32_t": ctypes.c_int32,
+    "int64_t": ctypes.c_int64,
+    "uint64_t": ctypes.c_uint64,
+    "unsigned int": ctypes.c_uint,
+    "unsigned char": ctypes.c_ubyte,
+    "char": ctypes.c_char,
+    "mjtByte": ctypes.c_ubyte,
+    "mjtBool": ctypes.c_bool,
+    "mjtSize": ctypes.c_int64,
+    "size_t": ctypes.c_size_t,
+    "uintptr_t": ctypes.c_size_t,
+}
+_DTYPES = {
+    "mjtNum": np.float64,
+    "float": np.float32,
+    "int": np.int32,
+    "mjtByte": np.uint8,
+    "mjtBool": np.uint8,
+    "char": np.uint8,
+    "uintptr_t": np.uint64,
+    "mjtSize": np.int64,
+}
+_built = {}
+
+
+def _c_type(node):
+    if isinstance(node, ast_nodes.PointerType):
+        return ctypes.c_void_p
+    if isinstance(node, ast_nodes.ArrayType):
+        kind = _c_type(node.inner_type)
+        for extent in reversed(node.extents):
+            kind = kind * extent
+        return kind
+    if isinstance(node, ast_nodes.AnonymousStructDecl):
+        base = ctypes.Union if isinstance(node, ast_nodes.AnonymousUnionDecl) else ctypes.Structure
+        return type("anonymous", (base,), {"_fields_": [(f.name, _c_type(f.type)) for f in node.fields]})
+    name = node.name.removeprefix("struct ").rstrip("_")
+    if name in _SCALARS:
+        return _SCALARS[name]
+    if name in structs.STRUCTS:
+        return c_structs(name)
+    if name in enums.ENUMS:
+        return ctypes.c_int
+    raise ValueError(
+        f"biotac_mj does not know MuJoCo's type {node.name!r}: "
+        "this MuJoCo is newer than the plugin; install mujoco>=3.17,<4"
+    )
+
+
+def c_structs(name: str) -> type:
+    """The ctypes.Structure of one of MuJoCo's public structs, for example "mjData"."""
+    if name not in _built:
+        fields = []
+        for i, field in enumerate(structs.STRUCTS[name].fields):
+            kind = field if isinstance(field, ast_nodes.AnonymousStructDecl) else field.type
+            fields.append((getattr(field, "name", f"anonymous{i}"), _c_type(kind)))
+        _built[name] = type(name, (ctypes.Structure,), {"_fields_": fields})
+    return _built[name]
+
+
+class _View:
+    """Fields of one struct by name: scalars as Python numbers, arrays as numpy views that write through."""
+
+    def __init__(self, kind, address):
+        self.struct = c_structs(kind).from_address(address)
+        self.address = address
+        self._field = _pointer_fields(kind)
+        self._seen = {}
+
+    def _size(self, name):
+        return getattr(self.struct, name)
+
+    def pointer(self, name, shape):
+        """(shape) view of the memory that pointer `name` points to now, without looking up its size."""
+        address = getattr(self.struct, name)
+        last = self._seen.get(name)
+        if (
+            last is not None and last[0] == address and last[1] == shape
+        ):  # the same memory, whatever it holds now
+            return last[2]
+        dtype = self._field[name][0]
+        if not address:
+            return np.zeros(shape, dtype)
+        count = 1
+        for n in shape:
+            count *= n
+        buffer = (ctypes.c_char * (count * np.dtype(dtype).itemsize)).from_address(address)
+        view = np.frombuffer(buffer, dtype).reshape(shape)
+        self._seen[name] = address, shape, view
+        return view
+
+    def array(self, name):
+        """View of array `name` with the shape that MuJoCo documents."""
+        extents = self._field[name][1]
+        return self.pointer(name, tuple([e if e.__class__ is int else self._size(e) for e in extents]))
+
+
+def _extent(extent):
+    if isinstance(extent, int) or extent.isdigit():
+        return int(extent)
+    constants = {
+        name: value for enum in enums.ENUMS.values() for name, value in enum.values.items() if name == extent
+    }
+    return constants.get(
+        extent, getattr(mujoco, extent, extent)
+    )  # a constant such as mjNREF, or the name of a size
+
+
+def _pointer_fields(kind):
+    key = kind + "*"
+    if key not in _built:
+        _built[key] = {
+            f.name: (_DTYPES.get(f.type.inner_type.name), tuple(_extent(e) for e in f.array_extent or ()))
+            for f in structs.STRUCTS[kind].fields
+            if isinstance(getattr(f, "type", None), ast_nodes.PointerType)
+            and isinstance(f.type.inner_type, ast_nodes.ValueType)
+        }
+    return _built[key]
+
+
+class ModelView(_View):
+    """mjModel at an address. Arrays are found once and kept: a model's arrays never move."""
+
+    def __init__(self, address: int):
+        super().__init__("mjModel", address)
+
+    def __getattr__(self, name):
+        value = self.array(name) if name in self._field else getattr(self.struct, name)
+        self.__dict__[name] = value
+        return value
+
+    def name(self, kind: str, index: int) -> str:
+        """Name of an object, for example name("body", 3)."""
+        start = getattr(self, f"name_{kind}adr")[index]
+        names = self.names
+        return names[start : start + int(np.argmax(names[start:] == 0))].tobytes().decode()
+
+    def config(self, instance: int, attribute: str) -> str:
+        """Configuration string of a plugin instance, "" where the model gives none."""
+        value = LIBRARY.mj_getPluginConfig(self.address, instance, attribute.encode())
+        return value.decode() if value else ""
+
+    @property
+    def is_sparse(self) -> bool:
+        return bool(LIBRARY.mj_isSparse(self.address))
+
+
+class DataView(_View):
+    """mjData at an address. Arrays of fixed size are kept; those that live on the arena (efc_*, contacts) are
+    looked up at each use."""
+
+    def __init__(self, address: int, model: ModelView):
+        super().__init__("mjData", address)
+        self.model = model
+        self._own = {name for name, *_ in self.struct._fields_}
+
+    def _size(self, name):
+        return getattr(self.struct if name in self._own else self.model.struct, name)
+
+    def __getattr__(self, name):
+        if name not in self._field:
+            return getattr(self.struct, name)
+        value = self.array(name)
+        if not name.startswith(
+            ("efc_", "iefc_", "map_", "contact", "island_", "dof_island", "tree_island", "tendon_efcadr")
+        ):
+            self.__dict__[name] = value
+        return value
+
+    def jacobian(self, body: int, point: np.ndarray) -> np.ndarray:
+        """(6, nv) Jacobian of the point [m, world] that moves with `body`: translation, then rotation."""
+        out = np.empty((6, self.model.nv))
+        address = out.ctypes.data
+        LIBRARY.mj_jac(
+            self.model.address, self.address, address, address + 24 * self.model.nv, point.ctypes.data, body
+        )
+        return out
+
+    def project_constraints(self) -> None:
+        """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and
+        regularisation."""
+        LIBRARY.mj_projectConstraint(self.model.address, self.address)
+
+    def acceleration(self) -> np.ndarray:
+        """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
+        rows as they are now.
+
+        Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of
+        mj_inverse, warm start) is put back."""
+        model, data = self.model.address, self.address
+        qacc, warmstart = self.qacc, self.qacc_warmstart
+        kept = qacc.copy(), warmstart.copy()
+        LIBRARY.mj_rne(model, data, 0, self.qfrc_bias.ctypes.data)
+        LIBRARY.mj_referenceConstraint(model, data)
+        LIBRARY.mj_fwdActuation(model, data)
+        LIBRARY.mj_fwdAcceleration(model, data)
+        LIBRARY.mj_fwdConstraint(model, data)
+        out = qacc.copy()
+        qacc[:], warmstart[:] = kept
+        return out

@@ -1,0 +1,16 @@
+"""White noise of a record, from its quietest parts."""
+
+import numpy as np
+
+__all__ = ["noise_level"]
+
+
+def noise_level(counts, repeated=None, least=0.05):
+    """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the
+    quietest quarter of the record."""
+    x = counts if repeated is None else counts[~repeated]
+    d = np.diff(x, n=2, axis=0) / np.sqrt(6)
+    size = max(20, len(d) // 60)
+    k = max(1, len(d) // size)
+    blocks = (d[: k * size].reshape(k, -1, d.shape[1]) ** 2).mean(1)
+    return np.maximum(np.sqrt(np.quantile(blocks, 0.25, axis=0)), least)

@@ -1,0 +1,1 @@
+"""Diagnosis of plain recordings: counts, perhaps with force, without poses."""

@@ -1,0 +1,159 @@
+"""Plain recordings: raw electrode counts, optionally with force and TDC, one row per sample, read and
+checked."""
+
+import dataclasses
+import math
+import pathlib
+
+import numpy as np
+
+from ...data.columns import read_columns
+from ...sensor.channels import CHANNELS, FULL_SCALE, REST_COUNTS, log_impedance
+
+__all__ = ["BUS_RATE", "Recording", "read_recording"]
+
+BUS_RATE = (
+    100.0  # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
+)
+MIN_ROWS = 400  # fewer leave no part to keep aside
+
+
+@dataclasses.dataclass
+class Recording:
+    """One sensor, uniformly sampled. n rows.
+
+    Attributes:
+      electrodes: (n, 19) raw counts e1..e19.
+      force: (n, 3) Fx Fy Fz [N], or None.
+      tdc: (n,) raw counts of the thermistor, or None.
+      rate: rows per second [Hz]; rate_source: where it comes from.
+      name: for the report.
+
+    Raises:
+      ValueError: shapes that differ, numbers that are no counts, or too few rows.
+    """
+
+    electrodes: np.ndarray
+    force: np.ndarray | None = None
+    tdc: np.ndarray | None = None
+    rate: float | None = None
+    rate_source: str = "given"
+    name: str = "recording"
+
+    def __post_init__(self):
+        e = self.electrodes = np.asarray(self.electrodes, float)
+        if e.ndim != 2 or e.shape[1] != 19:
+            raise ValueError(
+                f"electrodes have shape {e.shape}: "
+                "19 columns of raw counts e1..e19 are needed, one row per sample"
+            )
+        _check_numbers(e, "electrodes")
+        if len(e) < MIN_ROWS:
+            raise ValueError(
+                f"{len(e)} rows are too few to fit on one part and check on another: "
+                f"record at least {MIN_ROWS}"
+            )
+        if e.min() < 0 or e.max() > FULL_SCALE:
+            raise ValueError(
+                f"electrodes reach from {e.min():g} to {e.max():g}, raw counts are 0..4095: give the raw "
+                "values, not tared, scaled or in ohm"
+            )
+        if e.max() <= 8:
+            raise ValueError(
+                f"no electrode exceeds {e.max():g} counts: these look like volts or normalised values; "
+                "give raw counts 0..4095"
+            )
+        for label, width in (("force", 3), ("tdc", None)):
+            value = getattr(self, label)
+            if value is None:
+                continue
+            value = np.asarray(value, float)
+            shape = (len(e), width) if width else (len(e),)
+            value = value.reshape(len(value), -1)[:, 0] if width is None else value
+            if value.shape != shape:
+                raise ValueError(
+                    f"{label} has shape {value.shape}, the electrodes have {len(e)} rows: "
+                    f"{shape} is needed, row by row"
+                )
+            _check_numbers(value.reshape(len(e), -1), label)
+            setattr(self, label, value)
+        if self.force is not None and np.abs(self.force).max() > 1000:
+            raise ValueError(
+                f"force reaches {np.abs(self.force).max():.3g}: a BioTac is pressed with a few newtons; "
+                "give newtons (Fx Fy Fz), "
+                "not millinewtons or raw counts"
+            )
+        if self.rate is None:
+            share = self.repeated.mean()
+            if 0.02 < share < 0.98:
+                self.rate = BUS_RATE / (1 - share)
+                self.rate_source = (
+                    f"{share:.1%} of the rows repeat the one before: "
+                    f"a logger faster than the bus of {BUS_RATE:g} Hz"
+                )
+            else:
+                self.rate, self.rate_source = BUS_RATE, "assumed: the bus rate"
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise ValueError(f"rate is {self.rate}: give rows per second, a positive number")
+
+    def __len__(self):
+        return len(self.electrodes)
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) [s] from the first row."""
+        return np.arange(len(self)) / self.rate
+
+    @property
+    def repeated(self) -> np.ndarray:
+        """(n,) bool, rows equal to the one before in 15 or more electrodes, where that is no chance."""
+        # Four electrodes may differ: something may have been added to single channels after the row was held.
+        same = np.concatenate([[False], (np.diff(self.electrodes, axis=0) == 0).sum(1) >= 15])
+        single = (np.diff(self.electrodes, axis=0) == 0).mean(0)
+        chance = np.prod(
+            np.sort(np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1))[::-1][:15]
+        )
+        return same if same.mean() > 20 * chance else np.zeros(len(same), bool)
+
+    @property
+    def rest_correlation(self) -> float:
+        """Correlation of the median ln Z with the mean pattern of the published sensors; real ones reach 0.9,
+        a shuffled file does not."""
+        published = np.mean([log_impedance(c) for c in REST_COUNTS.values()], axis=0)
+        here = np.median(log_impedance(self.electrodes), axis=0)
+        return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
+
+
+def read_recording(electrodes, force=None, tdc=None, rate=None) -> Recording:
+    """Reads text files of numbers (`data.columns`).
+
+    Args:
+      electrodes: path, 19 columns of raw counts.
+      force: path, 3 columns [N]; tdc: path, 1 column of raw counts; rate: rows per second [Hz], None guesses
+        (see Recording).
+
+    Raises:
+      FileNotFoundError, ValueError: the text names file, line and remedy.
+    """
+    table = read_columns(electrodes, CHANNELS[:19])
+    push = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
+    temperature = None if tdc is None else read_columns(tdc, ("tdc",))[:, 0]
+    for name, path, value in (("--force", force, push), ("--tdc", tdc, temperature)):
+        if value is not None and len(value) != len(table):
+            raise ValueError(
+                f"{name} {path} has {len(value)} rows and --electrodes {electrodes} has {len(table)}: they "
+                "must be logged row by row "
+                "together; cut both to the time they share (a clock gap cannot be guessed)"
+            )
+    return Recording(table, push, temperature, rate, "given" if rate else "", pathlib.Path(electrodes).name)
+
+
+def _check_numbers(value, label):
+    bad = np.argwhere(~np.isfinite(value))
+    if len(bad):
+        row, column = bad[0]
+        raise ValueError(
+            f"{label}: {len(bad)} values are not finite, the first in row {row + 1}, column {column + 1}: a "
+            "gap cannot be guessed; "
+            "cut the recording there or log it again"
+        )

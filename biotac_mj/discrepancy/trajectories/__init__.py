@@ -1,0 +1,1 @@
+"""Evidence and verdict where the poses of the touching object are known."""

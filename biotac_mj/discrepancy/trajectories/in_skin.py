@@ -1,0 +1,143 @@
+"""Constitutive effects inside the finite elements instead of on the forces that they bear: the exact proof.
+
+    sim = InSkinSimulator(skin="coarse", tier="full")
+    sim.run(trajectories, effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})])  # the skin itself relaxes
+
+It takes the place of a Simulator wherever the skin is solved anew (`exact`); with `exact=False` it is one.
+`docs/discrepancy.md` says how much the reduced forms differ."""
+
+import dataclasses
+import typing
+
+import numpy as np
+
+from ...effects.in_film import RoughFilm, drain, left
+from ...effects.in_skin import memory_of
+from .simulator import Simulator, _impedance, placed
+
+__all__ = ["InSkinSimulator", "solve_with_memory"]
+
+
+def solve_with_memory(model, film, trajectories, poses=None, progress=None, loss=0.0) -> list:
+    """Walks trajectories in their order through a skin that remembers.
+
+    Overstress and slip are forgotten between trajectories, the largest energy of every point is not.
+
+    Args:
+      model: SkinModel on the CPU; film: FilmConduction.
+      poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
+      loss: of liquid, as a share of what there was at the session's beginning [1/h].
+
+    Returns:
+      per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
+        converged (n,).
+    """
+    from ...data.simulate import Scene, _walk
+    from ...skin import SkinData, step
+
+    data, out = SkinData(model), []
+    for i, t in enumerate(trajectories):
+        tool, pos = (t.tool, t.pos) if poses is None else poses[i]
+        worst = data.memory.worst.copy() if data.memory else None
+        data.reset()
+        if data.memory:
+            np.maximum(worst, data.memory.worst, out=data.memory.worst)
+        scene = Scene([tool], model.device, model.material.friction)
+        at, turn, row = _walk(pos, t.mat)
+        ends = np.flatnonzero(row >= 0)
+        count = np.diff(ends, prepend=-1)  # steps to each row
+        dt = np.repeat(np.diff(t.time, prepend=t.time[0] - 1.0) / count, count)
+        scene.place(at[:1], turn[:1])
+        clock = t.clock + t.time[0] + np.cumsum(dt) - dt[0]
+        if loss:
+            drain(model, data, left(loss, clock[0]))
+        one = {"force": [], "pressure": [], "x": [], "converged": []}
+        for p, R, r, h, now in zip(at, turn, row, dt, clock):
+            scene.place(p[None], R[None])
+            if loss:
+                data.set_liquid(fill_volume=(left(loss, now) - 1) * model.liquid_volume)
+            step(model, data, scene.geoms, h)
+            if r >= 0:
+                one["force"].append(data.wrench[0, 0, :3]), one["pressure"].append(data.pressure[0])
+                one["x"].append(data.vert_xpos[0]), one["converged"].append(data.converged[0])
+        out.append(
+            {
+                "force": np.array(one["force"]),
+                "pressure": np.array(one["pressure"]),
+                "converged": np.array(one["converged"]),
+                "log_z": np.log(_impedance(film, one["x"])),
+            }
+        )
+        if progress:
+            progress()
+    return out
+
+
+@dataclasses.dataclass
+class InSkinSimulator(Simulator):
+    """A Simulator of the full tier in which relaxation, creep, Mullins softening, hysteresis, stiffening and
+    a modulus that varies with place act inside the elements, adhesion and load-dependent friction inside the
+    contact, loss and roughness of the liquid's film in it.
+
+    Raises:
+      ValueError: another tier.
+    """
+
+    tier: str = "full"
+    constitutive: typing.ClassVar[str] = "in_skin"
+
+    def __post_init__(self):
+        if self.tier != "full":
+            raise ValueError(
+                f"the {self.tier} tier is elastic: constitutive effects inside the elements need tier='full'"
+            )
+
+    def run(self, trajectories, fields=None, exact=True, effects=None, *more, **kw):
+        """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
+        effects = self.effects if effects is None else effects
+        inside = memory_of(effects)
+        if exact is False or len(inside.rest) == len(effects):
+            return super().run(trajectories, fields, exact, effects, *more, **kw)
+        inner = _Remembering(
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(Simulator) if f.init}
+            | {"cache": None}
+        )
+        inner.inside, inner._models = inside, {}
+        runs = inner.run(trajectories, None, True, inside.rest, *more, **kw)
+        if exact is True:
+            return runs
+        listed = set(np.atleast_1d(exact).tolist())
+        others = super().run(trajectories, fields, False, effects, *more, **kw)
+        return [runs[i] if i in listed else other for i, other in enumerate(others)]
+
+
+class _Remembering(Simulator):
+    """Solves the skin with what is `inside`; nothing is cached, since the past decides."""
+
+    def solve(
+        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+    ) -> list:
+        poses = [
+            placed(
+                t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
+            )
+            for i, t in enumerate(trajectories)
+        ]
+        model, film = self._model(log_friction, bubble)
+        power = self.inside.film.get("power")
+        film = film if power is None else RoughFilm(film, power)
+        return solve_with_memory(
+            model, film, trajectories, poses, progress, self.inside.film.get("loss", 0.0)
+        )
+
+    def _model(self, log_friction, bubble):
+        from ...skin.rubber.material import material
+        from ...skin.model import SkinModel
+
+        if bubble not in self._models:
+            super()._model(0.0, bubble)
+            plain = self._models[bubble]
+            rubber = dataclasses.replace(material(self.material), **self.inside.material)
+            options = dataclasses.replace(plain.options, **self.inside.contact)
+            self._models[bubble] = SkinModel(plain.geometry, rubber, options, **self.inside.model)
+        return super()._model(log_friction, bubble)

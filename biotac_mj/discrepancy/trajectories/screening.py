@@ -1,0 +1,146 @@
+"""Linearised signatures: the screen of the catalogue, what one effect can mimic of another, and the
+experiment that tells them apart."""
+
+import numpy as np
+
+from ...effects.catalogue import CATALOGUE
+from .fitting import mean_square
+
+__all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen"]
+
+_STEPS = {"log_modulus": 0.05, "log_friction": 0.1, "footprint": 0.02, "mesh": 0.2}
+
+
+def columns(comparison, current, effect, shape, base, chosen):
+    """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a
+    realistic size."""
+    out = []
+    for name, size in _sizes(effect):
+        theta = {**effect.default(), **shape}
+        theta[name] = theta[name] + size
+        r = comparison.residuals([*current.effects, (effect, theta)], current.nuisance)
+        out.append(np.concatenate([(base[i] - r[i]).ravel() for i in chosen]))
+    return np.stack(out, axis=1)
+
+
+def _sizes(effect):
+    """(name, step) of the free parameters."""
+    for name in effect.free:
+        p = effect.params[name]
+        yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
+
+
+def nuisance_space(comparison, current, base, chosen):
+    """(rows, 4) orthonormal: what the nuisance parameters can mimic."""
+    out = []
+    for name, by in _STEPS.items():
+        r = comparison.residuals(current.effects, current.nuisance.moved(**{name: by}))
+        out.append(np.concatenate([(base[i] - r[i]).ravel() for i in chosen]))
+    q, r = np.linalg.qr(np.stack(out, axis=1))
+    return q[:, np.abs(np.diag(r)) > 1e-9]
+
+
+def screen(comparison, current, effects, chosen):
+    """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
+    start), best first."""
+    base = current.residuals(comparison)
+    q = nuisance_space(comparison, current, base, chosen)
+    sizes = [base[i].size for i in chosen]
+    edges = np.concatenate([[0], np.cumsum(sizes)])
+    weight = np.concatenate(
+        [np.full(s, 1 / np.sqrt(max(m, 0.5))) for s, m in zip(sizes, mean_square(base)[chosen])]
+    )
+    y = np.concatenate([base[i].ravel() for i in chosen]) * weight
+    q, _ = np.linalg.qr(q * weight[:, None])
+    y = y - q @ (q.T @ y)
+    folds = np.arange(len(chosen)) % 4
+    out = []
+    for effect in effects:
+        for shape in effect.grid:
+            S = columns(comparison, current, effect, shape, base, chosen) * weight[:, None]
+            S = S - q @ (q.T @ S)
+            gain = []
+            for f in range(4):
+                train = np.concatenate(
+                    [np.arange(a, b) for a, b, g in zip(edges[:-1], edges[1:], folds) if g != f]
+                )
+                ridge = np.eye(S.shape[1]) * 0.2
+                w = np.linalg.solve(S[train].T @ S[train] + ridge, S[train].T @ y[train])
+                for a, b, g in zip(edges[:-1], edges[1:], folds):
+                    if g == f:
+                        gain.append(
+                            np.log(max((y[a:b] ** 2).mean(), 1e-9))
+                            - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).mean(), 1e-9))
+                        )
+            w = np.linalg.solve(S.T @ S + 0.2 * np.eye(S.shape[1]), S.T @ y)
+            start = {**effect.default(), **shape}
+            for (name, size), share in zip(_sizes(effect), w):
+                p = effect.params[name]
+                start[name] = float(
+                    np.clip(
+                        start[name] + np.clip(share, -3, 3) * size,
+                        p.low + 0.01 * p.scale,
+                        p.high - 0.01 * p.scale,
+                    )
+                )
+            out.append((float(np.mean(gain)), effect, start))
+    best = {}
+    for score, effect, start in sorted(out, key=lambda o: -o[0]):
+        best.setdefault(effect.id, (score, effect, start))
+    return sorted(best.values(), key=lambda o: -o[0])
+
+
+def isolability(comparison, current, usable, found, chosen):
+    """M[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats that i
+    makes at a realistic size."""
+    base = current.residuals(comparison)
+    q = nuisance_space(comparison, current, base, chosen)
+    ids, spaces, size = [], [], []
+    for effect in usable:
+        shape = effect.grid[len(effect.grid) // 2]
+        S = columns(comparison, current, effect, shape, base, chosen)
+        S = S - q @ (q.T @ S)
+        norms = np.linalg.norm(S, axis=0)
+        size.append(0.5 * float(norms.max() ** 2) / comparison.width / len(chosen))
+        ids.append(effect.id)
+        spaces.append(S)
+    n = len(ids)
+    M = np.ones((n, n))
+    for j in range(n):
+        basis, _ = np.linalg.qr(spaces[j] + 1e-12)
+        for i in range(n):
+            s = spaces[i][:, np.argmax(np.linalg.norm(spaces[i], axis=0))]
+            M[i, j] = np.linalg.norm(s - basis @ (basis.T @ s)) ** 2 / max(s @ s, 1e-30)
+    notes = [
+        f"your data cannot show {e.name}: {v:.1f} nats per trajectory at a realistic size"
+        for e, v in zip(usable, size)
+        if v * len(chosen) < 3
+    ]
+    return {"ids": ids, "matrix": M.tolist(), "nats": size, "notes": notes}
+
+
+def next_experiment(effects, isolability):
+    pairs = [(e, t) for e in effects for t in e["ties"]]
+    if not pairs:
+        pairs = [
+            (e, next((o for o in e["confusable"] if o in isolability["ids"]), None)) for e in effects[:1]
+        ]
+    out = []
+    for effect, other in pairs[:3]:
+        if other is None:
+            continue
+        text = effect["confusable"].get(other) or next(
+            (e.confusable.get(effect["id"]) for e in CATALOGUE if e.id == other), None
+        )
+        ids = isolability["ids"]
+        nats = ""
+        if effect["id"] in ids and other in ids:
+            share = isolability["matrix"][ids.index(effect["id"])][ids.index(other)]
+            left = share * isolability["nats"][ids.index(effect["id"])]
+            count = int(np.ceil(3 / max(left, 1e-3)))
+            nats = (
+                f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: "
+                f"{count} trajectories make 3 nats)"
+            )
+        out.append(f"{effect['name']} or {other}: {text or 'vary load, speed and hold together less'}{nats}")
+    return "; ".join(out) or "none needed: nothing was named, or nothing is tied"

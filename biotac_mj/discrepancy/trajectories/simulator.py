@@ -1,0 +1,421 @@
+"""The simulator as stages and effects: where objects are, skin, transduction, acquisition; saved as YAML.
+
+Poses go in, what the sensor would read comes out. The skin is solved for the poses as they are (`fields`),
+and once more for each small change of them: these differences make every effect of the set-up affordable, and
+what uses them says so (`exact=False`). `exact=True` solves the skin anew with the effects in place.
+"""
+
+import copy
+import dataclasses
+import hashlib
+import pathlib
+import typing
+
+import numpy as np
+import tqdm
+
+from ...effects.effect import STAGES, Run
+from ...files import replacing
+from .nuisance import KNOWN, OTHER_MESH, widen
+
+__all__ = ["SCHEMA", "Fields", "Simulator", "placed"]
+
+SCHEMA = "biotac_mj.sensor/1"
+_SHIFT = 40e-6  # [m] of the poses for differences
+_RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
+_AIR = 101325.0  # [Pa]
+_WORLDS = 64  # trajectories solved at once
+
+
+@dataclasses.dataclass
+class Simulator:
+    """A sensor that can be compared with data.
+
+    Attributes:
+      skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
+      effects: list of (Effect, theta) in any order; stages decide.
+      device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
+      modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
+      intervals: {effect id: {parameter: (low, high)}} for the YAML.
+    """
+
+    skin: str = "coarse"
+    tier: str = "condensed"
+    material: str = "default"
+    sensor: str = "1"
+    effects: list = dataclasses.field(default_factory=list)
+    modulus: float = 1.0
+    cache: str | None = None
+    device: str = "cpu"
+    intervals: dict = dataclasses.field(default_factory=dict)
+    constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
+
+    def with_effects(self, effects, modulus=None) -> "Simulator":
+        """A copy with these effects added."""
+        other = copy.copy(self)
+        other.effects = [*self.effects, *effects]
+        other.modulus = self.modulus if modulus is None else modulus
+        return other
+
+    # --- the skin  ---
+
+    def solve(
+        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+    ) -> list:
+        """Per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
+        19); kept in `cache`.
+
+        Args:
+          offset: list of (n, 3) [m], or None; log_radius: list of floats, or None.
+        """
+        out, todo = [None] * len(trajectories), []
+        for i, t in enumerate(trajectories):
+            tool, pos = placed(
+                t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
+            )
+            key = hashlib.sha256(
+                repr(
+                    (
+                        self.skin,
+                        self.tier,
+                        self.material,
+                        self.sensor,
+                        tool,
+                        round(log_friction, 9),
+                        round(bubble * 1e12, 6),
+                        "v2",
+                    )
+                ).encode()
+                + np.round(pos, 9).tobytes()
+                + np.round(t.mat, 9).tobytes()
+            ).hexdigest()[:24]
+            path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"
+            if path is not None and path.exists():
+                with np.load(path) as file:
+                    out[i] = {k: file[k] for k in ("force", "pressure", "log_z")}
+                if progress:
+                    progress()
+            else:
+                todo.append((i, tool, pos, t.mat, path))
+        for part in range(0, len(todo), _WORLDS):
+            self._walk(todo[part : part + _WORLDS], out, log_friction, bubble, progress)
+        return out
+
+    def _walk(self, todo, out, log_friction, bubble, progress):
+        """Solves trajectories (index, tool, pos, mat, path of the cache), each one world, and files what they
+        gave."""
+        from ...data.plan import Motion
+        from ...data.simulate import simulate, simulate_condensed
+
+        model, film = self._model(log_friction, bubble)  # kept: made once
+        walk = simulate_condensed if self.tier == "condensed" else simulate
+        longest = max(len(pos) for _, _, pos, _, _ in todo)
+        rows = [
+            np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _ in todo
+        ]  # who has arrived waits there
+        motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _) in zip(rows, todo)]
+        fields = walk(model, [tool for _, tool, _, _, _ in todo], motions)
+        for w, (i, _, pos, _, path) in enumerate(todo):
+            n = len(pos)
+            impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
+            out[i] = {
+                "force": fields.wrench[w, :n, :3].copy(),
+                "pressure": fields.pressure[w, :n].copy(),
+                "log_z": np.log(impedance),
+            }
+            if path is not None:
+                with replacing(path) as temporary:
+                    np.savez(temporary, **out[i])
+            if progress:
+                progress()
+
+    def _model(self, log_friction, bubble):
+        from ...geometry.skins import load_skin
+        from ...sensor.film import FilmConduction
+        from ...skin.rubber.material import material
+        from ...skin.model import SkinModel, SkinOptions
+
+        store = self.__dict__.setdefault("_models", {})
+        if bubble not in store:
+            geometry = load_skin(self.skin)
+            options = SkinOptions(liquid=True)
+            if bubble:
+                volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
+                # liquid and air in series: V / K + V0 / p0
+                options = dataclasses.replace(
+                    options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume))
+                )
+            store[bubble] = SkinModel(
+                geometry, material(self.material), options, "cpu" if self.tier == "condensed" else self.device
+            )
+            store.setdefault("film", FilmConduction(geometry, sensor=self.sensor))
+        model = store[bubble]
+        if log_friction:
+            model = copy.copy(model)
+            model.material = dataclasses.replace(
+                model.material, friction=model.material.friction * float(np.exp(log_friction))
+            )
+        return model, store["film"]
+
+    def fields(self, trajectories, progress=True) -> "Fields":
+        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in
+        `cache`."""
+        spheres = any("sphere" in t.tool for t in trajectories)
+        with tqdm.tqdm(
+            total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+        ) as bar:
+            tick = bar.update
+            base = self.solve(trajectories, progress=tick)
+            slopes = {}
+            if self.skin in OTHER_MESH:
+                here, there = (
+                    dataclasses.replace(self, skin=skin, tier="condensed").solve(trajectories)
+                    for skin in (self.skin, OTHER_MESH[self.skin])
+                )
+                slopes["mesh"] = [
+                    {k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)
+                ]
+                tick(len(trajectories))
+            for axis in range(3):
+                unit = np.zeros(3)
+                unit[axis] = _SHIFT
+                moved = self.solve(
+                    trajectories,
+                    offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
+                    progress=tick,
+                )
+                slopes["xyz"[axis]] = _difference(moved, base, _SHIFT)
+            if spheres:
+                slopes["radius"] = _difference(
+                    self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
+                    base,
+                    _RADIUS,
+                )
+            slopes["friction"] = _difference(
+                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, _FRICTION
+            )
+            slopes["bubble"] = _difference(
+                self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
+            )
+        return Fields(base, slopes, trajectories)
+
+    # --- all stages  ---
+
+    def run(
+        self, trajectories, fields=None, exact=True, effects=None, modulus=None, offsets=None, nuisance=KNOWN
+    ) -> list[Run]:
+        """What the sensor would read, without noise and rounding.
+
+        Args:
+          fields: Fields of the trajectories; None solves them.
+          exact: solve the skin anew where effects move the object; False uses the fields' differences; a list
+            of indices does so for those trajectories alone.
+          effects, modulus: None takes the simulator's; offsets: list of (3,) further shifts of the poses [m].
+          nuisance: what the base model is off by; its modulus is a factor on the simulator's.
+        """
+        effects = self.effects if effects is None else effects
+        modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
+        base = fields.base if fields is not None else self.solve(trajectories)
+        ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
+        before = [(e, th) for e, th in ordered if e.stage in "SB" or e.id == "friction"]
+        after = [(e, th) for e, th in ordered if (e, th) not in before]
+        session, runs = {}, []
+        first = trajectories[0].tdc
+        for i, t in enumerate(trajectories):
+            run = _begin(i, t, base[i], session, first)
+            run.scale_load(modulus)
+            run.stiffness = modulus * _stiffness(
+                base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t
+            )
+            run.log_friction = nuisance.log_friction
+            if offsets is not None:
+                run.offset = run.offset + offsets[i]
+            for effect, theta in before:
+                effect.apply(run, theta)
+            runs.append(run)
+        self._mechanics(trajectories, runs, base, fields, exact, modulus)
+        for i, run in enumerate(runs):
+            if nuisance.mesh and fields is not None and "mesh" in fields.slopes:
+                other = fields.slopes["mesh"][i]
+                run.force = run.force + nuisance.mesh * modulus * other["force"]
+                run.pressure = run.pressure + nuisance.mesh * modulus * other["pressure"]
+                run.log_z = run.log_z + nuisance.mesh * other["log_z"]
+            if nuisance.footprint:
+                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint)
+        for run in runs:
+            for stage in ("K", "C", "T"):
+                for effect, theta in after:
+                    if effect.stage == stage:
+                        effect.apply(run, theta)
+            run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
+            run.pdc = 2000 + run.pressure / 36.5
+            for effect, theta in after:
+                if effect.stage == "A":
+                    effect.apply(run, theta)
+        return runs
+
+    def _mechanics(self, trajectories, runs, base, fields, exact, modulus):
+        """Force, pressure and ln Z of runs whose object or contact has changed."""
+        changed = [
+            i
+            for i, r in enumerate(runs)
+            if np.abs(r.offset).max() > 1e-9 or r.log_radius or r.log_friction or r.bubble
+        ]
+        if exact is True:
+            anew = changed
+        elif exact is False:
+            anew = []
+        else:
+            anew = [i for i in changed if i in set(np.atleast_1d(exact).tolist())]
+        if anew:
+            kept = [runs[i] for i in anew]
+            solved = self.solve(
+                [trajectories[i] for i in anew],
+                [r.offset for r in kept],
+                [r.log_radius for r in kept],
+                kept[0].log_friction,
+                kept[0].bubble,
+            )
+            for run, one in zip(kept, solved):
+                run.force, run.pressure, run.log_z = (
+                    modulus * one["force"],
+                    modulus * one["pressure"],
+                    one["log_z"].copy(),
+                )
+        for i in sorted(set(changed) - set(anew)):
+            run = runs[i]
+            change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
+            parts = [
+                ("x", run.offset[:, 0]),
+                ("y", run.offset[:, 1]),
+                ("z", run.offset[:, 2]),
+                ("radius", run.log_radius),
+                ("friction", run.log_friction),
+                ("bubble", run.bubble),
+            ]
+            for name, amount in parts:
+                if name in fields.slopes and np.any(amount):
+                    for k in change:
+                        slope = fields.slopes[name][i][k]
+                        change[k] = change[k] + (
+                            slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount)
+                        )
+            run.force = modulus * (base[i]["force"] + change["force"])
+            run.pressure = modulus * (base[i]["pressure"] + change["pressure"])
+            run.log_z = base[i]["log_z"] + change["log_z"]
+
+    # --- YAML  ---
+
+    def save(self, path) -> None:
+        """Writes the stages and effects as YAML."""
+        import yaml
+
+        stages = {
+            "set-up": [],
+            "boundary": [],
+            "contact": [],
+            "constitutive": [],
+            "transduction": [],
+            "acquisition": [],
+        }
+        for effect, theta in self.effects:
+            parameters = {}
+            for name, value in theta.items():
+                low, high = self.intervals.get(effect.id, {}).get(name, (None, None))
+                entry = {"value": float(value), "unit": effect.params[name].unit}
+                if low is not None:
+                    entry["interval95"] = [float(low), float(high)]
+                parameters[name] = entry
+            stages[STAGES[effect.stage]].append(
+                {"effect": effect.id, "name": effect.name, "parameters": parameters}
+            )
+        document = {
+            "schema": SCHEMA,
+            "skin": self.skin,
+            "tier": self.tier,
+            "material": self.material,
+            "sensor": self.sensor,
+            "constitutive": self.constitutive,
+            "modulus_factor": float(self.modulus),
+            "stages": {k: v for k, v in stages.items() if v},
+        }
+        with replacing(path) as temporary:
+            temporary.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+@dataclasses.dataclass
+class Fields:
+    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
+    (radius, friction), per m3; "mesh": of another mesh, about rest."""
+
+    base: list
+    slopes: dict
+    trajectories: list
+
+
+def placed(t, shift=None, grow=0.0):
+    """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
+    by exp(grow), its tip kept."""
+    tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)
+    if grow and "sphere" in tool:
+        radius = _sphere_radius(tool)
+        tip = pos if not tool.startswith("geom:") else pos + radius * t.mat[:, :, 1]
+        radius *= np.exp(grow)
+        tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
+    return tool, pos
+
+
+def _begin(order, t, base, session, first_tdc):
+    from ...sensor.channels import temperature_from_counts
+
+    warm = None
+    if t.tdc is not None and first_tdc is not None:
+        warm = temperature_from_counts(t.tdc) - temperature_from_counts(first_tdc[0])
+    touch = int(np.argmax(t.depth))
+    return Run(
+        time=t.time,
+        clock=t.clock + t.time,
+        tool=t.tool,
+        heading=t.heading,
+        depth=t.depth,
+        place=t.pos[touch],
+        order=order,
+        offset=np.zeros((len(t.time), 3)),
+        force=base["force"].copy(),
+        pressure=base["pressure"].copy(),
+        log_z=base["log_z"].copy(),
+        temperature=warm,
+        session=session,
+        rest_log_z=base["log_z"][0].copy(),
+    )
+
+
+def _stiffness(base, slopes, t):
+    """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
+    if slopes is None:
+        return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
+    along = sum(h * s["force"] for h, s in zip(t.heading, slopes))
+    return np.maximum(-along @ t.heading, 0)
+
+
+def _impedance(film, vert_xpos):
+    """(n, 19) [ohm]; a row whose film has no solution keeps the last one."""
+    rows, last = [], None
+    for x in vert_xpos:
+        try:
+            last = film.impedance(x)
+        except ValueError:
+            if last is None:
+                raise
+        rows.append(last)
+    return np.array(rows)
+
+
+def _difference(moved, base, by):
+    return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+
+
+def _sphere_radius(tool):
+    if tool.startswith("geom:sphere:"):
+        return float(tool.split(":")[2])
+    return float(tool.removeprefix("sphere_").removesuffix("mm").replace("-", ".")) * 0.5e-3

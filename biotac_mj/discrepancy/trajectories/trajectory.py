@@ -1,0 +1,223 @@
+"""Measured trajectories: poses of an object in the BioTac frame and what the sensor read meanwhile."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from ..noise import noise_level
+
+__all__ = ["Trajectory", "measurement_noise", "read_trajectories", "write_trajectories"]
+
+FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
+
+
+@dataclasses.dataclass
+class Trajectory:
+    """One contact. n rows, row 0 before first touch.
+
+    Attributes:
+      id: unique. tool: as `biotac generate --objects` names it. clock: when it began in the session [s].
+      time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
+      electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None. force: (n, 3) of the
+        skin on the object [N] or
+      None.
+    """
+
+    id: str
+    tool: str
+    clock: float
+    time: np.ndarray
+    pos: np.ndarray
+    mat: np.ndarray
+    electrodes: np.ndarray
+    pdc: np.ndarray | None = None
+    tdc: np.ndarray | None = None
+    force: np.ndarray | None = None
+
+    def __post_init__(self):
+        n = len(self.time)
+        shapes = {
+            "pos": (n, 3),
+            "mat": (n, 3, 3),
+            "electrodes": (n, 19),
+            "pdc": (n,),
+            "tdc": (n,),
+            "force": (n, 3),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if np.shape(value) != shape:
+                raise ValueError(
+                    f"{name} of trajectory {self.id!r} has shape {np.shape(value)}: "
+                    f"{shape} is needed, one row per time"
+                )
+            if not np.isfinite(value).all():
+                raise ValueError(
+                    f"{name} of trajectory {self.id!r} has values that are not finite: "
+                    "cut the trajectory there, or leave it out"
+                )
+        if n < 8:
+            raise ValueError(
+                f"trajectory {self.id!r} has {n} rows: at least 8 are needed, from before the touch on"
+            )
+        step = np.diff(self.time)
+        if not (step > 0).all():
+            raise ValueError(
+                f"the time of trajectory {self.id!r} does not increase: sort its rows and drop repeated ones"
+            )
+        if step.max() > 100 * np.median(step):
+            raise ValueError(
+                f"the clock of trajectory {self.id!r} has a gap of {step.max():.3g} s where rows are "
+                f"{np.median(step):.3g} s apart: cut it in two "
+                "there; what happened meanwhile cannot be guessed"
+            )
+        if np.abs(self.pos).max() > 0.5:
+            raise ValueError(
+                f"pos of trajectory {self.id!r} reaches {np.abs(self.pos).max():.3g}: "
+                "metres are needed, these look like millimetres"
+            )
+        if self.electrodes.min() < 0 or self.electrodes.max() > 4095 or self.electrodes.max() <= 8:
+            raise ValueError(
+                f"electrodes of trajectory {self.id!r} lie in "
+                f"{self.electrodes.min():g}..{self.electrodes.max():g}: "
+                "raw counts 0..4095 are needed"
+            )
+        if self.force is not None and np.abs(self.force).max() > 500:
+            raise ValueError(
+                f"force of trajectory {self.id!r} reaches {np.abs(self.force).max():.3g}: "
+                "newtons are needed, these look like mN"
+            )
+
+    @property
+    def heading(self) -> np.ndarray:
+        """(3,) unit vector along which the object presses: its +y axis."""
+        return self.mat[0][:, 1]
+
+    @property
+    def depth(self) -> np.ndarray:
+        """(n,) travel along the heading from row 0 [m]."""
+        return (self.pos - self.pos[0]) @ self.heading
+
+
+def read_trajectories(path) -> list[Trajectory]:
+    """Labelled interactions of a data set (docs/data.md); `parameters` may hold "clock" [s] of the session.
+
+    Raises:
+      FileNotFoundError, ValueError: the text names cause and remedy.
+    """
+    from scipy.spatial.transform import Rotation
+
+    from ...data.store import TactileSet
+
+    path = pathlib.Path(path)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"no measured data at {path}: give an HDF5 file or folder of them as docs/data.md says"
+        )
+    out, clock = [], 0.0
+    with TactileSet(path) as data:
+        for i in range(len(data)):
+            if not data.labelled[i]:
+                continue
+            one = data.interaction(i)
+            counts, wrench = one.measured_counts, one.measured_wrench
+            if one.indenter_pos is None:
+                raise ValueError(
+                    f"interaction {one.id!r} of {path} has no poses of the object: "
+                    "without them nothing can be simulated"
+                )
+            mat = Rotation.from_quat(np.roll(one.indenter_quat, -1, axis=1)).as_matrix()
+            begin = float(one.parameters.get("clock", clock))
+            known = [None if np.isnan(counts[:, k]).any() else counts[:, k].astype(float) for k in (19, 21)]
+            force = None if wrench is None or np.isnan(wrench[:, :3]).any() else wrench[:, :3].astype(float)
+            out.append(
+                Trajectory(
+                    one.id,
+                    one.object,
+                    begin,
+                    one.time - one.time[0],
+                    one.indenter_pos,
+                    mat,
+                    counts[:, :19].astype(float),
+                    *known,
+                    force,
+                )
+            )
+            clock = begin + float(one.time[-1] - one.time[0]) + 1.0
+    if not out:
+        raise ValueError(
+            f"{path} has no measured counts: only labelled interactions can be compared with the simulation"
+        )
+    return out
+
+
+def write_trajectories(path, trajectories) -> None:
+    """Writes one HDF5 file that `biotac diagnose` and `read_trajectories` read; what was not measured is
+    stored as nan."""
+    from scipy.spatial.transform import Rotation
+
+    from ...data.schema import Interaction
+    from ...data.store import write_shard
+
+    rows = []
+    for t in trajectories:
+        n = len(t.time)
+        counts, wrench = np.full((n, 23), np.nan, np.float32), np.full((n, 6), np.nan, np.float32)
+        counts[:, :19] = t.electrodes
+        for column, values in ((19, t.pdc), (21, t.tdc)):
+            if values is not None:
+                counts[:, column] = values
+        if t.force is not None:
+            wrench[:, :3] = t.force
+        quat = np.roll(Rotation.from_matrix(t.mat).as_quat(), 1, axis=1)
+        rows.append(
+            Interaction(
+                t.id,
+                t.tool,
+                "recorded",
+                "train",
+                0,
+                {"clock": float(t.clock)},
+                t.time,
+                indenter_pos=t.pos,
+                indenter_quat=quat,
+                measured_counts=counts,
+                measured_wrench=wrench,
+            )
+        )
+    write_shard(pathlib.Path(path), rows)
+
+
+def measurement_noise(trajectories) -> dict:
+    """Standard deviations: electrodes (19,) [counts], pdc [counts], force (3,) [N].
+
+    From second differences of rows while the object rests, in air or held; where there are too few of them,
+    of all rows."""
+    out = {
+        "electrodes": _noise([t.electrodes for t in trajectories], trajectories, 2.0),
+        "pdc": None,
+        "force": None,
+    }
+    if any(t.pdc is not None for t in trajectories):
+        out["pdc"] = float(
+            _noise([None if t.pdc is None else t.pdc[:, None] for t in trajectories], trajectories, 1.0)[0]
+        )
+    if any(t.force is not None for t in trajectories):
+        out["force"] = _noise([t.force for t in trajectories], trajectories, 0.005)
+    return out
+
+
+def _noise(values, trajectories, least):
+    pairs = [(x, t) for x, t in zip(values, trajectories) if x is not None]
+    rest = []
+    for x, t in pairs:
+        still = np.abs(np.diff(t.pos, axis=0)).max(1) < 1e-6
+        even = np.abs(np.diff(t.time, n=2)) < 0.2 * np.minimum(np.diff(t.time)[1:], np.diff(t.time)[:-1])
+        rest.append(np.diff(x, n=2, axis=0)[still[1:] & still[:-1] & even])
+    rest = np.concatenate(rest)
+    if len(rest) >= 20:
+        return np.maximum(np.median(np.abs(rest), axis=0) / (0.6745 * np.sqrt(6)), least)
+    return np.maximum(np.median([noise_level(x, None, 1e-4) for x, _ in pairs], axis=0), least)

@@ -1,0 +1,277 @@
+"""The workflow: is there a disagreement, where, what is it, added, proved on trajectories that took no part,
+and what cannot be known."""
+
+import dataclasses
+
+import numpy as np
+import tqdm
+
+from ...effects.catalogue import CATALOGUE
+from .composition import compose
+from .fitting import Fit, fit_effects, mean_square
+from .nuisance import OTHER_MESH
+from .screening import isolability, next_experiment
+from .simulator import Simulator
+from .thresholds import THRESHOLDS, confidence, threshold_hash
+from .trajectory import FEWEST, measurement_noise
+from .where import depends_on, phases, where
+from .whitening import REPEATABILITY, Comparison
+
+__all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
+
+
+@dataclasses.dataclass
+class Report:
+    """What `diagnose` found.
+
+    Attributes:
+      verdict: one line. effects: list of dicts (id, name, stage, parameters, confidence, ties, p, nats).
+        ranking: list of (id, nats per
+      trajectory left out, p) of the first round. where: list of cells. before, after: dicts of mean square
+      and RMS per channel on the
+      locked trajectories. closed: share S on them. isolability: dict ids, matrix, nats. next_experiment:
+        text. notes: what cannot be known.
+      fit: Fit. comparison, selection, locked: what it was made of. trace: numbers that thresholds are set on,
+        as a file can hold them.
+    """
+
+    verdict: str
+    effects: list
+    ranking: list
+    where: list
+    before: dict
+    after: dict
+    closed: float
+    isolability: dict
+    next_experiment: str
+    notes: list
+    fit: Fit
+    comparison: Comparison
+    selection: np.ndarray
+    locked: np.ndarray
+    remainder: str = ""
+    trace: dict = dataclasses.field(default_factory=dict)
+
+    def apply(self, sim: Simulator) -> Simulator:
+        """The simulator with the effects found as further stages, and the modulus that was fitted with
+        them."""
+        new = sim.with_effects(self.fit.effects, sim.modulus * self.fit.nuisance.modulus)
+        for k, (effect, name) in enumerate(self.fit.names):
+            new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
+        return new
+
+
+def diagnose(
+    sim: Simulator,
+    data,
+    *,
+    effects=CATALOGUE,
+    repeatability=REPEATABILITY,
+    locked=0.25,
+    seed=0,
+    progress=True,
+    fields=None,
+) -> Report:
+    """Compares a simulator with measured trajectories and names what it misses.
+
+    Args:
+      sim: Simulator. data: list of Trajectory. effects: the catalogue to choose from.
+      repeatability: standard deviation of a pose from trial to trial [m]. locked: share of the trajectories
+        opened once, at the end.
+      seed: of the split. fields: what `sim.fields(data)` gave, to use again.
+
+    Raises:
+      ValueError: too few trajectories, or a share that leaves none.
+    """
+    n = len(data)
+    if n < FEWEST:
+        raise ValueError(
+            f"{n} trajectories are too few: the trajectory is the unit of evidence and some are kept aside; "
+            f"measure at least {FEWEST}, better 24"
+        )
+    if not 0 < locked < 0.6:
+        raise ValueError(f"locked is {locked}: keep a share between 0 and 0.6 of the trajectories aside")
+    order = np.random.default_rng(seed).permutation(n)
+    aside = np.sort(order[: max(2, round(locked * n))])
+    chosen = np.sort(order[len(aside) :])
+    fields = sim.fields(data, progress) if fields is None else fields
+    comparison = Comparison(sim, data, fields, measurement_noise(data), repeatability)
+    usable, notes = [], _notes(data, comparison)
+    for effect in effects:
+        why = effect.applicable([data[i] for i in chosen])
+        if why:
+            notes.append(f"{effect.name} cannot be known: {why}")
+        else:
+            usable.append(effect)
+    with tqdm.tqdm(total=2 + THRESHOLDS["most"], desc="diagnose", disable=not progress, leave=False) as bar:
+        null = fit_effects(comparison, [], chosen)
+        bar.update()
+        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar.update)
+        report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable)
+        bar.update()
+    return report
+
+
+def _levels(comparison, residuals, chosen) -> dict:
+    """level: mean square of a trajectory, peak: of the worst channel, both geometric means over
+    trajectories."""
+    square = np.array([(residuals[i] ** 2).mean(0) for i in chosen])
+    return {
+        "level": float(np.exp(np.log(np.maximum(square.mean(1), 0.05)).mean())),
+        "peak": float(np.exp(np.log(np.maximum(square, 0.05)).mean(0).max())),
+    }
+
+
+def _wrong(levels) -> bool:
+    return levels["level"] > THRESHOLDS["significant"] or levels["peak"] > THRESHOLDS["peak"]
+
+
+def _excess(residuals, rows) -> float:
+    """Mean log mean square above that of noise."""
+    return float(np.mean(np.log(np.maximum(mean_square(residuals)[rows], 1.0))))
+
+
+def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable):
+    residual, base = current.residuals(comparison), null.residuals(comparison)
+    before, after = _levels(comparison, base, chosen), _levels(comparison, residual, chosen)
+    inside = 1 - _excess(residual, chosen) / max(_excess(base, chosen), 1e-9)
+    left = _excess(residual, chosen)
+    effects = [
+        _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)))
+        for item in found
+    ]
+    named = inside >= THRESHOLDS["named"] or not _wrong(after)
+    remainder = ""
+    if not found and not _wrong(before):
+        verdict, remainder = (
+            "no significant disagreement",
+            "noise, the model's resolution and the set-up's repeatability explain the data",
+        )
+    else:
+        parts = [
+            e["name"]
+            + (f" (behaves like {', '.join(e['ties'])} too: not distinguished)" if e["ties"] else "")
+            for e in effects
+        ]
+        if effects and named:
+            verdict = ("named: " if len(parts) == 1 else "several: ") + "; ".join(parts)
+        else:
+            remainder = depends_on(comparison, current, chosen)
+            verdict = (
+                f"partly: {'; '.join(parts)}; remainder unknown ({remainder})"
+                if effects
+                else f"unknown ({remainder})"
+            )
+    # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
+    gap_before, gap_after = _gap(comparison, null, aside), _gap(comparison, current, aside)
+    outside = [np.log(np.maximum(g["mean_square"], 1.0)).mean() for g in (gap_before, gap_after)]
+    closed = float(1 - outside[1] / max(outside[0], 1e-9)) if found or _wrong(before) else float("nan")
+    notes = notes + _base(comparison, current.nuisance)
+    table = isolability(comparison, current, usable, effects, chosen)
+    trace = {
+        "before": before,
+        "after": after,
+        "inside": inside,
+        "left": left,
+        "rounds": [[c.record() for c in step] for step in rounds],
+        "mean_square": [mean_square(r)[chosen].tolist() for r in (base, residual)],
+        "closed": closed,
+        "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
+    }
+    return Report(
+        verdict,
+        effects,
+        [(c.effect.id, c.nats, c.p) for c in rounds[0]],
+        where(comparison, null, chosen),
+        gap_before,
+        gap_after,
+        closed,
+        table,
+        next_experiment(effects, table),
+        notes + table.pop("notes"),
+        current,
+        comparison,
+        chosen,
+        aside,
+        remainder,
+        trace,
+    )
+
+
+def _describe(item, current, certain) -> dict:
+    theta = next(th for e, th in current.effects if e.id == item.effect.id)
+    parameters = []
+    for name, value in theta.items():
+        p = item.effect.params[name]
+        low, high = current.interval(current.names.index((item.effect.id, name)))
+        parameters.append(
+            {
+                "name": name,
+                "value": value,
+                "unit": p.unit,
+                "interval95": [low, high],
+                "bounds": [p.low, p.high],
+                "source": p.source,
+            }
+        )
+    return {
+        "id": item.effect.id,
+        "name": item.effect.name,
+        "stage": item.effect.stage,
+        "physics": item.effect.physics,
+        "parameters": parameters,
+        "ties": item.ties,
+        "p": item.p,
+        "q": item.q,
+        "nats": item.nats,
+        "share": item.share,
+        "confidence": certain,
+        "confusable": item.effect.confusable,
+    }
+
+
+def _gap(comparison, fit, rows):
+    residual = fit.raw(comparison, exact=rows)
+    out = {"mean_square": [float((comparison.whiten(i, residual[i]) ** 2).mean()) for i in rows]}
+    for name, part in comparison.groups.items():
+        out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
+    out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
+    return out
+
+
+def _base(comparison, nuisance) -> list:
+    """What the fitted nuisance says of the base model; it takes no effect's name."""
+    notes = []
+    if abs(nuisance.footprint) > 0.02:
+        notes.append(
+            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
+            "calibrate before looking for small effects"
+        )
+    if nuisance.mesh > 0.5:
+        notes.append(
+            f"the data lie nearer to the mesh {OTHER_MESH[comparison.sim.skin]!r} than to "
+            f"{comparison.sim.skin!r}: use that one"
+        )
+    return notes
+
+
+def _notes(data, comparison):
+    notes = []
+    if len(data) < 12:
+        notes.append(
+            f"{len(data)} trajectories: "
+            f"p-values cannot fall below {2.0 ** -len(data):.3g}, small effects stay unseen"
+        )
+    unloading = any(phases(t)["unload"].any() for t in data)
+    if not unloading:
+        notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")
+    if not any(phases(t)["free"].sum() > 1 for t in data):
+        notes.append(
+            "no free segment: drift and warm-up cannot be told from load; "
+            "begin each trajectory before the touch"
+        )
+    if not any(phases(t)["hold"].sum() > 3 for t in data):
+        notes.append("no holds: relaxation cannot be told from hysteresis")
+    if not comparison.has_force:
+        notes.append("no force: the rubber's modulus shows in the liquid's pressure alone")
+    return notes

@@ -1,0 +1,80 @@
+"""The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up."""
+
+from .effect import Effect
+from .sensing import (
+    Asperities,
+    CrossTalk,
+    Drift,
+    FluidLoss,
+    ForceZero,
+    Gain,
+    Latency,
+    LowPass,
+    PressureGain,
+    Saturation,
+    Thermal,
+    WarmUp,
+)
+from .skin_and_setup import (
+    Adhesion,
+    Bubble,
+    DepthZero,
+    Friction,
+    FrictionLoad,
+    Hysteresis,
+    Inhomogeneity,
+    Misalignment,
+    Mount,
+    Mullins,
+    PowerCreep,
+    Radius,
+    Relaxation,
+    Rocking,
+    Stiffening,
+)
+
+__all__ = ["CATALOGUE", "by_id"]
+
+CATALOGUE = (
+    Relaxation(),
+    PowerCreep(),
+    Hysteresis(),
+    Mullins(),
+    Stiffening(),
+    Inhomogeneity(),
+    Bubble(),
+    FluidLoss(),
+    Friction(),
+    FrictionLoad(),
+    Adhesion(),
+    Radius(),
+    Misalignment(),
+    DepthZero(),
+    Mount(),
+    Rocking(),
+    Thermal(),
+    WarmUp(),
+    Asperities(),
+    Gain(),
+    CrossTalk(),
+    Saturation(),
+    LowPass(),
+    Latency(),
+    Drift(),
+    PressureGain(),
+    ForceZero(),
+)
+
+
+def by_id(name: str, extra: tuple | list = ()) -> Effect:
+    """The effect of that id.
+
+    Raises:
+      ValueError: unknown; the text lists the ids.
+    """
+    for effect in (*extra, *CATALOGUE):
+        if effect.id == name:
+            return effect
+    raise ValueError(
+        f"unknown effect {name!r}: choose from {', '.join(e.id for e in CATALOGUE)}, or pass your own Effect"
+    )

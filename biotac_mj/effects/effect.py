@@ -1,0 +1,153 @@
+"""An effect that a simulator can have or miss: one class, one stage, parameters with units, bounds and
+source.
+
+Your own in ten lines:
+
+    class HalfBoard(Effect):
+        id, name, stage = "half_board", "one half of the multiplexer creeps", "A"
+        physics = "the reference of every other electrode creeps while the session lasts"
+        params = {"rate": Param("counts/s", -5, 5, "my own board", scale=0.1)}
+        confusable = {"warmup": "one half of the electrodes or all"}
+
+        def apply(self, run, theta):
+            run.counts[:, ::2] += theta["rate"] * run.clock[:, None]
+
+    diagnose(sim, data, effects=[*CATALOGUE, HalfBoard()])
+"""
+
+import abc
+import dataclasses
+
+import numpy as np
+
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory"]
+
+# In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
+STAGES = {
+    "S": "set-up",
+    "B": "boundary",
+    "K": "contact",
+    "C": "constitutive",
+    "T": "transduction",
+    "A": "acquisition",
+}
+
+# reduced laws: what practice data with other forms of the same effects showed
+# (benchmarks/discrepancy_calibrate.py)
+LAW = 0.08
+
+
+@dataclasses.dataclass(frozen=True)
+class Param:
+    """unit; bounds; source of the bounds; scale: a realistic size, with which signatures are taken and the
+    prior is made."""
+
+    unit: str
+    low: float
+    high: float
+    source: str
+    scale: float
+    start: float = 0.0
+    shape: bool = False  # True: does nothing by itself (a time constant, a knee); several values are tried
+
+
+@dataclasses.dataclass
+class Run:
+    """One trajectory on its way through the stages. n rows; effects change it in place.
+
+    Attributes:
+      time (n,) within the trajectory, clock (n,) of the session [s]; tool; heading (3,); depth (n,) [m];
+      order: number in the session.
+      offset (n, 3): of the object beyond where it was meant to be [m]; log_radius, log_friction: of the tool
+        and the contact.
+      bubble: volume of trapped air [m3].
+      force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is
+      solved those without effects. counts (n, 19), pdc (n,): after the converter, before rounding.
+      temperature: (n,) above the first row of the session [C], or None.
+      stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
+      session: dict that the effects of one simulation share from trajectory to trajectory.
+    """
+
+    time: np.ndarray
+    clock: np.ndarray
+    tool: str
+    heading: np.ndarray
+    depth: np.ndarray
+    place: np.ndarray
+    order: int
+    offset: np.ndarray
+    force: np.ndarray
+    pressure: np.ndarray
+    log_z: np.ndarray
+    temperature: np.ndarray | None
+    session: dict
+    log_radius: float = 0.0
+    log_friction: float = 0.0
+    bubble: float = 0.0
+    rest_log_z: np.ndarray | None = None
+    counts: np.ndarray | None = None
+    pdc: np.ndarray | None = None
+    stiffness: np.ndarray | None = None
+
+    @property
+    def normal_force(self) -> np.ndarray:
+        """(n,) against the heading, positive while pressed [N]."""
+        return np.maximum(-self.force @ self.heading, 0)
+
+    def give(self, compliance: float) -> np.ndarray:
+        """(n,) x = compliance F(depth - x): how far something in series gives way [m]."""
+        stiffness = 0.0 if self.stiffness is None else self.stiffness
+        return compliance * self.normal_force / (1 + max(compliance, 0) * stiffness)
+
+    def scale_load(self, factor: float | np.ndarray) -> None:
+        """Multiplies what the rubber bears: force and the liquid's pressure (n,)."""
+        factor = np.broadcast_to(factor, self.time.shape)
+        self.force = self.force * factor[:, None]
+        self.pressure = self.pressure * factor
+
+
+class Effect(abc.ABC):
+    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values
+    of shape parameters) and `apply`.
+
+    apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no
+    effect) at `Param.start`."""
+
+    id = name = stage = physics = ""
+    params: dict = {}
+    confusable: dict = {}
+    # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
+    # interval
+    law = 0.0
+    grid: tuple = ({},)
+
+    @abc.abstractmethod
+    def apply(self, run: Run, theta: dict) -> None:
+        """Changes `run` where the effect acts."""
+
+    def applicable(self, trajectories: list) -> str | None:
+        """Why the data cannot show the effect, or None."""
+        return None
+
+    def doubt(self, theta: dict) -> str | None:
+        """Why fitted parameters are not what the effect could be, or None."""
+        return None
+
+    @property
+    def free(self) -> list[str]:
+        """Names of the parameters that are fitted; shape parameters come from `grid`, then are polished."""
+        return [n for n, p in self.params.items() if not p.shape]
+
+    def default(self) -> dict:
+        """Parameters without effect, shape parameters from the first entry of the grid."""
+        return {**{n: p.start for n, p in self.params.items()}, **self.grid[0]}
+
+
+def memory(run: Run, x: np.ndarray, tau: float) -> np.ndarray:
+    """(n, ...) x less its exponential memory: what has changed within about tau."""
+    out = np.zeros_like(x)
+    for i in range(1, len(x)):
+        a = np.exp(-(run.time[i] - run.time[i - 1]) / tau)
+        h = (1 - a) * tau / max(run.time[i] - run.time[i - 1], 1e-12)  # exact for x linear in between
+        out[i] = a * out[i - 1] + h * (x[i] - x[i - 1])
+    return out

@@ -1,0 +1,45 @@
+"""Loss of liquid and rough walls where they act: less liquid under the skin, another law of the film's
+conductance."""
+
+import numpy as np
+
+from ..sensor.film import FilmConduction
+from ..skin import SkinData, SkinModel
+
+__all__ = ["RoughFilm", "drain", "left"]
+
+_MOST = 0.8  # of the liquid may be lost, as in `sensing.FluidLoss`
+_SHARE = 0.02  # of the liquid lost in one step of the skin
+_LONG = 1e6  # [s] rubber relaxes while the liquid goes
+
+
+class RoughFilm(FilmConduction):
+    """A film whose conductance goes as a power of its thickness: sigma h0 (h / h0)^power, h0 at rest, so that
+    impedances at rest stay.
+
+    Args:
+      film: FilmConduction; power: 1 is a smooth film.
+    """
+
+    def __init__(self, film: FilmConduction, power: float):
+        self.__dict__.update(film.__dict__)
+        self._power, self._rest = power, film.film(film.geometry.vert)[1]
+
+    def film(self, vert_xpos: np.ndarray) -> tuple:
+        middle, thickness = super().film(vert_xpos)
+        return middle, self._rest * (thickness / self._rest) ** self._power
+
+
+def left(rate: float, clock: float) -> float:
+    """Share of the liquid that is left at the session's clock [s] where `rate` is lost in an hour."""
+    return 1 - min(rate * clock / 3600, _MOST)
+
+
+def drain(model: SkinModel, data: SkinData, share: float) -> None:
+    """Brings an untouched skin to rest on a share of its liquid."""
+    from ..skin import GeomSet, step
+
+    nothing = GeomSet([], [])
+    for part in np.linspace(1, share, int(np.ceil((1 - share) / _SHARE)) + 1)[1:]:
+        data.set_liquid(fill_volume=(part - 1) * model.liquid_volume)
+        step(model, data, nothing, _LONG)

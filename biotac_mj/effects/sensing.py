@@ -1,0 +1,209 @@
+"""Effects of the transduction and the acquisition: what electrodes, pressure and force channels read of a
+given skin."""
+
+import numpy as np
+
+from ..geometry.electrodes import electrode_positions
+from .effect import LAW, Effect, Param, Run, memory
+
+__all__ = [
+    "FluidLoss",
+    "Thermal",
+    "WarmUp",
+    "Asperities",
+    "Gain",
+    "CrossTalk",
+    "Saturation",
+    "LowPass",
+    "Latency",
+    "Drift",
+    "PressureGain",
+    "ForceZero",
+]
+
+
+class FluidLoss(Effect):
+    id, name, stage = "fluidloss", "liquid lost over the session", "T"
+    physics = "the film gets thinner with the session's clock: every impedance rises in proportion"
+    params = {
+        "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)
+    }
+    law = LAW
+    confusable = {
+        "warmup": "log TDC; wait an hour",
+        "gain": "the same probe at the beginning and the end of the session",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.log_z = run.log_z - np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))[:, None]
+
+
+class Thermal(Effect):
+    id, name, stage = "thermal", "temperature dependence of conductivity", "T"
+    physics = "ln Z = ... - alpha (T - T0), T from TDC"
+    params = {
+        "alpha": Param(
+            "1/K", -0.05, 0.15, "0.014-0.028 of salt solutions; 0.064-0.078 over five sensors", 0.02
+        )
+    }
+    confusable = {"warmup": "heater on and off"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        tdc = [t.tdc for t in trajectories if t.tdc is not None]
+        return None if tdc and np.ptp(np.concatenate(tdc)) > 8 else "no TDC, or it does not change"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if run.temperature is not None:
+            run.log_z = run.log_z - theta["alpha"] * run.temperature[:, None]
+
+
+class WarmUp(Effect):
+    id, name, stage = "warmup", "shared impedance gain (warm-up)", "T"
+    physics = "every impedance times exp(a (1 - exp(-t / tau))), t the session's clock"
+    params = {
+        "a": Param("ln Z", -1.0, 1.0, "-0.23 over 190 s measured; 10-17 % of full scale (Mongeon 2015)", 0.1),
+        "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
+    }
+    grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
+    law = LAW
+    confusable = {
+        "thermal": "log TDC",
+        "fluidloss": "wait an hour",
+        "drift": "free segments: one electrode or all",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
+
+
+class Asperities(Effect):
+    id, name, stage = "asper", "sensitivity of impedance to the film", "T"
+    physics = "conductance ~ gap^p: the change of ln Z from rest is multiplied by p"
+    params = {
+        "log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)
+    }
+    confusable = {"gain": "one electrode or all", "saturate": "depth ladder"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.log_z = run.rest_log_z + np.exp(theta["log_p"]) * (run.log_z - run.rest_log_z)
+
+
+class Gain(Effect):
+    id, name, stage = "gain", "gain of single electrodes", "A"
+    physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
+    params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
+    confusable = {
+        "asper": "one electrode or all",
+        "crosstalk": "drive one electrode alone",
+        "saturate": "depth ladder",
+    }
+
+    def doubt(self, theta: dict) -> str | None:
+        g = np.array(list(theta.values()))
+        return (
+            "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
+        )  # scatter of manufacturing has no mean
+
+    def apply(self, run: Run, theta: dict) -> None:
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))
+
+
+class CrossTalk(Effect):
+    id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
+    physics = "V = (I + kappa K) U with K falling off with distance"
+    params = {
+        "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
+        "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
+    }
+    grid = ({"length": 2.0}, {"length": 4.0})
+    law = LAW
+    confusable = {
+        "gain": "drive one electrode alone",
+        "rocking": "another place",
+        "base": "a footprint or mesh that is a little off looks alike",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        p = electrode_positions()
+        K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        run.counts = run.counts + theta["kappa"] * (run.counts - rest) @ K.T
+
+
+class Saturation(Effect):
+    id, name, stage = "saturate", "saturation of the change", "A"
+    physics = "changes from rest bend beyond a knee: soft clip"
+    params = {
+        "strength": Param("1", 0.0, 1.0, "none to hard", 0.3),
+        "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True),
+    }
+    grid = ({"knee": 120.0}, {"knee": 400.0}, {"knee": 900.0})
+    law = LAW
+    confusable = {"gain": "depth ladder at one place"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        change = run.counts - rest
+        over = np.sign(change) * np.maximum(np.abs(change) - theta["knee"], 0)
+        run.counts = run.counts - theta["strength"] * over
+
+
+class LowPass(Effect):
+    id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
+    physics = "tau dV/dt + V = U"
+    params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
+    law = LAW
+    confusable = {"latency": "two speeds a decade apart and a tap"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if theta["tau"] > 0:
+            run.counts = run.counts - memory(run, run.counts, theta["tau"])
+
+
+class Latency(Effect):
+    id, name, stage = "latency", "latency of the electrodes", "A"
+    physics = "V(t - d)"
+    params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
+    confusable = {"lowpass": "two speeds a decade apart and a tap"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        at = run.time - theta["delay"]
+        run.counts = np.stack([np.interp(at, run.time, c) for c in run.counts.T], axis=1)
+
+
+class Drift(Effect):
+    id, name, stage = "drift", "drift of offsets within a trajectory", "A"
+    physics = "counts + v t from the trajectory's beginning, the same for all electrodes"
+    params = {"rate": Param("counts/s", -60, 60, "0-20 counts in 10 s", 2.0)}
+    law = LAW
+    confusable = {"warmup": "free segments over the session", "relax": "free segments"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.counts = run.counts + theta["rate"] * (run.time - run.time[0])[:, None]
+
+
+class PressureGain(Effect):
+    id, name, stage = "pdc_gain", "gain of the pressure channel", "A"
+    physics = "PDC's change from rest is multiplied by a factor"
+    params = {"gain": Param("1", -0.7, 2.0, "transducer 10 %", 0.15)}
+    confusable = {"bubble": "electrodes far from the contact", "relax": "holds"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        return None if any(t.pdc is not None for t in trajectories) else "no PDC"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.pdc = 2000 + (run.pdc - 2000) * (1 + theta["gain"])
+
+
+class ForceZero(Effect):
+    id, name, stage = "force_cross", "cross-axis sensitivity of the force sensor", "A"
+    physics = "part of the normal force shows in the tangential components"
+    params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
+    confusable = {"misalign": "turn the force sensor by 180 degrees", "friction": "press without slides"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        return None if any(t.force is not None for t in trajectories) else "no force"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.force = run.force + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))

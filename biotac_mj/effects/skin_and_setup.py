@@ -1,0 +1,259 @@
+"""Effects of the skin, its contact and the set-up.
+
+Bounds and sources are those of the literature named; "generic" marks silicone in general. C effects act on
+what the rubber bears: with a displacement-controlled object and an elastic field that keeps its form, a
+separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
+exact for linear materials while the contact grows)."""
+
+import numpy as np
+from scipy.special import erf
+
+from .effect import LAW, Effect, Param, Run, memory
+
+__all__ = [
+    "Relaxation",
+    "PowerCreep",
+    "Hysteresis",
+    "Mullins",
+    "Stiffening",
+    "Inhomogeneity",
+    "Bubble",
+    "Friction",
+    "FrictionLoad",
+    "Adhesion",
+    "Radius",
+    "Misalignment",
+    "DepthZero",
+    "Mount",
+    "Rocking",
+]
+
+
+class Relaxation(Effect):
+    id, name, stage = "relax", "stress relaxation (Prony)", "C"
+    physics = "G(t) = G (1 + g exp(-t / tau)): stress follows strain at once and relaxes"
+    params = {
+        "g": Param("1", 0.0, 0.8, "0.02-0.3 (Kunzemann 2024; Liao 2020)", 0.1),
+        "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
+    }
+    grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
+    law = LAW
+    confusable = {
+        "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
+        "creep": "a hold of 100 s",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
+        run.pressure = run.pressure + theta["g"] * memory(run, run.pressure, theta["tau"])
+
+
+class PowerCreep(Effect):
+    id, name, stage = "creep", "power-law relaxation (springpot)", "C"
+    physics = "G(t) ~ (t + t0)^-n: no plateau"
+    params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04)}
+    law = LAW
+    confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
+        # slope n ln 3).
+        for tau in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0):
+            weight = theta["n"] * np.log(10**0.5)
+            run.force = run.force + weight * memory(run, run.force, tau)
+            run.pressure = run.pressure + weight * memory(run, run.pressure, tau)
+
+
+class Hysteresis(Effect):
+    id, name, stage = "hyster", "rate-independent hysteresis", "C"
+    physics = (
+        "Prandtl-Ishlinskii elements in depth: "
+        "loading and unloading differ at equal depth, whatever the speed"
+    )
+    params = {
+        "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
+        "width": Param(
+            "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
+        ),
+    }
+    grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
+    law = LAW
+    confusable = {
+        "relax": "the same depth at ten times the speed",
+        "mullins": "a third cycle to the same depth",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        z, width = np.zeros(len(run.depth)), theta["width"]
+        for i in range(1, len(z)):
+            z[i] = np.clip(z[i - 1] + run.depth[i] - run.depth[i - 1], -width, width)
+        run.scale_load(1 + theta["fraction"] * z / width)
+
+
+class Mullins(Effect):
+    id, name, stage = "mullins", "Mullins softening", "C"
+    physics = (
+        "Ogden-Roxburgh, the work taken as depth^2: "
+        "load times 1 - s erf((1 - W / Wmax) / width) below the deepest press before"
+    )
+    params = {
+        "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
+        "width": Param("1", 0.1, 3, "m + b Wmax over Wmax", 1.0, 1.0, True),
+        "reach": Param("m", 1e-3, 10e-3, "radius of a contact", 3e-3, 3e-3, True),
+    }
+    grid = tuple({"width": w, "reach": r} for w in (0.3, 1.0) for r in (1.5e-3, 4e-3))
+    law = LAW
+    confusable = {"hyster": "a third cycle to the same depth", "adhesion": "talc on the skin"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        seen = run.session.setdefault("mullins", [])
+        before = max(
+            (d * np.exp(-((np.linalg.norm(p - run.place) / theta["reach"]) ** 2)) for p, d in seen),
+            default=0.0,
+        )
+        depth = np.maximum(run.depth, 0)
+        largest = np.maximum(before, np.maximum.accumulate(depth))
+        ratio = np.where(largest > 1e-6, depth / np.maximum(largest, 1e-6), 1.0)
+        run.scale_load(1 - theta["softening"] * erf(np.clip(1 - ratio**2, 0, 1) / theta["width"]))
+        seen.append((run.place, float(depth.max())))
+
+
+class Stiffening(Effect):
+    id, name, stage = "stiffen", "hyperelastic stiffening", "C"
+    physics = "the rubber's modulus rises with strain: Yeoh's second term in the mean strain depth / 1.5 mm"
+    params = {"c2": Param("1", -0.5, 1.5, "c2/c1 0-1", 0.15)}
+    law = LAW
+    confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.scale_load(1 + theta["c2"] * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
+
+
+class Inhomogeneity(Effect):
+    id, name, stage = "inhomog", "modulus varies with place", "C"
+    physics = "stiffer towards the tip or the clamp, one side or the other"
+    params = {
+        "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
+        "across": Param("1/cm", -1, 1, "the same", 0.15),
+    }
+    confusable = {
+        "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
+        "sensor"
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
+        run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
+
+
+class Bubble(Effect):
+    id, name, stage = "bubble", "air bubble in the liquid", "B"
+    physics = "p (V0 + dV) = const: the liquid gives way, the pressure and the far electrodes answer less"
+    params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
+    confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.bubble = run.bubble + theta["volume"]
+
+
+class Friction(Effect):
+    id, name, stage = "friction", "friction level", "K"
+    physics = "Coulomb's coefficient times a factor"
+    params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
+    confusable = {"fric_load": "slides at three normal loads with two radii"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
+        return None if slide > 0.3e-3 else "no slides"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.log_friction = run.log_friction + theta["log_mu"]
+
+
+class FrictionLoad(Effect):
+    id, name, stage = "fric_load", "friction that saturates with load", "K"
+    physics = (
+        "tangential force tau0 A rather than mu F: "
+        "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
+    )
+    params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
+    confusable = {"friction": "slides at three normal loads"}
+    applicable = Friction.applicable
+
+    def apply(self, run: Run, theta: dict) -> None:
+        normal = -np.outer(run.force @ run.heading, run.heading)
+        tangential = run.force + normal
+        run.force = (
+            run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
+        )
+
+
+class Adhesion(Effect):
+    id, name, stage = "adhesion", "adhesion (JKR)", "K"
+    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
+    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
+    law = LAW
+    confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        radius, modulus = 3.5e-3, 1e6
+        a = np.sqrt(radius * np.maximum(run.depth, 0))
+        out = np.gradient(run.depth, run.time) < -1e-9
+        W = theta["W"] * np.where(out, 3.0, 1.0)
+        run.force = run.force + np.outer(
+            np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
+        )
+
+
+class Radius(Effect):
+    id, name, stage = "radius", "radius of the tool", "S"
+    physics = "the sphere is larger or smaller than it says"
+    params = {"log_radius": Param("1", -0.4, 0.4, "+-25 %", 0.1)}
+    confusable = {"mount": "light load", "stiffen": "another tool"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if "sphere" in run.tool:
+            run.log_radius = run.log_radius + theta["log_radius"]
+
+
+class Misalignment(Effect):
+    id, name, stage = "misalign", "constant misalignment of the sensor", "S"
+    physics = "all poses are shifted across the press by the same vector"
+    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")}
+    confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset + np.array([theta["x"], 0, theta["z"]])
+
+
+class DepthZero(Effect):
+    id, name, stage = "depth0", "zero of the depth", "S"
+    physics = "the object touches earlier or later than its pose says, everywhere alike"
+    params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
+    confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset + theta["dz"] * run.heading
+
+
+class Mount(Effect):
+    id, name, stage = "mount", "compliance of mount or robot", "B"
+    physics = "the object gives way in proportion to the force: d - F / k"
+    params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
+    confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
+
+
+class Rocking(Effect):
+    id, name, stage = "rocking", "rocking of the fingertip", "B"
+    physics = "the sensor moves sideways in proportion to the force, always in one direction"
+    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in ("x", "z")}
+    confusable = {"misalign": "light load", "mount": "camera on the clamp"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))

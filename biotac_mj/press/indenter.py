@@ -1,0 +1,187 @@
+"""The shapes that press: the paper's eight by name, any MuJoCo geom, any closed mesh.
+
+An indenter's frame has its tip in front and +y along the way it goes, as the paper's files have it.
+"""
+
+import dataclasses
+import pathlib
+
+import mujoco
+import numpy as np
+import trimesh
+
+from ..geometry.indenters import INDENTERS, indenter
+
+__all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
+
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0}
+_UPRIGHT = np.array([1.0, 0, 0, 0])
+_Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns a geom so that its z axis goes ahead
+
+
+@dataclasses.dataclass(frozen=True)
+class Indenter:
+    """One rigid shape.
+
+    Attributes:
+      name: how it was asked for.
+      type: MuJoCo's geom type by name.
+      size: MuJoCo's sizes [m]; empty for a mesh.
+      rounding: fillet radius of the edges of a box or cylinder [m].
+      pos, quat: pose of the geom in the indenter's frame, (3,) [m] and (4,).
+      vert, face: (n, 3) [m], (m, 3), its surface in the indenter's frame: of a mesh exactly, else for
+        pictures and rays.
+    """
+
+    name: str
+    type: str
+    size: tuple
+    rounding: float
+    pos: np.ndarray
+    quat: np.ndarray
+    vert: np.ndarray
+    face: np.ndarray
+
+
+def _surface(kind, size):
+    """Triangles of a MuJoCo geom in its own frame."""
+    if kind in ("sphere", "ellipsoid"):
+        mesh = trimesh.creation.icosphere(subdivisions=3)
+        mesh.apply_scale(size)
+    elif kind == "capsule":
+        mesh = trimesh.creation.capsule(radius=size[0], height=2 * size[1], count=[48, 48])
+        mesh.apply_translation(-mesh.bounds.mean(0))
+    elif kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=96)
+    elif kind == "box":
+        mesh = trimesh.creation.box(extents=2 * np.array(size))
+    else:
+        mesh = trimesh.creation.box(extents=[2 * size[0], 2 * size[1], 1e-4])
+        mesh.apply_translation([0, 0, -5e-5])  # the plane itself is its front
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _from_geom(text):
+    kind, _, sizes = text.partition(":")
+    if kind not in _SIZES:
+        raise ValueError(
+            f"unknown geom type {kind!r} in 'geom:{text}': "
+            f"use geom:TYPE:SIZE[,SIZE...] with TYPE one of {', '.join(_SIZES)}"
+        )
+    try:
+        size = tuple(float(s) for s in sizes.split(",") if s)
+    except ValueError:
+        raise ValueError(
+            f"sizes {sizes!r} of 'geom:{text}' are not numbers: "
+            "give half-sizes in metres, as in geom:capsule:0.003,0.005"
+        ) from None
+    if kind == "plane":
+        size = size or (0.02, 0.02, 0.001)
+        needed = 3
+    else:
+        needed = _SIZES[kind]
+    if len(size) != needed or not all(np.isfinite(s) and s > 0 for s in size):
+        raise ValueError(
+            f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: "
+            "as in geom:capsule:0.003,0.005"
+        )
+    vert, face = _surface(kind, size)
+    return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), _Z_TO_Y, vert @ _matrix(_Z_TO_Y).T, face)
+
+
+def _from_file(path):
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no indenter mesh at {path}: give mesh:FILE of a closed surface (obj, stl, ply) in metres"
+        )
+    try:
+        mesh = trimesh.load(path, force="mesh")
+    except Exception as error:  # readers raise what they like
+        raise ValueError(
+            f"cannot read the indenter mesh {path} ({error}): give an obj, stl or ply file"
+        ) from error
+    if not len(getattr(mesh, "faces", ())) or not np.isfinite(mesh.vertices).all():
+        raise ValueError(
+            f"the indenter mesh {path} has no faces or vertices that are not finite: "
+            "give a closed surface in metres"
+        )
+    if mesh.extents.max() > 0.5:
+        raise ValueError(
+            f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
+            "scale it from millimetres"
+        )
+    if not mesh.is_watertight:
+        raise ValueError(f"the indenter mesh {path} is open: its inside is not defined; close its holes")
+    return Indenter(
+        f"mesh:{path}",
+        "mesh",
+        (),
+        0.0,
+        np.zeros(3),
+        _UPRIGHT,
+        np.asarray(mesh.vertices),
+        np.asarray(mesh.faces),
+    )
+
+
+def _matrix(quat):
+    out = np.empty(9)
+    mujoco.mju_quat2Mat(out, quat)
+    return out.reshape(3, 3)
+
+
+def make_indenter(text: str) -> Indenter:
+    """The indenter that a text asks for.
+
+    A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in
+    metres. The z axis of a geom goes
+    ahead: a capsule presses with its cap, a cylinder with its end, a plane with its front.
+
+    Raises:
+      ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in
+        metres.
+      FileNotFoundError: no such mesh.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "geom":
+        return _from_geom(rest)
+    if kind == "mesh":
+        return _from_file(rest)
+    if text not in INDENTERS:
+        raise ValueError(
+            f"unknown indenter {text!r}: "
+            f"choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
+        )
+    shape = indenter(text)
+    return Indenter(
+        text,
+        shape.geom_type,
+        shape.size,
+        shape.rounding if shape.size else 0.0,
+        np.array(shape.pos),
+        np.array(shape.quat),
+        *shape.mesh(),
+    )
+
+
+def add_indenter(
+    spec: mujoco.MjSpec, body: "mujoco._specs.MjsBody", shape: Indenter, exact: bool = True, **geom: object
+) -> "mujoco._specs.MjsGeom":
+    """Adds the indenter's geom, named "indenter", to a body of a spec whose frame is the indenter's.
+
+    Args:
+      exact: False gives shapes with rounded edges as meshes, which MuJoCo's rays see with their rounding.
+      geom: further properties of the geom.
+    """
+    if shape.type != "mesh" and (exact or not shape.rounding):
+        size = np.zeros(3)
+        size[: len(shape.size)] = shape.size
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.type.upper()}")
+        return body.add_geom(name="indenter", type=kind, size=size, pos=shape.pos, quat=shape.quat, **geom)
+    # a shell's inertia is defined for open and badly oriented triangles too
+    mesh = spec.add_mesh(
+        name="indenter", uservert=shape.vert.ravel(), userface=shape.face.ravel().astype(np.int32)
+    )
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    return body.add_geom(name="indenter", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="indenter", **geom)

@@ -1,0 +1,164 @@
+"""What a press is, and the way of its indenter: to the depth, then along the skin."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from . import approach
+from .indenter import Indenter, add_indenter
+
+__all__ = ["LEAD", "Path", "PressOptions", "plan_path", "rotation_from_y"]
+
+LEAD = 5e-6  # the indenter starts this far before first touch [m]
+
+
+@dataclasses.dataclass(frozen=True)
+class PressOptions:
+    """What a press is.
+
+    Attributes:
+      indenter: see `indenter.make_indenter`.
+      location: (x [m], angle around the finger [rad]) or (x, y, z) [m], moved to the nearest point of the
+        skin.
+      direction: of the press (3,); None is the inward normal of the skin at the location.
+      depth: travel from first touch [m].
+      slide: travel along slide_direction after the press [m].
+      slide_direction: (3,), of which the part across `direction` counts.
+      material: name of a preset of the skin.
+      liquid: whether there is liquid under the skin; None takes the material's choice.
+      skin: "coarse", "default", "fine" or a file.
+      tier: of the skin's solution, "full" or "condensed".
+      timestep: [s]. speed: of the indenter [m/s]. hold: rest at the end of the press and of the slide [s].
+      two_way: a servo with mass pushes the indenter and gives way, instead of a prescribed path.
+      friction: Coulomb coefficient; None takes the material's.
+      seed: of the sensor's noise.
+      device: of the skin, "cpu" or "cuda:0".
+    """
+
+    indenter: str = "sphere_7mm"
+    location: tuple = (-12e-3, 0.0)
+    direction: tuple | None = None
+    depth: float = 2.4e-3
+    slide: float = 0.0
+    slide_direction: tuple = (1.0, 0.0, 0.0)
+    material: str = "default"
+    liquid: bool | None = None
+    skin: str = "default"
+    tier: str = "full"
+    timestep: float = 4e-3
+    speed: float = 10e-3
+    hold: float = 0.02
+    two_way: bool = False
+    friction: float | None = None
+    seed: int = 0
+    device: str = "cpu"
+
+    def __post_init__(self):
+        for name, least in (("depth", 0), ("timestep", 0), ("speed", 0)):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > least):
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be a positive number")
+        for name in ("slide", "hold"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
+        if len(self.location) not in (2, 3):
+            raise ValueError(
+                f"location {self.location} has {len(self.location)} numbers: "
+                "give x and an angle, or x, y and z"
+            )
+        for name in ("location", "direction", "slide_direction"):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise ValueError(f"{name} {value} contains NaN or infinite numbers")
+        for name in ("direction", "slide_direction"):
+            value = getattr(self, name)
+            if value is not None and (len(value) != 3 or not np.linalg.norm(value)):
+                raise ValueError(f"{name} {value} is no direction: give three numbers that are not all zero")
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """Way of an indenter's frame, which only translates.
+
+    Attributes:
+      start: (3,) its origin at first touch [m].
+      quat: (4,) its orientation.
+      direction, slide_direction: (3,) unit vectors, across each other.
+      depth, slid: (n,) travel at each step [m]; row 0 is the start before first touch.
+    """
+
+    start: np.ndarray
+    quat: np.ndarray
+    direction: np.ndarray
+    slide_direction: np.ndarray
+    depth: np.ndarray
+    slid: np.ndarray
+
+    def position(self, depth: float, slid: float = 0.0) -> np.ndarray:
+        """(3,) origin of the frame after travels [m]."""
+        return self.start + depth * self.direction + slid * self.slide_direction
+
+
+def rotation_from_y(direction: np.ndarray) -> np.ndarray:
+    """Quaternion of the smallest rotation that takes +y to a unit direction."""
+    quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
+    return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions) -> Path:
+    """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the
+    depth, then along the skin.
+
+    Raises:
+      ValueError: no skin at the location, an indenter that passes it, a direction out of the skin, or a slide
+        along the direction.
+    """
+    if len(options.location) == 2:
+        point, normal = approach.surface_point(geometry, *options.location)
+    else:
+        point, normal = approach.nearest_point(geometry, options.location)
+    direction = -normal if options.direction is None else np.asarray(options.direction, float)
+    direction = direction / np.linalg.norm(direction)
+    if direction @ normal >= 0:
+        raise ValueError(
+            f"direction {direction.round(3).tolist()} leaves the skin at {(1e3 * point).round(2).tolist()} "
+            "mm: it must point into it"
+        )
+    across = np.asarray(options.slide_direction, float)
+    across = across - (across @ direction) * direction
+    if options.slide and np.linalg.norm(across) < 1e-3 * np.linalg.norm(options.slide_direction):
+        raise ValueError("slide_direction is along the press: give one across it")
+    across = across / max(np.linalg.norm(across), 1e-30)
+
+    quat = rotation_from_y(direction)
+    spec = mujoco.MjSpec()
+    back = 0.05 + np.abs(indenter.vert).max()  # clear of the finger
+    add_indenter(
+        spec, spec.worldbody.add_body(pos=point - back * direction, quat=quat), indenter, exact=False
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    travel = approach.first_touch(geometry, model, data, direction)
+    start = point + (travel - back) * direction
+
+    step = options.speed * options.timestep
+
+    def ramp(length):
+        count = int(np.ceil(length / step - 1e-9))
+        return length * np.arange(1, count + 1) / max(count, 1)
+
+    rest = np.zeros(int(round(options.hold / options.timestep)))
+    down, along = ramp(options.depth), ramp(options.slide)
+    depth = np.concatenate(
+        [
+            [-LEAD],
+            down,
+            rest + options.depth,
+            0 * along + options.depth,
+            (rest if options.slide else rest[:0]) + options.depth,
+        ]
+    )
+    slid = np.concatenate([[0], 0 * down, rest, along, (rest if options.slide else rest[:0]) + options.slide])
+    return Path(start, quat, direction, across, depth, slid)

@@ -1,0 +1,120 @@
+"""One press of an indenter into a BioTac with `mj_step`, and a picture of how it ended."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import tqdm
+
+from .. import plugin
+from ..sensor.channels import CHANNELS
+from .indenter import make_indenter
+from .path import LEAD, PressOptions, plan_path
+from .record import PressRecord
+from .scene import build_scene
+
+__all__ = ["press", "render"]
+
+
+def _read(handle, data):
+    """What one step left: (3,) force of the skin on the indenter [N], (23,) counts, non-converged steps."""
+    counts = np.concatenate(
+        [handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])]
+    )  # of PAC's 22 the latest
+    return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
+
+
+def press(
+    options: PressOptions = PressOptions(),  # noqa: B008 - frozen
+    render: Callable | None = None,
+    progress: bool = True,
+) -> tuple[PressRecord, np.ndarray | None]:
+    """Presses.
+
+    Args:
+      options: what to press where.
+      render: called with (model, data) at the end; its result is returned beside the record.
+      progress: whether to show a progress bar.
+
+    Returns:
+      record: PressRecord.
+      picture: what `render` returned, None without it.
+
+    Raises:
+      ValueError, FileNotFoundError: an option is not possible; the text names cause and remedy.
+    """
+    from ..geometry import load_skin
+
+    geometry = load_skin(options.skin)
+    indenter = make_indenter(options.indenter)
+    path = plan_path(geometry, indenter, options)
+    spec, handle = build_scene(indenter, path, options)
+    try:
+        model = spec.compile()
+        data = mujoco.MjData(model)
+    except (ValueError, mujoco.FatalError):
+        plugin.check()  # says why, where MuJoCo only says that
+        raise
+    rows, picture = [], None
+    last = len(path.depth) - 1
+    begin = time.perf_counter()
+    for step in tqdm.trange(last + 1, desc="press", unit="step", disable=not progress, leave=False):
+        travel = np.array([path.depth[step], path.slid[step]])
+        if options.two_way:
+            data.ctrl[:] = (travel + [LEAD, 0])[: model.nu]
+            mujoco.mj_step(model, data)
+            travel[: model.nq] = data.qpos - [LEAD, 0][: model.nq]
+        else:
+            data.mocap_pos[0] = path.position(*travel)
+            mujoco.mj_step(model, data)
+        plugin.check()
+        rows.append(
+            (
+                data.time,
+                travel[0],
+                path.position(*travel),
+                handle.vert_xpos(model, data),
+                *_read(handle, data),
+            )
+        )
+    seconds = time.perf_counter() - begin
+    if render is not None:
+        picture = render(model, data)
+    times, depth, position, xpos, force, counts, nonconverged = (np.array(column) for column in zip(*rows))
+    record = PressRecord(
+        geometry=geometry,
+        parameters={
+            **dataclasses.asdict(options),
+            "direction": path.direction.tolist(),
+            "start": path.start.tolist(),
+        },
+        time=times,
+        depth=depth,
+        force=force,
+        counts=counts,
+        nonconverged=nonconverged,
+        vert_xpos=xpos.astype(np.float32),
+        indenter_pos=position,
+        indenter_quat=np.tile(path.quat, (len(times), 1)),
+        indenter_vert=indenter.vert,
+        indenter_face=indenter.face,
+        seconds=seconds,
+    )
+    return record, picture
+
+
+def render(
+    model: mujoco.MjModel, data: mujoco.MjData, width: int = 900, height: int = 640
+) -> np.ndarray | None:
+    """(height, width, 3) uint8 of the scene through the camera "press"; None where no GL library works."""
+    from ..view.offscreen import Offscreen, find_gl
+
+    gl = find_gl()
+    if gl is None:
+        return None
+    camera = mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera("press").id
+    with Offscreen(model, width, height, gl) as screen:
+        return screen.render(data, camera)

@@ -1,0 +1,143 @@
+"""What a press leaves behind: the recorded arrays and the files `readings.csv` and `skin.h5`."""
+
+import csv
+import dataclasses
+import json
+import pathlib
+
+import numpy as np
+
+from ..files import replacing, versions
+from ..geometry.skin_geometry import SkinGeometry
+from ..sensor.channels import CHANNELS
+
+__all__ = ["CSV_COLUMNS", "PressRecord", "write_readings", "write_skin"]
+
+CSV_COLUMNS = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *CHANNELS, "nonconverged", "tier")
+
+
+@dataclasses.dataclass
+class PressRecord:
+    """One press, in the BioTac frame. n is the number of saved steps; row 0 is the rest, 5 um before first
+    touch.
+
+    Attributes:
+      geometry: the skin at rest.
+      parameters: what was asked for; numbers and strings, so that JSON keeps it.
+      time: (n,) [s].
+      depth: (n,) travel of the indenter along its direction from first touch [m].
+      force: (n, 3) of the skin on the indenter [N].
+      counts: (n, 23) in the order of sensor.channels.CHANNELS [counts].
+      nonconverged: (n,) int, steps of the skin so far that did not converge.
+      vert_xpos: (n, nvert, 3) float32, nodes [m].
+      indenter_pos, indenter_quat: (n, 3) [m], (n, 4), pose of the indenter's frame.
+      indenter_vert, indenter_face: (p, 3) [m], (q, 3), its surface in that frame, for pictures.
+      seconds: wall time of the steps [s].
+    """
+
+    geometry: SkinGeometry
+    parameters: dict
+    time: np.ndarray
+    depth: np.ndarray
+    force: np.ndarray
+    counts: np.ndarray
+    nonconverged: np.ndarray
+    vert_xpos: np.ndarray
+    indenter_pos: np.ndarray
+    indenter_quat: np.ndarray
+    indenter_vert: np.ndarray
+    indenter_face: np.ndarray
+    seconds: float
+
+    def __post_init__(self):
+        n = len(self.time)
+        shapes = dict(
+            depth=(n,),
+            force=(n, 3),
+            counts=(n, len(CHANNELS)),
+            nonconverged=(n,),
+            vert_xpos=(n, self.geometry.nvert, 3),
+            indenter_pos=(n, 3),
+            indenter_quat=(n, 4),
+        )
+        for name, shape in shapes.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(
+                    f"{name} of a press with {n} saved steps has shape {np.shape(getattr(self, name))}: "
+                    f"{shape} is needed"
+                )
+
+    @property
+    def electrode_change(self) -> np.ndarray:
+        """(n, 19) change of e1..e19 against row 0 [counts]."""
+        return self.counts[:, :19] - self.counts[0, :19]
+
+    @property
+    def deepest(self) -> int:
+        """The saved step to show: the last one at the greatest depth."""
+        return int(np.flatnonzero(self.depth >= self.depth.max() - 1e-9)[-1])
+
+
+def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
+    """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved
+    step."""
+    tier = record.parameters.get("tier", "full")
+    rows = np.column_stack([record.time, record.depth, record.force])
+    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(CSV_COLUMNS)
+        for row, counts, nonconverged in zip(rows, record.counts, record.nonconverged):
+            writer.writerow(
+                [
+                    *(f"{value:.9g}" for value in row),
+                    *(f"{value:.6g}" for value in counts),
+                    int(nonconverged),
+                    tier,
+                ]
+            )
+
+
+def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
+    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and
+    versions as JSON attributes."""
+    import h5py
+
+    geometry = record.geometry
+    pose = np.concatenate([record.indenter_pos, record.indenter_quat], axis=1)
+    columns = dict(
+        time=(record.time, "s"),
+        depth=(record.depth, "m"),
+        force=(record.force, "N"),
+        counts=(record.counts, "count"),
+        indenter_pose=(pose, "m, then quaternion w x y z"),
+        nonconverged=(record.nonconverged, "steps"),
+    )
+    topology = dict(
+        vert=(geometry.vert, "m"),
+        elem=(geometry.tets, "node"),
+        outer_face=(geometry.outer_face, "node"),
+        inner_face=(geometry.inner_face, "node"),
+        fixed=(geometry.fixed, "node"),
+        indenter_vert=(record.indenter_vert, "m"),
+        indenter_face=(record.indenter_face, "vertex"),
+    )
+    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        shape = record.vert_xpos.shape
+        file.create_dataset(
+            "vert_xpos",
+            data=record.vert_xpos,
+            dtype="f4",
+            chunks=(1, *shape[1:]),
+            compression="gzip",
+            shuffle=True,
+        )
+        file["vert_xpos"].attrs["unit"] = "m"
+        for name, (value, unit) in {**columns, **topology}.items():
+            file[name] = value
+            file[name].attrs["unit"] = unit
+        file["counts"].attrs["names"] = CHANNELS
+        file.attrs["skin"] = geometry.name
+        file.attrs["tier"] = record.parameters.get("tier", "full")
+        file.attrs["frame"] = "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x"
+        file.attrs["parameters"] = json.dumps(record.parameters)
+        file.attrs["versions"] = json.dumps(versions())

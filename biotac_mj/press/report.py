@@ -1,0 +1,189 @@
+"""The picture of a press and its table on the terminal. No window and no global state of matplotlib is
+touched."""
+
+import pathlib
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from ..files import replacing
+from .record import PressRecord
+
+__all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "write_picture"]
+
+_CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
+_SKIN = np.array([0.20, 0.55, 0.42])
+_HARD = np.array([0.75, 0.75, 0.78])
+_INDENTER = np.array([0.85, 0.45, 0.15])
+_TO_PAD_UP = np.array(
+    [[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]
+)  # BioTac frame to a frame whose z leaves the pad
+
+
+def _unroll(points):
+    """(n, 2) [mm]: along the finger, and around it from the pad's midline as an arc on the core."""
+    return 1e3 * np.stack([points[:, 0], _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])], axis=1)
+
+
+def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
+    """The unrolled core: electrodes coloured by their change (red: fewer counts, as in the render) over
+    contours of the skin's motion."""
+    geometry = record.geometry
+    change = record.electrode_change[step]
+    outer = np.unique(geometry.outer_face)
+    outer = outer[np.abs(np.arctan2(geometry.vert[outer, 2], -geometry.vert[outer, 1])) < 2.0]
+    moved = 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
+    if np.ptp(moved) > 0:
+        axes.tricontour(
+            *_unroll(geometry.vert[outer]).T, moved, levels=6, colors="0.75", linewidths=0.8, zorder=1
+        )
+    limit = max(np.abs(change).max(), 1.0)
+    place = _unroll(geometry.electrode_pos)
+    dots = axes.scatter(
+        *place.T, c=change, cmap="RdBu", vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2
+    )
+    for i, (x, y) in enumerate(place):
+        dark = abs(change[i]) > 0.6 * limit
+        axes.annotate(
+            str(i + 1),
+            (x, y),
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if dark else "black",
+            zorder=3,
+        )
+    axes.figure.colorbar(dots, ax=axes, label="change [counts]", shrink=0.85)
+    axes.set(
+        aspect="equal",
+        xlabel="along the finger, tip on the left [mm]",
+        ylabel="around the core [mm]",
+        title="Electrodes E1..E19",
+    )
+    axes.margins(0.12)
+
+
+def draw_force(axes: Axes, record: PressRecord) -> None:
+    """Components and size of the force over depth."""
+    depth = 1e3 * record.depth
+    for i, name in enumerate("xyz"):
+        axes.plot(depth, record.force[:, i], lw=1, label=f"$F_{name}$")
+    axes.plot(depth, np.linalg.norm(record.force, axis=1), "k", lw=2, label="$|F|$")
+    axes.set(xlabel="depth [mm]", ylabel="force on the indenter [N]", title="Force")
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def draw_traces(axes: Axes, record: PressRecord, named: int = 6) -> None:
+    """Changes of the 19 electrodes over time; those that change most are named."""
+    change = record.electrode_change
+    order = np.argsort(-np.abs(change).max(0))
+    for i in order[named:]:
+        axes.plot(record.time, change[:, i], color="0.75", lw=0.8)
+    for i in order[:named]:
+        axes.plot(record.time, change[:, i], lw=1.5, label=f"E{i + 1}")
+    axes.set(xlabel="time [s]", ylabel="change [counts]", title="Electrodes over time")
+    axes.legend(fontsize=8, ncols=2)
+    axes.grid(alpha=0.3)
+
+
+def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
+    """What stands in for MuJoCo's render: deformed outer skin, nail and indenter as shaded triangles, seen
+    from beside the pad.
+
+    Args:
+      axes: with projection "3d".
+    """
+    geometry = record.geometry
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(record.indenter_quat[step], float))
+    indenter = record.indenter_vert @ rotation.reshape(3, 3).T + record.indenter_pos[step]
+    xpos = np.asarray(record.vert_xpos[step], float)
+    moved = np.linalg.norm(xpos - geometry.vert, axis=1)
+    # lighter where the skin moved more, so that dimple and bulge show
+    glow = (moved / max(moved.max(), 1e-9))[geometry.outer_face].mean(1)[:, None]
+    parts = [
+        (
+            xpos,
+            geometry.outer_face,
+            np.hstack([_SKIN + glow * (np.array([0.95, 0.85, 0.30]) - _SKIN), np.ones_like(glow)]),
+        ),
+        (geometry.nail_vert, geometry.nail_face, np.tile([*_HARD, 1.0], (len(geometry.nail_face), 1))),
+        (geometry.clamp_vert, geometry.clamp_face, np.tile([*_HARD, 1.0], (len(geometry.clamp_face), 1))),
+        (indenter, record.indenter_face, np.tile([*_INDENTER, 0.35], (len(record.indenter_face), 1))),
+    ]
+    # one collection, so that matplotlib sorts all triangles by depth together
+    tri = 1e3 * np.concatenate([vert[face].reshape(-1, 3, 3) for vert, face, _ in parts]) @ _TO_PAD_UP.T
+    color = np.concatenate([c for _, _, c in parts])
+    normal = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    azimuth, elevation = np.radians(-115), np.radians(30)
+    eye = np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    light = eye + np.array([-0.5, 0.2, 0.8])
+    color[:, :3] *= 0.35 + 0.65 * np.clip(normal @ (light / np.linalg.norm(light)), 0, 1)[:, None]
+    front = normal @ eye > -0.05
+    axes.add_collection3d(
+        Poly3DCollection(
+            tri[front], facecolors=np.clip(color[front], 0, 1), edgecolors="none", antialiased=False
+        )
+    )
+    low, high = 1e3 * (geometry.vert @ _TO_PAD_UP.T).min(0), 1e3 * (geometry.vert @ _TO_PAD_UP.T).max(0)
+    high[2] += 5
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low, zoom=1.1)
+    axes.view_init(np.degrees(elevation), np.degrees(azimuth))
+    axes.set_axis_off()
+
+
+def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndarray | None = None) -> None:
+    """press.png: render, electrode map, force over depth, electrode traces.
+
+    Args:
+      record: the press.
+      path: of the picture; its ending chooses the format.
+      render: (height, width, 3) uint8 of the step `record.deepest` from MuJoCo; None draws the surfaces with
+        matplotlib instead.
+    """
+    step = record.deepest
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    if render is None:
+        axes = figure.add_subplot(2, 2, 1, projection="3d")
+        draw_surface(axes, record, step)
+    else:
+        axes = figure.add_subplot(2, 2, 1)
+        axes.imshow(render)
+        axes.set_axis_off()
+    axes.set_title(f"Skin at {1e3 * record.depth[step]:.2f} mm")
+    draw_electrodes(figure.add_subplot(2, 2, 2), record, step)
+    draw_force(figure.add_subplot(2, 2, 3), record)
+    draw_traces(figure.add_subplot(2, 2, 4), record)
+    figure.suptitle(
+        f"{record.parameters.get('indenter', 'indenter')} on a BioTac, skin {record.geometry.name}",
+        fontsize=13,
+    )
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def table(record: PressRecord, files: tuple | list = ()) -> str:
+    """The end of a press in a few lines of text."""
+    force = np.linalg.norm(record.force, axis=1)
+    change = record.electrode_change[record.deepest]
+    order = np.argsort(-np.abs(change))[:5]
+    rows = [
+        ("depth", f"{1e3 * record.depth.max():.3f} mm"),
+        ("peak force", f"{force.max():.3f} N at {1e3 * record.depth[force.argmax()]:.3f} mm"),
+        ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
+        ("PDC", f"{record.counts[record.deepest, 19] - record.counts[0, 19]:+.0f} counts"),
+        ("steps", f"{len(record.time)} saved, {int(record.nonconverged[-1])} did not converge"),
+        ("wall time", f"{record.seconds:.2f} s"),
+        *[("wrote" if not i else "", str(file)) for i, file in enumerate(files)],
+    ]
+    return "\n".join(f"  {name:<12}{value}" for name, value in rows)

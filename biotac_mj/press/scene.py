@@ -1,0 +1,118 @@
+"""The scene of a press: the BioTac on a fixed body, the indenter that is moved, camera and light."""
+
+import mujoco
+import numpy as np
+
+from ..coupling.attachment import Handle
+from .indenter import Indenter, add_indenter
+from .path import LEAD, Path, PressOptions
+
+__all__ = ["build_scene", "see_through"]
+
+_PREFIX = "biotac_"
+
+
+# The servo of a two-way press: 50 kN/m gives way by 0.02 mm per newton; with this mass it moves at 200 rad/s,
+# slow against a 4 ms step.
+_SERVO_STIFFNESS, _SERVO_MASS = 5e4, 1.25
+
+
+def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[mujoco.MjSpec, Handle]:
+    """The BioTac on a fixed body, the indenter on a mocap body or, two-way, on slide joints with servos; a
+    camera named "press".
+
+    Returns:
+      spec, and the handle of `biotac_mj.attach`.
+
+    Raises:
+      ValueError: a two-way press with a plane, which cannot move in MuJoCo.
+    """
+    from ..coupling import attach
+    from ..skin.rubber.material import material
+
+    chosen = material(options.material)
+    friction = chosen.friction if options.friction is None else options.friction
+    spec = mujoco.MjSpec()
+    spec.option.timestep = options.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.gravity = np.zeros(3)
+    _stage(spec)
+    spec.worldbody.add_body(name="finger")
+
+    body = spec.worldbody.add_body(
+        name="indenter", pos=path.position(-LEAD), quat=path.quat, mocap=not options.two_way
+    )
+    look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 0.35])
+    if options.two_way:
+        if indenter.type == "plane":
+            raise ValueError(
+                "a plane cannot be pushed by a servo, MuJoCo keeps planes fixed: "
+                "press it one-way, or use a flat geom:box"
+            )
+        body.mass, body.inertia, body.explicitinertial = _SERVO_MASS, [1e-3] * 3, True
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, path.quat)
+        for name, axis in (("press", path.direction), ("slide", path.slide_direction))[
+            : 2 if options.slide else 1
+        ]:
+            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=rotation.reshape(3, 3).T @ axis)
+            servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            servo.set_to_position(kp=_SERVO_STIFFNESS, dampratio=1.0)
+    add_indenter(spec, body, indenter, **look)
+    handle = attach(
+        spec,
+        body="finger",
+        prefix=_PREFIX,
+        skin=options.skin,
+        tier=options.tier,
+        material=options.material,
+        liquid=chosen.liquid if options.liquid is None else options.liquid,
+        coupling="two-way" if options.two_way else "one-way",
+        geoms=["indenter"],
+        rounding={"indenter": indenter.rounding} if indenter.rounding else None,
+        friction=friction,
+        seed=options.seed,
+        device=options.device,
+    )
+    see_through(spec, handle)
+    return spec, handle
+
+
+def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
+    """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are
+    seen."""
+    spec.skin(handle.prefix + "skin").rgba[3] = 0.45
+    for i in range(1, 20):
+        spec.site(f"{handle.prefix}e{i}").size[0] = 7e-4
+
+
+def _stage(spec):
+    """Camera, light and a white background."""
+    # from beside the pad, which looks up in the picture
+    eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
+    z = eye / np.linalg.norm(eye)
+    x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
+    spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
+    spec.worldbody.add_light(
+        pos=[-0.1, -0.3, -0.1],
+        dir=[0.6, 0.9, -0.1],
+        diffuse=[0.5] * 3,
+        specular=[0.1] * 3,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False,
+    )
+    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = (
+        0.35,
+        0.35,
+        0.05,
+    )
+    sky = spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        width=8,
+        height=48,
+    )
+    sky.rgb1, sky.rgb2 = [1.0] * 3, [1.0] * 3

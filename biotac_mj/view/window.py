@@ -1,0 +1,217 @@
+"""A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes
+are shown by the plugin."""
+
+import os
+import pathlib
+import sys
+import time
+
+import mujoco
+import numpy as np
+
+from .. import plugin
+from ..coupling.attachment import Handle
+from ..files import replacing
+from ..geometry.skin_geometry import SkinGeometry
+from ..press import approach
+from ..press.scene import see_through
+
+__all__ = ["build_hand", "build_scene", "view"]
+
+_PAD_UP = np.array(
+    [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
+)  # turns the pad, -y of the BioTac, to the world's +z
+_RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
+
+
+def build_scene(
+    skin: str | pathlib.Path | SkinGeometry = "default", **attach_options: object
+) -> tuple[mujoco.MjSpec, Handle]:
+    """A fixed BioTac and a ball above its pad that moves in three directions without turning; weak springs
+    keep it over the pad.
+
+    Args:
+      skin: name, file or SkinGeometry.
+      attach_options: see `biotac_mj.attach`.
+
+    Returns:
+      spec, and the handle of `biotac_mj.attach`.
+    """
+    from ..coupling import attach
+    from ..geometry import SkinGeometry, load_skin
+
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    top, _ = approach.surface_point(geometry, -10e-3, 0.0)
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 4e-3
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
+    _light(spec)
+    ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
+    ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
+    for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
+        joint = ball.add_joint(name=f"ball_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        joint.stiffness[0], joint.damping[0] = stiffness, 0.5
+    ball.add_geom(
+        name="ball",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[_RADIUS, 0, 0],
+        contype=0,
+        conaffinity=0,
+        rgba=[0.85, 0.45, 0.15, 0.6],
+    )
+    handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
+    see_through(spec, handle)
+    return spec, handle
+
+
+def _light(spec):
+    """Sky and light."""
+    spec.visual.headlight.ambient[:] = 0.3
+    sky = spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=64,
+        height=384,
+    )
+    sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
+    spec.worldbody.add_light(
+        pos=[-0.1, -0.2, 0.3],
+        dir=[0.3, 0.5, -0.8],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False,
+    )
+
+
+def build_hand(
+    path: pathlib.Path | str, skin: str | pathlib.Path | SkinGeometry = "coarse", **attach_options: object
+) -> tuple[mujoco.MjSpec, dict]:
+    """A Shadow Hand of MuJoCo Menagerie, palm up, with five BioTacs and a ball that lies on its fingers.
+
+    Args:
+      path: its right_hand.xml or left_hand.xml.
+      skin: name, file or SkinGeometry; attach_options: see `biotac_mj.attach`.
+
+    Returns:
+      spec, and {finger: handle} of `biotac_mj.attach_to_hand`.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: it is no Shadow Hand.
+    """
+    from ..tasks.hands import attach_to_hand
+
+    if not pathlib.Path(path).is_file():
+        raise FileNotFoundError(
+            f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand"
+        )
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    _light(spec)
+    ball = spec.worldbody.add_body(name="ball", pos=[0.41, 0.0, 0.05])
+    ball.add_freejoint(name="ball")
+    ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[0.85, 0.45, 0.15, 1])
+    return spec, attach_to_hand(spec, "shadow_hand", skin=skin, **attach_options)
+
+
+def view(
+    skin: str | pathlib.Path | SkinGeometry = "default",
+    material: str = "default",
+    liquid: bool | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    tier: str = "full",
+    render: pathlib.Path | str | None = None,
+    seconds: float = 0.3,
+    hand: pathlib.Path | str | None = None,
+    web: bool = False,
+    recording: pathlib.Path | str | None = None,
+    port: int = 8080,
+) -> object:
+    """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
+
+    Args:
+      skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's
+        choice.
+      render: path of a picture to write after `seconds` [s] instead.
+      hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
+      web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`.
+
+    Raises:
+      ValueError: no display for a window, or no GL library to render with.
+    """
+    from ..skin.rubber.material import material as preset
+
+    if recording and not web:
+        raise ValueError("a recording is shown in the browser: add --web")
+    if recording:
+        from .web import play_file
+
+        return play_file(recording, port=port)
+    linux = sys.platform.startswith("linux")
+    if (
+        render is None
+        and not web
+        and linux
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
+        raise ValueError(
+            "no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY"
+        )
+    liquid = preset(material).liquid if liquid is None else liquid
+    settings = dict(
+        material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device
+    )
+    if hand is None:
+        spec, handle = build_scene(skin, tier=tier, **settings)
+        handles, aim = {"biotac": handle}, _aim
+    else:
+        spec, handles = build_hand(hand, tier="condensed", **settings)
+        aim = _aim_at_hand
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    if render is not None:
+        return _render(model, data, render, seconds, aim)
+    if web:
+        from .web import play_model
+
+        return play_model(model, data, handles, port=port)
+    from mujoco import viewer
+
+    with viewer.launch_passive(model, data) as window:
+        aim(window.cam)
+        while window.is_running():
+            begin = time.perf_counter()
+            mujoco.mj_step(model, data)
+            plugin.check()
+            window.sync()
+            time.sleep(max(0.0, model.opt.timestep - (time.perf_counter() - begin)))
+
+
+def _aim(camera):
+    """Looks at the pad from beside and above."""
+    camera.lookat[:] = [-0.008, 0, 0.004]
+    camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
+
+
+def _aim_at_hand(camera):
+    camera.lookat[:] = [0.38, 0, 0.02]
+    camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
+
+
+def _render(model, data, path, seconds, aim):
+    from matplotlib.image import imsave
+
+    from .offscreen import Offscreen, find_gl
+
+    with Offscreen(model, 1000, 750, find_gl()) as screen:
+        while data.time < seconds:
+            mujoco.mj_step(model, data)
+            plugin.check()
+        camera = mujoco.MjvCamera()
+        aim(camera)
+        picture = screen.render(data, camera)
+    with replacing(path) as temporary:
+        imsave(temporary, picture)
+    print(f"  wrote {path}: {data.time:.2f} s after the ball was let go")

@@ -1,0 +1,62 @@
+"""The package's structure: no module imports itself by way of others, and every folder imports only what the
+table of docs/design.md allows."""
+
+import collections
+
+import pytest
+from imports import circles, imports, modules
+
+# What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
+LAYERS = {
+    "files": "biotac_mj",  # the version
+    "geometry": "",
+    "skin": "geometry",
+    "sensor": "geometry",
+    "effects": "skin sensor geometry",
+    "coupling": "skin sensor geometry learning.serve",
+    "plugin": "coupling",
+    "batch": "coupling skin sensor geometry learning.serve",
+    "press": "coupling plugin skin sensor geometry files view.offscreen",
+    "calibration": "geometry skin files press.indenter press.path",
+    "data": "geometry skin sensor files press.approach press.indenter press.path",
+    "tasks": "coupling sensor geometry data.objects",
+    "view": "coupling plugin skin sensor geometry files tasks press.approach press.scene",
+    "learning": "data sensor geometry files",
+    "discrepancy": "effects data skin sensor geometry files",
+    "biotac_mj": "plugin",
+}
+ABOVE_ALL = {"cli"}
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return imports(modules())
+
+
+def test_circles_are_found():
+    """A module of two others' circle, one in a function, one outside."""
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}, "e": set()}) == [["a", "b", "c"]]
+    assert circles({"a": {"b"}, "b": set()}) == []
+
+
+def test_no_import_circles(graph):
+    found = circles(graph)
+    assert not found, "circles of imports: " + "; ".join(" - ".join(names) for names in found)
+
+
+def test_folders_import_only_what_lies_below_them(graph):
+    wrong = collections.defaultdict(set)
+    for name, others in graph.items():
+        folder = _folder(name)
+        if folder in ABOVE_ALL:
+            continue
+        for other in others:
+            allowed = LAYERS[folder].split()
+            if _folder(other) not in {folder, *allowed} and other.removeprefix("biotac_mj.") not in allowed:
+                wrong[folder].add(f"{name} imports {other}")
+    assert not wrong, "\n".join(line for lines in wrong.values() for line in sorted(lines))
+
+
+def _folder(name):
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 else parts[0]
