@@ -18,12 +18,12 @@ from biotac_mj.press_record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_linear, step
-from biotac_mj.skin.condensed import CondensedSkin, Memory
-from biotac_mj.skin.condensed_correction import correction
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.condensed import CondensedSkin, Memory, linear
+from biotac_mj.skin.condensed.compliance import SurfaceCompliance, cache_folder
+from biotac_mj.skin.condensed.correction import correction
+from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact import face_samples
-from biotac_mj.skin.rest_tangent import rest_tangent
-from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -322,7 +322,7 @@ def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse
     path = [start + (top - 7e-3 + depth) * direction for depth in (4e-4, 8e-4, 1.2e-3, 1.6e-3)]
     found = []
     for direct in (0, 10000):
-        monkeypatch.setattr(condensed_linear, "_DIRECT", direct)
+        monkeypatch.setattr(linear, "_DIRECT", direct)
         skin, memory = CondensedSkin(coarse, box), Memory.rest(1)
         for pos in path:
             out = skin.solve(memory, pos[None], mat)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
-from ..skin.condensed_search import NearSearch
+from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.stress_memory import StressMemory
 from ..skin.types import vec3

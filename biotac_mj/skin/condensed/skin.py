@@ -8,7 +8,7 @@ part. What is left is the contact law f = F(u) over the candidates, tens of coor
 method with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin,
 `contact.touch_face`).
 
-What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed_correction`).
+What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed.correction`).
 """
 
 import math
@@ -19,16 +19,16 @@ import warp as wp
 from scipy.linalg.blas import saxpy
 from scipy.spatial import cKDTree
 
-from . import liquid
-from .condensed_correction import correction
-from .condensed_faces import CandidateFaces
-from .condensed_search import NearSearch
-from .condensed_step import Memory, Outcome, Step
+from .. import liquid
+from ..geoms import GeomSet
+from ..types import real, vec3
+from .compliance import SurfaceCompliance
 from .core_contact import CoreContact
-from .geoms import GeomSet
+from .correction import correction
+from .faces import CandidateFaces
 from .rest_tangent import rest_tangent
-from .surface_compliance import SurfaceCompliance
-from .types import real, vec3
+from .search import NearSearch
+from .step import Memory, Outcome, Step
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
@@ -106,7 +106,7 @@ class CondensedSkin:
     Args:
       model: SkinModel on the CPU, quasi-static.
       geoms: GeomSet of one world.
-      cache: whether to keep the compliance on disk (see `surface_compliance`).
+      cache: whether to keep the compliance on disk (see `compliance`).
 
     Raises:
       ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from .condensed_linear import Compliance, Lumped, Springs, solve
+from .linear import Compliance, Lumped, Springs, solve
 
 __all__ = ["Memory", "Outcome", "Step"]
 

@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from .contact import Geoms, face_samples
-from .shapes import distance_bound
-from .types import real, vec3
+from ..contact import Geoms, face_samples
+from ..shapes import distance_bound
+from ..types import real, vec3
 
 __all__ = ["CoreContact", "Meeting"]
 

@@ -7,8 +7,8 @@ them, which also fixes the order of sums."""
 import numpy as np
 import warp as wp
 
-from .contact import Geoms, touch_face
-from .types import mat33, real, vec3
+from ..contact import Geoms, touch_face
+from ..types import mat33, real, vec3
 
 __all__ = ["CandidateFaces"]
 

@@ -5,8 +5,8 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from . import elasticity, liquid
-from .types import vec3
+from .. import elasticity, liquid
+from ..types import vec3
 
 __all__ = ["rest_tangent"]
 
@@ -20,7 +20,7 @@ def rest_tangent(model) -> sp.csc_matrix:
     Args:
       model: SkinModel on the CPU.
     """
-    from .data import SkinData, view
+    from ..data import SkinData, view
 
     data = SkinData(model)
     view(data.x)[:, 0] = model.rest.vert
