@@ -1,9 +1,12 @@
-"""The skin at rest on its filling: inflated step by step, once for each model."""
+"""The skin at rest on its filling: inflated step by step, once for each geometry, material and options."""
 
 import copy
 import dataclasses
 import math
 
+import numpy as np
+
+from .cache import kept
 from .geoms import GeomSet
 from .liquid import Rest
 
@@ -20,17 +23,36 @@ def rest_state(model) -> Rest:
     Raises:
       ValueError: the skin does not hold that much liquid or pressure.
     """
-    options, volume = model.options, model.liquid_volume
-    vert = model.geometry.vert
+    options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     if not (model.has_liquid and (options.fill_volume or options.rest_pressure)):
         return Rest(vert, 0.0, volume, volume)
     if volume + options.fill_volume <= 0:
         raise ValueError(
             f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
         )
+
+    def inflate():
+        rest = _inflated(model)
+        return {"vert": rest.vert, "numbers": np.array([rest.pressure, rest.volume, rest.natural_volume])}
+
+    found = kept("rest", _inputs(model), inflate)
+    return Rest(found["vert"], *found["numbers"].tolist())
+
+
+def _inputs(model):
+    """All that the rest depends on."""
+    g = model.geometry
+    mesh = [g.vert, model._elem, model.fixed, g.inner_face, g.core_vert, g.core_face]
+    core = model.core_surface.face_np if model.has_core else None
+    rubber = [model.element, model.material, model.modulus]
+    return [*mesh, core, *rubber, model.options, model.device.is_cuda]
+
+
+def _inflated(model):
     from .data import SkinData
     from .solver import step
 
+    options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(

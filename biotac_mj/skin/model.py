@@ -10,17 +10,19 @@ import warp as wp
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import clearance, contact, elasticity, liquid
+from .cache import kept
 from .contact_law import ContactLaw, contact_law
 from .factor import DenseFactor, SparseFactor
 from .fill import rest_state
 from .geoms import GeomSet
 from .material import ELEMENTS, LAWS, Material, material
 from .quadratic import QuadraticTetrahedra
-from .shapes import bake_distance_grid
+from .shapes import DistanceGrid, bake_distance_grid
 from .types import real, vec3
 
 __all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
 
+_GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core [m]
 _CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
 
 
@@ -240,7 +242,6 @@ class SkinModel:
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
-        self._stiffness = self._of_free(self.elasticity.rest_stiffness(self.material.mu, self.material.lame))
 
     @property
     def extensions(self) -> tuple[str, ...]:
@@ -333,6 +334,11 @@ class SkinModel:
         return rest_state(self)
 
     @functools.cached_property
+    def _stiffness(self):
+        """(3 nfree, 3 nfree) at rest, without the liquid, sparse [N/m]."""
+        return self._of_free(self.elasticity.rest_stiffness(self.material.mu, self.material.lame))
+
+    @functools.cached_property
     def factor(self):
         """Inverse of the rest stiffness of the free nodes, as an operator."""
         return self._invert(self._stiffness)
@@ -372,8 +378,14 @@ class SkinModel:
 
 @functools.lru_cache(maxsize=8)
 def _cached_core_grid(key, spacing):
-    vert, face = key.arrays
-    return bake_distance_grid(vert, face, spacing=spacing, margin=3e-3)
+    vert, face = np.asarray(key.arrays[0], float), np.asarray(key.arrays[1], np.int32)
+
+    def bake():
+        grid = bake_distance_grid(vert, face, spacing=spacing, margin=_GRID_MARGIN)
+        return {"value": grid.value, "origin": grid.origin}
+
+    found = kept("grid", [vert, face, spacing, _GRID_MARGIN], bake)
+    return DistanceGrid(found["value"], found["origin"], spacing, vert, face)
 
 
 class _Key:

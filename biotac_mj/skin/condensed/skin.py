@@ -26,9 +26,9 @@ from .compliance import SurfaceCompliance
 from .core_contact import CoreContact
 from .correction import correction
 from .faces import CandidateFaces
-from .rest_tangent import rest_tangent
 from .search import NearSearch
 from .step import Memory, Outcome, Step
+from .threads import single_thread
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
@@ -81,11 +81,7 @@ _compliances = weakref.WeakKeyDictionary()
 def _compliance(model, outer, inner, direction, cache):
     """The rows of a model, shared by all its skins."""
     if cache not in _compliances.get(model, {}):
-        factor, stiffness = model.factor, model._stiffness
-        if model.rest.pressure:
-            stiffness = rest_tangent(model)
-            factor = model._invert(stiffness)
-        made = SurfaceCompliance(model, factor, stiffness, outer, inner, direction, cache)
+        made = SurfaceCompliance(model, outer, inner, direction, cache)
         _compliances.setdefault(model, {})[cache] = made
     return _compliances[model][cache]
 
@@ -260,6 +256,10 @@ class CondensedSkin:
         Raises:
           ValueError: NaN in a pose, or a geom deep inside the core.
         """
+        with single_thread():
+            return self._solve(memory, geom_pos, geom_mat)
+
+    def _solve(self, memory, geom_pos, geom_mat):
         if not (math.isfinite(np.sum(geom_pos)) and math.isfinite(np.sum(geom_mat))):
             raise ValueError(
                 "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
