@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..contact import Geoms, touch_face
+from ..geoms import GeomSet
 from ..types import mat33, real, vec3
 
 __all__ = ["CandidateFaces"]
@@ -201,11 +202,11 @@ class CandidateFaces:
         the candidates' nodes (-1: it is held), as Warp arrays.
 
     Attributes:
-      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (nnode,). geom, trial: of the samples; all
-        of the last `evaluate`.
+      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (k,) numbers of the nodes that are touched;
+        all of the last `evaluate`.
     """
 
-    def __init__(self, model, geoms, x, x_last, slot):
+    def __init__(self, model, geoms: GeomSet, x: wp.array, x_last: wp.array, slot: wp.array):
         self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = (
             model,
             geoms,
@@ -273,7 +274,9 @@ class CandidateFaces:
     def _record(self, kernel, inputs, outputs):
         return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
 
-    def choose(self, number, face, area, nnode, contacts):
+    def choose(
+        self, number: np.ndarray, face: np.ndarray, area: np.ndarray, nnode: int, contacts: np.ndarray
+    ) -> None:
         """Takes faces (n,), their nodes and areas (n, 3), (n,) and the sticking contacts of the last step (k,
         5) that are theirs."""
         n, nsample = len(number), self._nsample
@@ -292,26 +295,26 @@ class CandidateFaces:
             self._anchor_geom[here, 0], self._anchor[here, 0] = contacts[known, 1], contacts[known, 2:]
 
     @property
-    def force(self):
+    def force(self) -> np.ndarray:
         return self._force[: self.count[1]]
 
     @property
-    def lumped(self):
+    def lumped(self) -> np.ndarray:
         return self._lumped[: self.count[1]]
 
     @property
-    def touched(self):
+    def touched(self) -> np.ndarray:
         """Numbers of the nodes that are touched."""
         return self._touched[: self.count[1]].nonzero()[0]
 
-    def product(self, p):
+    def product(self, p: np.ndarray) -> np.ndarray:
         """Stiffness times p (3 nnode,)."""
         n = self.count[1]
         self._p[:n] = p.reshape(n, 3)
         self._multiply()
         return self._result[:n].ravel()
 
-    def matrix(self, node):
+    def matrix(self, node: np.ndarray) -> np.ndarray:
         """Stiffness over the touched nodes (k,): (3 k, 3 k)."""
         n = 3 * len(node)
         if self._dense is None or len(self._dense[0]) < n * n:
@@ -322,7 +325,7 @@ class CandidateFaces:
         self._dense[1]()
         return self._dense[0][: n * n].reshape(n, n)
 
-    def contacts(self):
+    def contacts(self) -> np.ndarray:
         """(k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches."""
         nsample = self._nsample
         geom = self._geom[: len(self.number) * nsample, 0]
@@ -332,12 +335,7 @@ class CandidateFaces:
         out[:, 1], out[:, 2:] = geom[here], self._trial[here, 0]
         return out
 
-    def sample_forces(self):
-        """(k, 3) forces on the samples that `contacts` lists [N]."""
-        n = len(self.number) * self._nsample
-        return self._sample_force[:n, 0][self._geom[:n, 0] >= 0]
-
-    def loads(self):
+    def loads(self) -> tuple[np.ndarray, np.ndarray]:
         """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in
         the contact of each node."""
         self._loads()

@@ -8,7 +8,7 @@ part. What is left is the contact law f = F(u) over the candidates, tens of coor
 method with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin,
 `contact.touch_face`).
 
-What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed.correction`).
+What skin does differently from a linear one, s and c, is fitted to the full FEM (`correction`).
 """
 
 import math
@@ -202,7 +202,7 @@ class CondensedSkin:
             _strain, [count, number, force, outer, opposite, rest, self._x_wp], [out]
         )
 
-    def strain(self, number, force):
+    def strain(self, number: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
         """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces
         (n,), as the skin is now."""
         n = len(number)
@@ -210,7 +210,7 @@ class CondensedSkin:
             return 0.0, 0.0, 0.0
         self._touched[:n], self._touched_force[:n], self._touched_count[0] = number, force, n
         self._measure_strain()
-        return self._strains.tolist()
+        return tuple(self._strains.tolist())
 
     def _prepare_liquid(self):
         m = self.model
@@ -249,7 +249,7 @@ class CondensedSkin:
 
     # --- a step  ---
 
-    def solve(self, memory: Memory, geom_pos, geom_mat) -> Outcome:
+    def solve(self, memory: Memory, geom_pos: np.ndarray, geom_mat: np.ndarray) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
         alone.
 
@@ -286,7 +286,7 @@ class CondensedSkin:
         self._keep(out.memory, step.u)
         return out
 
-    def clear(self, geom_pos, geom_mat, margin) -> bool:
+    def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         return self.search.clear(geom_pos, geom_mat, margin)
 
