@@ -83,9 +83,9 @@ def _load(path, key):
             found = dict(file)
         if str(found.pop("key")) != key:
             raise ValueError("made of something else")
-    except FileNotFoundError:
+    except OSError:  # not there, or not to be read
         return None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         report_damage(path)
         return None
     with contextlib.suppress(OSError):

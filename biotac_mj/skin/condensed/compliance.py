@@ -17,9 +17,9 @@ import zlib
 import numpy as np
 import scipy.sparse as sp
 
+from ...threads import single_thread
 from ..cache import cache_folder, kept, replace_file, report_damage
 from .rest_tangent import rest_tangent
-from .threads import single_thread
 
 __all__ = ["SurfaceCompliance"]
 
@@ -181,9 +181,9 @@ class SurfaceCompliance:
     def _read(self, path):
         try:
             return _Rows(path, self.count, self.size)
-        except FileNotFoundError:
+        except OSError:  # not there, or not to be read
             return None
-        except (OSError, ValueError):
+        except ValueError:
             report_damage(path)
             return None
 

@@ -335,6 +335,11 @@ class CandidateFaces:
         out[:, 1], out[:, 2:] = geom[here], self._trial[here, 0]
         return out
 
+    def sample_forces(self) -> np.ndarray:
+        """(k, 3) forces on the samples that `contacts` lists [N]."""
+        n = len(self.number) * self._nsample
+        return self._sample_force[:n, 0][self._geom[:n, 0] >= 0]
+
     def loads(self) -> tuple[np.ndarray, np.ndarray]:
         """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in
         the contact of each node."""

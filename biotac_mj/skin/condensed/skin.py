@@ -19,6 +19,7 @@ import warp as wp
 from scipy.linalg.blas import saxpy
 from scipy.spatial import cKDTree
 
+from ...threads import single_thread
 from .. import liquid
 from ..geoms import GeomSet
 from ..types import real, vec3
@@ -28,7 +29,6 @@ from .correction import correction
 from .faces import CandidateFaces
 from .search import NearSearch
 from .step import Memory, Outcome, Step
-from .threads import single_thread
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
@@ -256,10 +256,6 @@ class CondensedSkin:
         Raises:
           ValueError: NaN in a pose, or a geom deep inside the core.
         """
-        with single_thread():
-            return self._solve(memory, geom_pos, geom_mat)
-
-    def _solve(self, memory, geom_pos, geom_mat):
         if not (math.isfinite(np.sum(geom_pos)) and math.isfinite(np.sum(geom_mat))):
             raise ValueError(
                 "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
@@ -277,12 +273,13 @@ class CondensedSkin:
         self.search.refuse_core(geom_pos, geom_mat)
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
-        for _ in range(4):
-            step.run()
-            if not step.missed():
-                break
-        out = step.outcome()
+        with single_thread():
+            step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
+            for _ in range(4):
+                step.run()
+                if not step.missed():
+                    break
+            out = step.outcome()
         self._keep(out.memory, step.u)
         return out
 

@@ -1,4 +1,4 @@
-"""One thread of BLAS: more of them only wait for each other over the small matrices of a skin."""
+"""One thread of BLAS: over the small matrices of a skin and its film, more only wait for each other."""
 
 import contextlib
 import functools
@@ -16,8 +16,8 @@ def _libraries():
 
 @contextlib.contextmanager
 def single_thread() -> Iterator[None]:
-    """Holds BLAS to one thread; next to nothing where it is held to one already."""
-    changed = [(library, n) for library in _libraries() if (n := library.get_num_threads()) > 1]
+    """Holds BLAS to one thread; some microseconds where it is held to one already."""
+    changed = [(library, n) for library in _libraries() if (n := library.get_num_threads() or 1) > 1]
     for library, _ in changed:
         library.set_num_threads(1)
     try:
