@@ -16,7 +16,7 @@ the largest change of any electrode in the full FEM. "beyond": from this depth o
 its error was not measured.
 ms: median of the processor time of a step of the skin alone (no readings).
 
---fit finds the constants of `skin/condensed_correction.py` for the law of the material: least squares of the
+--fit finds the constants of `skin/condensed/correction.py` for the law of the material: least squares of the
 logarithms of force and (weight 0.3) pressure against the full FEM over all presses, small errors squared and
 large ones nearly linear."""
 
@@ -45,7 +45,8 @@ from biotac_mj.coupling import fem, instance
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.skin import PRESETS, condensed_correction
+from biotac_mj.skin import PRESETS
+from biotac_mj.skin.condensed import correction
 
 __all__ = ["compare", "fit", "main", "run", "time_steps"]
 
@@ -137,11 +138,11 @@ def fit(skin: str, material: str, indenters, depth: float):
     presses = [(indenter, location) for indenter in indenters for location in LOCATIONS]
     full = [run("full", skin, *press_, material, depth, _FIT_STEP) for press_ in presses]
     names = ("depth", "most", "width", "stretch", "squeeze")
-    start = condensed_correction.correction(law)
+    start = correction.correction(law)
 
     def residual(x):
         values = dict(zip(names, x * _SCALES, strict=True))
-        condensed_correction.FITTED[law] = dataclasses.replace(start, **values)
+        correction.FITTED[law] = dataclasses.replace(start, **values)
         instance.forget_skins()
         out = []
         for press_, wanted in zip(presses, full, strict=True):

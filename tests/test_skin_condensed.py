@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 
 import biotac_mj
+from biotac_mj.approach import nearest_point, surface_point
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
-from biotac_mj.press.approach import nearest_point, surface_point
-from biotac_mj.press.record import write_readings, write_skin
+from biotac_mj.press_record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, condensed_linear, step
-from biotac_mj.skin.condensed import CondensedSkin, Memory
-from biotac_mj.skin.condensed_correction import correction
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.cache import cache_folder, kept
+from biotac_mj.skin.condensed import CondensedSkin, Memory, linear
+from biotac_mj.skin.condensed.compliance import SurfaceCompliance
+from biotac_mj.skin.condensed.correction import correction
+from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact.faces import face_samples
-from biotac_mj.skin.rest_tangent import rest_tangent
-from biotac_mj.skin.surface_compliance import SurfaceCompliance, cache_folder
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -322,7 +323,7 @@ def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse
     path = [start + (top - 7e-3 + depth) * direction for depth in (4e-4, 8e-4, 1.2e-3, 1.6e-3)]
     found = []
     for direct in (0, 10000):
-        monkeypatch.setattr(condensed_linear, "_DIRECT", direct)
+        monkeypatch.setattr(linear, "_DIRECT", direct)
         skin, memory = CondensedSkin(coarse, box), Memory.rest(1)
         for pos in path:
             out = skin.solve(memory, pos[None], mat)
@@ -361,7 +362,7 @@ def test_replay_is_bit_equal(coarse):
         states = [state]
         for pos in path:
             before = states[-1].copy()
-            result = stepper.solve_skin(states[-1], pos[None], EYE, 2e-3)
+            result = stepper.solve(states[-1], pos[None], EYE, 2e-3)
             assert (states[-1] == before).all()
             assert (stepper.vert_xpos(result.state) == result.vert_xpos).all()
             states.append(result.state)
@@ -371,15 +372,20 @@ def test_replay_is_bit_equal(coarse):
     first = run(stepper)
     assert (run(stepper) == first).all()
     fresh = stepper_at()  # other caches, other memory
-    assert (fresh.solve_skin(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
+    assert (fresh.solve(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
+
+
+def pieces(model):
+    """Some contact coordinates: outer nodes, inner nodes, directions."""
+    geometry = model.geometry
+    outer = np.setdiff1d(np.unique(geometry.outer_face), model.fixed)[::40]
+    inner = np.setdiff1d(np.unique(geometry.inner_face), model.fixed)[::40]
+    return outer, inner, np.tile([0.6, 0.0, 0.8], (len(inner), 1))
 
 
 def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):
-    geometry = coarse.geometry
-    outer = np.setdiff1d(np.unique(geometry.outer_face), coarse.fixed)[::40]
-    inner = np.setdiff1d(np.unique(geometry.inner_face), coarse.fixed)[::40]
-    direction = np.tile([0.6, 0.0, 0.8], (len(inner), 1))
-    fresh = SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction, cache=False)
+    outer, inner, direction = pieces(coarse)
+    fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
     chosen = [4, 3 * len(outer) + 2]
     for coordinate, force in zip(chosen, ((outer[1], [0, 1, 0]), (inner[2], [0.6, 0, 0.8]))):
         unit = np.zeros((coarse.nvert, 3))
@@ -389,14 +395,127 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
         assert np.abs(row - exact).max() < 6e-4 * np.abs(exact).max()
         stiff = coarse._stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
+    assert not list(tmp_path.iterdir())
+    at = np.arange(5)
     for _ in range(2):  # written, then read
-        kept = SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction)
+        kept = SurfaceCompliance(coarse, outer, inner, direction)
         assert all((a == b).all() for a, b in zip(kept.row(chosen), fresh.row(chosen)))
-    (file,) = cache_folder().glob("compliance-*.npy")
-    assert file.parent == tmp_path
-    np.save(file, np.zeros((3, 3), np.float16))
-    with pytest.raises(ValueError, match="does not hold the compliance of this skin: delete it"):
-        SurfaceCompliance(coarse, coarse.factor, coarse._stiffness, outer, inner, direction)
+        assert (kept.part(np.array(chosen), at) == fresh.part(np.array(chosen), at)).all()
+        assert (kept.vector(unit) == exact).all()
+    assert len(list(cache_folder().glob("compliance-*.rows"))) == 1
+    assert all(path.parent == tmp_path and "." not in path.stem for path in tmp_path.rglob("*"))
+
+
+def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
+    outer, inner, direction = pieces(coarse)
+    field = np.zeros((coarse.nvert, 3))
+    field[outer, 1] = 1
+    first = SurfaceCompliance(coarse, outer, inner, direction).vector(field)
+    monkeypatch.setattr(SurfaceCompliance, "_factor", None)
+    monkeypatch.setattr(SurfaceCompliance, "stiffness", None)
+    kept = SurfaceCompliance(coarse, outer, inner, direction)
+    kept.row([0, 3 * len(outer)])
+    assert (kept.vector(field) == first).all()
+    with pytest.raises(AttributeError):  # another load is another file
+        kept.vector(2 * field)
+
+
+@pytest.mark.parametrize("place", [0, 100, -1, None])
+def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, place):
+    """In a row, in the scales' checksum, or cut short."""
+    outer, inner, direction = pieces(coarse)
+    wanted = SurfaceCompliance(coarse, outer, inner, direction).row([0, 1])
+    (file,) = cache_folder().glob("compliance-*.rows")
+    whole = file.read_bytes()
+    damaged = bytearray(whole)
+    if place is None:
+        del damaged[-1000:]
+    else:
+        damaged[place] ^= 1
+    file.unlink()
+    file.write_bytes(damaged)
+    for lines in (1, 0):
+        kept = SurfaceCompliance(coarse, outer, inner, direction)
+        assert (kept.part(np.arange(2), np.arange(kept.size)) == wanted).all()
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == lines and all(f"{file} is damaged" in line for line in said)
+        assert file.read_bytes() == whole
+
+
+@pytest.mark.parametrize("content", [b"", b"PK nonsense", None])
+def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
+    wanted = {"a": np.arange(1000.0), "b": np.array("text")}
+    made = []
+
+    def make():
+        made.append(1)
+        return wanted
+
+    def read(*inputs):
+        found = kept("thing", inputs, make)
+        assert found.keys() == wanted.keys() and all((found[k] == wanted[k]).all() for k in wanted)
+
+    read(1.0, np.ones(3))
+    read(1.0, np.ones(3))
+    assert len(made) == 1
+    (file,) = cache_folder().glob("thing-*.npz")
+    if content is None:  # one bit of an array
+        content = bytearray(file.read_bytes())
+        content[content.index(np.array(500.0).tobytes())] ^= 1
+    file.write_bytes(content)
+    assert not capsys.readouterr().err
+    read(1.0, np.ones(3))
+    assert len(made) == 2 and len(capsys.readouterr().err.splitlines()) == 1
+    read(1.0, np.ones(3))
+    for inputs in ((2.0, np.ones(3)), (1.0, np.ones((3, 1))), (1.0, np.ones(3, np.float32)), (1.0,)):
+        read(*inputs)
+    assert len(made) == 6
+    assert len(list(cache_folder().glob("thing-*.npz"))) == 5
+    for i in range(100):
+        read(i)
+    assert len(list(cache_folder().iterdir())) == 64
+
+
+def test_other_options_and_materials_have_other_files():
+    """A skin's files are found by its geometry, material and options; the modulus alone shares the rows."""
+
+    def files(**changes):
+        fill = changes.pop("fill_volume", 0.0)
+        made = dataclasses.replace(PRESETS["default"], **changes)
+        model = SkinModel(load_skin("coarse"), made, SkinOptions(liquid=True, fill_volume=fill))
+        outer, inner, direction = pieces(model)
+        before = set(cache_folder().iterdir()) if cache_folder().is_dir() else set()
+        SurfaceCompliance(model, outer, inner, direction).vector(np.ones((model.nvert, 3)))
+        return sorted(path.name.split("-")[0] for path in set(cache_folder().iterdir()) - before)
+
+    assert files() == ["compliance", "stiffness", "vector"]
+    assert files() == []
+    assert files(youngs_modulus=3e5) == ["stiffness", "vector"]
+    assert files(poissons_ratio=0.4) == ["compliance", "stiffness", "vector"]
+    assert files(fill_volume=1e-8) == ["compliance", "rest", "stiffness", "vector"]
+    assert files(fill_volume=2e-8) == ["compliance", "rest", "stiffness", "vector"]
+    assert files(fill_volume=2e-8) == []
+
+
+@pytest.mark.parametrize("trouble", ["a file", "full"])
+def test_a_folder_that_cannot_be_written_costs_time_only(coarse, tmp_path, monkeypatch, capsys, trouble):
+    outer, inner, direction = pieces(coarse)
+    fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
+    if trouble == "a file":
+        (tmp_path / "taken").write_text("")
+        monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path / "taken"))
+    else:
+
+        def fail(*arguments):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("os.replace", fail)
+    kept = SurfaceCompliance(coarse, outer, inner, direction)
+    assert (kept.row([5])[0] == fresh.row([5])[0]).all()
+    field = np.ones((coarse.nvert, 3))
+    assert (kept.vector(field) == fresh.vector(field)).all()
+    assert [path.name for path in tmp_path.iterdir()] == (["taken"] if trouble == "a file" else [])
+    assert not capsys.readouterr().err
 
 
 # --- in MuJoCo

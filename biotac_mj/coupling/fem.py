@@ -9,9 +9,9 @@ import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
-from ..skin.condensed_search import NearSearch
+from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
-from ..skin.stress_memory import StressMemory
+from ..skin.rubber.memory import RubberMemory
 from ..skin.types import vec3
 from .config import Config
 from .stepper import Geom, SkinResult
@@ -58,7 +58,7 @@ class FemStepper:
             sizes |= {"velocity": 3 * n}
         if self._material.remembers:
             points = 4 * len(solved.elem) if element == "quadratic" else len(solved.tets)
-            sizes |= {"memory": StressMemory.size(self._material, points)}
+            sizes |= {"memory": RubberMemory.size(self._material, points)}
         ends = np.cumsum(list(sizes.values()))
         self._slices = {
             name: slice(int(end - size), int(end))

@@ -21,6 +21,7 @@ from scipy.special import j1
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.channels import REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
+from biotac_mj.threads import single_thread
 
 __all__ = ["CONDUCTIVITY", "EXCITATION", "FilmConduction", "sheet_laplacian", "spreading_resistance"]
 
@@ -264,14 +265,15 @@ class FilmConduction:
             :, 0
             # holds the free constant; no current flows through it, so the impedances do not depend on it
         ].mean()
-        factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
-        if info:
-            raise ValueError(
-                "the film's conductance is not positive definite: the inner surface is folded; keep the "
-                "last good state"
-            )
-        half, _ = lapack.dtbtrs(factor, weight, uplo="L")
-        return half.T @ half
+        with single_thread():
+            factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+            if info:
+                raise ValueError(
+                    "the film's conductance is not positive definite: the inner surface is folded; keep the "
+                    "last good state"
+                )
+            half, _ = lapack.dtbtrs(factor, weight, uplo="L")
+            return half.T @ half
 
 
 def sheet_laplacian(point, face, conductance):

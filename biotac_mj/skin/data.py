@@ -128,7 +128,7 @@ class SkinData:
         self.laws = WorldLaws(model, nworld)
         self.worlds.pulls = self.laws.pulls
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
-        remembers = model.material.prony or model.material.mullins or model.material.hysteresis
+        remembers = model.material.remembers
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
         self._preconditioner, self._chosen = None, _choose(model, preconditioner)
         self.steps, self._vectors = {}, None  # see `step`

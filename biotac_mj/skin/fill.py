@@ -1,10 +1,13 @@
-"""The skin at rest on its filling: inflated step by step, once for each model."""
+"""The skin at rest on its filling: inflated step by step, once for each geometry, material and options."""
 
 import copy
 import dataclasses
 import math
 
+import numpy as np
+
 from . import model as skin_model
+from .cache import kept
 from .data import SkinData
 from .geoms import GeomSet
 from .liquid import Rest
@@ -31,6 +34,26 @@ def rest_state(model) -> Rest:
         raise ValueError(
             f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
         )
+
+    def inflate():
+        rest = _inflated(model)
+        return {"vert": rest.vert, "numbers": np.array([rest.pressure, rest.volume, rest.natural_volume])}
+
+    found = kept("rest", _inputs(model), inflate)
+    return Rest(found["vert"], *found["numbers"].tolist())
+
+
+def _inputs(model):
+    """All that the rest depends on."""
+    g = model.geometry
+    mesh = [g.vert, model._elem, model.fixed, g.inner_face, g.core_vert, g.core_face]
+    core = model.core_surface.face_np if model.has_core else None
+    rubber = [model.element, model.material, model.modulus]
+    return [*mesh, core, *rubber, model.options, model.device.is_cuda]
+
+
+def _inflated(model):
+    options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(

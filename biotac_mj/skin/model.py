@@ -10,10 +10,11 @@ import warp as wp
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import liquid
+from .cache import kept
 from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law
 from .contact.limits import rest_gap
-from .contact.shapes import bake_distance_grid
+from .contact.shapes import DistanceGrid, bake_distance_grid
 from .geoms import GeomSet
 from .precondition.dense import DenseInverse
 from .precondition.sparse import SparseFactor
@@ -27,6 +28,7 @@ __all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
 # (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
 solve_rest = None
 
+_GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core [m]
 _CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
 
 
@@ -246,7 +248,6 @@ class SkinModel:
         if self.inner is not None:
             self.core_slot = self._core_slots()
         self.rest_volume, self.liquid_volume = self._volumes()
-        self.stiffness = self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
     @property
     def rubber_options(self) -> tuple[str, ...]:
@@ -340,9 +341,14 @@ class SkinModel:
         self._rest = value
 
     @functools.cached_property
+    def stiffness(self):
+        """(3 nfree, 3 nfree) at rest, without the liquid, sparse [N/m]."""
+        return self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
+
+    @functools.cached_property
     def factor(self) -> SparseFactor | DenseInverse:
         """Inverse of the rest stiffness of the free nodes, as the device's preconditioner has it."""
-        return self.dense_inverse if self.device.is_cuda else self._factor_of(self.stiffness)
+        return self.dense_inverse if self.device.is_cuda else self.factor_of(self.stiffness)
 
     @functools.cached_property
     def dense_inverse(self) -> DenseInverse:
@@ -365,9 +371,10 @@ class SkinModel:
         """
         there = Tetrahedra(vert_xpos, self._elem, self.law, self.device, self.modulus)
         stiffness = there.rest_stiffness(self.material.mu, self.material.lame)
-        return self._factor_of(self._of_free(stiffness))
+        return self.factor_of(self._of_free(stiffness))
 
-    def _factor_of(self, stiffness):
+    def factor_of(self, stiffness) -> SparseFactor:
+        """Sparse factor of a stiffness with the pattern of the skin's, over the free coordinates."""
         made = SparseFactor(stiffness, self.free, self.geometry.vert, self._elimination)
         self._elimination = made.elimination
         return made
@@ -379,8 +386,14 @@ class SkinModel:
 
 @functools.lru_cache(maxsize=8)
 def _cached_core_grid(key, spacing):
-    vert, face = key.arrays
-    return bake_distance_grid(vert, face, spacing=spacing, margin=3e-3)
+    vert, face = np.asarray(key.arrays[0], float), np.asarray(key.arrays[1], np.int32)
+
+    def bake():
+        grid = bake_distance_grid(vert, face, spacing=spacing, margin=_GRID_MARGIN)
+        return {"value": grid.value, "origin": grid.origin}
+
+    found = kept("grid", [vert, face, spacing, _GRID_MARGIN], bake)
+    return DistanceGrid(found["value"], found["origin"], spacing, vert, face)
 
 
 class _Key:

@@ -24,8 +24,8 @@ import weakref
 
 import numpy as np
 import warp as wp
-from threadpoolctl import ThreadpoolController
 
+from ..threads import single_thread
 from . import liquid
 from .contact import faces, limits
 from .data import SkinData
@@ -39,11 +39,6 @@ from .types import mat33, real, vec3
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
 
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
-
-
-@functools.cache
-def _blas():
-    return ThreadpoolController()
 
 
 def step(
@@ -68,8 +63,7 @@ def step(
     ready = prepare_step(model, data, geoms)
     _set_time(model, data, dt, core_pos, core_mat)
     data.laws.refuse_coarse_grids(geoms)
-    # matrices of a few hundred rows: more threads of BLAS only wait for each other
-    with _blas().limit(limits=1, user_api="blas"):
+    with single_thread():
         ready.run()
     if model.has_core and geoms.count and (data.worlds.reason.numpy() == worlds.INSIDE_CORE).any():
         _refuse_core(model, geoms)
@@ -198,10 +192,7 @@ class SkinStep:
             self._held_pos = wp.zeros((geoms.count, w), dtype=vec3)
             self._held_mat = wp.zeros((geoms.count, w), dtype=mat33)
             self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, w), dtype=vec3)
-            self._lawless = faces.Laws()
-            for name, variable in faces.Laws.vars.items():
-                shape = (0,) * variable.type.ndim
-                setattr(self._lawless, name, wp.zeros(shape, dtype=variable.type.dtype))
+        self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (
@@ -237,17 +228,18 @@ class SkinStep:
         """Writes the forces at `data.x` and what belongs to them, in all worlds."""
         self._once(lambda: self._evaluate(self.st.moving))
 
-    def multiply_tangent(self, p: np.ndarray) -> np.ndarray:
+    def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
         """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed nodes.
 
-        The liquid's part is in it.
+        Args:
+          at_pressure: of a liquid that keeps its pressure, instead of one that resists changes of its volume.
         """
         k, st = self.k, self.st
         k.p.assign(np.ascontiguousarray(p))
         st.running.fill_(1)
         self._once(self._multiply)
         q = k.q.numpy().astype(float)
-        if self.m.has_liquid:
+        if self.m.has_liquid and not at_pressure:
             free = self.m.free_mask.numpy()[:, None, None]
             gradient = self.d.gradient.numpy() * free
             swell = st.kappa.numpy() * (gradient * p).sum((0, 2))

@@ -26,7 +26,9 @@ __all__ = [
     "block_index",
     "commit_contacts",
     "contact_kernels",
+    "empty_laws",
     "cull_faces",
+    "distance_from_afar",
     "face_samples",
     "partial_wrench",
     "push",
@@ -71,6 +73,15 @@ class Laws:
     reach: wp.array(dtype=real)  # range of adhesion [m]
     node_area: wp.array(dtype=real)  # of the surface [nvert] [m^2]
     node_push: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
+
+
+def empty_laws(device) -> Laws:
+    """Of a surface without a ContactLaw."""
+    laws = Laws()
+    for name, variable in Laws.vars.items():
+        none = wp.zeros((0,) * variable.type.ndim, dtype=variable.type.dtype, device=device)
+        setattr(laws, name, none)
+    return laws
 
 
 def face_samples(order: int) -> np.ndarray:
@@ -182,6 +193,21 @@ def known_clearance(x0: vec3, x1: vec3, x2: vec3, free: real):
     return real(-1.0)
 
 
+@wp.func
+def distance_from_afar(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
+    """How far a face is from every geom at least [m], by one distance of its centre each."""
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
+    free = real(1.0)
+    for g in range(geoms.count):
+        y = wp.transpose(geoms.mat[g, w]) * (center - geoms.pos[g, w])
+        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        free = wp.min(free, bound - radius)
+    return free
+
+
 @wp.kernel
 def cull_faces(
     # In:
@@ -218,21 +244,13 @@ def cull_faces(
         if wp.sqrt(wp.max(a, wp.max(b, c))) < clearance[f, w]:
             near_out[f, w] = 0
             return
-    center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(
-        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
-    )
-    near = int(0)
-    free = real(1.0)
     reach = real(0.0)
     if laws.reach.shape[0] > 0:
         reach = laws.reach[w]
-    for g in range(geoms.count):
-        y = wp.transpose(geoms.mat[g, w]) * (center - geoms.pos[g, w])
-        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-        free = wp.min(free, bound - radius)
-        if bound < radius + reach:
-            near = 1
+    free = distance_from_afar(x0, x1, x2, w, geoms)
+    near = int(0)
+    if free < reach:
+        near = 1
     near_out[f, w] = near
     if near == 0:
         if touching[f, w] == 1:
@@ -249,7 +267,8 @@ def cull_faces(
 
 @functools.cache
 def contact_kernels(lawful: bool) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without."""
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_face` is a function of
+    theirs."""
     module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
 
     @wp.func
@@ -338,6 +357,59 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
             K = R * K * wp.transpose(R)
         return touched, bond, clearance, force, K, stick
 
+    @wp.func
+    def touch_face(
+        f: int,
+        w: int,
+        # In:
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: real,
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        # Out:
+        corner_out: wp.array2d(dtype=vec3),
+        block_out: wp.array2d(dtype=mat33),
+        touching_out: wp.array2d(dtype=int),
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+    ):
+        """Evaluates a face; returns how far its nearest sample is from touching [m]."""
+        nsample = sample.shape[0]
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        free = real(1.0)
+        touching = int(0)
+        total = FaceSum()
+        share = area[f] / real(nsample)
+        k = stiffness * share
+        for s in range(nsample):
+            i = f * nsample + s
+            b = sample[s]
+            touched, bond, gap, force, K, stick = touch_sample(
+                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor
+            )
+            free = wp.min(free, gap)
+            geom_out[i, w] = touched
+            bond_out[i, w] = bond
+            if touched >= 0:
+                touching = 1
+                anchor_out[i, w] = stick
+                force_out[i, w] = force
+                total = with_sample(total, b, force, K)
+        write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        return free
+
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
         # In:
@@ -373,36 +445,15 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
             return
         if near[f, w] == 0:
             return
-        nsample = sample.shape[0]
-        t = face[f]
-        x0 = x[t[0], w]
-        x1 = x[t[1], w]
-        x2 = x[t[2], w]
-        free = real(1.0)
-        touching = int(0)
-        total = FaceSum()
-        share = area[f] / real(nsample)
-        k = stiffness * share
-        for s in range(nsample):
-            i = f * nsample + s
-            b = sample[s]
-            touched, bond, gap, force, K, stick = touch_sample(
-                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor
-            )
-            free = wp.min(free, gap)
-            geom_out[i, w] = touched
-            bond_out[i, w] = bond
-            if touched >= 0:
-                touching = 1
-                anchor_out[i, w] = stick
-                force_out[i, w] = force
-                total = with_sample(total, b, force, K)
-        write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        free = touch_face(
+            f, w, face, area, sample, stiffness, stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
+            corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
+        )  # fmt: skip
         if still == 1:
-            clearance[f, w] = known_clearance(x0, x1, x2, free)
-            seen[3 * f, w] = x0
-            seen[3 * f + 1, w] = x1
-            seen[3 * f + 2, w] = x2
+            t = face[f]
+            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
+            for c in range(3):
+                seen[3 * f + c, w] = x[t[c], w]
 
     @wp.kernel(module=module, enable_backward=False)
     def by_sample(
@@ -450,7 +501,7 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
             force_out[i, w] = force
             tangent_out[i, w] = K
 
-    return types.SimpleNamespace(by_face=by_face, by_sample=by_sample)
+    return types.SimpleNamespace(touch_face=touch_face, by_face=by_face, by_sample=by_sample)
 
 
 @wp.kernel

@@ -220,12 +220,13 @@ def judge_balance(
     # single precision leaves more residual than nothing, so a vibration without contact is measured by the
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
-    st.error[w] = wp.sqrt(wp.max(rz, real(0.0)) / work)
+    st.error[w] = wp.sqrt(wp.abs(rz) / work)
     settled = int(1)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
             settled = 0
-    if rz <= tolerance * tolerance * work and settled == 1:
+    # where the preconditioner is indefinite by rounding, a negative product is as far from balance
+    if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
     elif st.iterations[w] == limit:
         st.active[w] = 0

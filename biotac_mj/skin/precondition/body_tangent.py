@@ -12,6 +12,7 @@ of them.
 import numpy as np
 import warp as wp
 
+from ..rigid import rigid_motions
 from ..types import mat33, real, vec3
 
 __all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
@@ -42,9 +43,7 @@ def body_tangent(nodes, compliance, solver, blocks, x, nvert):
     size, m = len(compliance), 3 * len(nodes)
     springs = np.zeros((size, size))
     springs[:m, :m] = assemble(nodes, *blocks, nvert)
-    rigid = np.zeros((size, 6))
-    rigid[:m].reshape(-1, 3, 6)[:, :, :3] = np.eye(3)
-    rigid[:m].reshape(-1, 3, 6)[:, :, 3:] = -_skew(x[nodes])
+    rigid = rigid_motions(x[nodes], size)
     pull = springs @ rigid
     give = compliance @ pull
     give -= compliance @ solver(give)
@@ -64,12 +63,6 @@ def assemble(nodes, faces, blocks, nvert):
         if a != b:
             np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
     return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
-
-
-def _skew(v):
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return out - np.swapaxes(out, -1, -2)
 
 
 @wp.kernel

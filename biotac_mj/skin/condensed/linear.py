@@ -10,6 +10,8 @@ import numpy as np
 from scipy.linalg.blas import sgemv
 from scipy.linalg.lapack import dgesv, spotrf, spotrs
 
+from .faces import CandidateFaces
+
 __all__ = ["Compliance", "Lumped", "Springs", "solve"]
 
 _ROUNDING = 3e-4  # of entries of W, which come in half precision
@@ -33,7 +35,7 @@ class Springs:
       on: coordinates with stiffness, outer ones first.
     """
 
-    def __init__(self, faces, core, ninner):
+    def __init__(self, faces: CandidateFaces, core: tuple | None, ninner: int):
         self._faces, self.n = faces, int(faces.count[1])
         self._node = faces.touched
         self.outer = (3 * self._node[:, None] + _AXES).ravel()
@@ -44,7 +46,7 @@ class Springs:
             self._pressed = self._inner.nonzero()[0]
             self.on = np.concatenate([self.outer, 3 * self.n + self._pressed])
 
-    def dense(self):
+    def dense(self) -> np.ndarray:
         """Stiffness (k, k) of the coordinates `on`."""
         m = len(self.outer)
         if not self._core:
@@ -57,7 +59,7 @@ class Springs:
         D[m:, m:] = (B.T * k) @ B
         return D
 
-    def product(self, p):
+    def product(self, p: np.ndarray) -> np.ndarray:
         """D p for p (n,) of all coordinates."""
         m = 3 * self.n
         out = np.zeros(len(p))
@@ -68,11 +70,11 @@ class Springs:
             out[m:] = (k * (B @ p[m:])) @ B
         return out
 
-    def lumped(self):
+    def lumped(self) -> tuple[np.ndarray, np.ndarray]:
         """Stiffness lumped at the touched nodes: (k, 3, 3) of outer and (l,) of inner ones."""
         return self._faces.lumped[self._node], self._inner[self._pressed] if self._core else _NONE
 
-    def add_inverse_lumped(self, matrix):
+    def add_inverse_lumped(self, matrix: np.ndarray) -> None:
         """Adds the inverse of the stiffness, lumped at the nodes, to a matrix (k, k) over the coordinates
         `on`."""
         block, inner = self.lumped()
@@ -96,10 +98,10 @@ class Compliance:
       rest: (n, n) float32, symmetric. a: (n,) or None without liquid.
     """
 
-    def __init__(self, rest, scale, share=0.0, a=None):
+    def __init__(self, rest: np.ndarray, scale: float, share: float = 0.0, a: np.ndarray | None = None):
         self._rest, self._scale, self._share, self._a = rest, scale, share, a
 
-    def __matmul__(self, p):
+    def __matmul__(self, p: np.ndarray) -> np.ndarray:
         """W p of p (n,)."""
         out = sgemv(self._scale, self._rest.T, p).astype(
             float
@@ -108,7 +110,7 @@ class Compliance:
             out -= (self._share * float(self._a @ p)) * self._a
         return out
 
-    def part(self, on, dtype=float):
+    def part(self, on: np.ndarray, dtype=float) -> np.ndarray:
         """W over the coordinates `on` (k,): (k, k)."""
         out = self._rest.take(on, 0).take(on, 1).astype(dtype, copy=False)
         out *= self._scale
@@ -135,7 +137,7 @@ class Lumped:
         if info:
             raise np.linalg.LinAlgError("the compliance over the contact is not positive definite")
 
-    def fits(self, springs) -> bool:
+    def fits(self, springs: Springs) -> bool:
         """Whether the same is touched and the stiffness of the nodes is nearly that of these springs."""
         if len(self.on) != len(springs.on) or not (self.on == springs.on).all():
             return False
@@ -144,18 +146,20 @@ class Lumped:
             for new, old in zip(springs.lumped(), self._blocks)
         )
 
-    def solve(self, b):
+    def solve(self, b: np.ndarray) -> np.ndarray:
         """(1/D' + W) x = b for b (k,) or (k, m)."""
         return spotrs(self._factor, b, lower=1)[0]
 
-    def stiffness(self, rigid):
+    def stiffness(self, rigid: np.ndarray) -> np.ndarray:
         """G' (1/D' + W)^-1 G for G (n, m): stiffness against motions of what touches; symmetric, positive
         semi-definite."""
         G = rigid[self.on]
         return G.T @ self.solve(G)
 
 
-def solve(W: Compliance, springs: Springs, r, lumped: Lumped | None):
+def solve(
+    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None
+) -> tuple[np.ndarray, np.ndarray, Lumped | None]:
     """Solves (1 + D W) df = r.
 
     Args:

@@ -3,10 +3,10 @@ about."""
 
 import numpy as np
 import scipy.sparse as sp
-import warp as wp
 
-from . import elasticity, liquid
-from .types import vec3
+from ..data import SkinData
+from ..geoms import GeomSet
+from ..step import prepare_step
 
 __all__ = ["rest_tangent"]
 
@@ -20,37 +20,20 @@ def rest_tangent(model) -> sp.csc_matrix:
     Args:
       model: SkinModel on the CPU.
     """
-    from .data import SkinData
-
     data = SkinData(model)
-    data.x.numpy()[:, 0] = model.rest.vert
-    model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.product)
+    at_rest = prepare_step(model, data, GeomSet([], []))
+    at_rest.evaluate_forces()
+    data.worlds.pressure.fill_(model.rest.pressure)
     pattern = _neighbours(model.nvert, model._elem)
     color = _colors(pattern)
-    if model.has_liquid:
-        nface = len(model.inner.face)
-        wet = wp.full(
-            (nface, 1), value=wp.vec3d(1 / 3, 1 / 3, 1 / 3), dtype=vec3, device=model.device
-        )  # all: the skin is off its core
-        bend, nodal = (
-            wp.zeros((3 * nface, 1), dtype=vec3, device=model.device),
-            wp.zeros((model.nvert, 1), dtype=vec3, device=model.device),
-        )
     row, column, value = [], [], []
     for c in range(color.max() + 1):
         nodes = np.flatnonzero(color == c)
         part = pattern[:, nodes].tocoo()
         for axis in range(3):
-            data.direction.numpy()[...] = 0
-            data.direction.numpy()[nodes, 0, axis] = 1
-            model.elasticity.product(data.elastic, data.mu, data.lam, data.x, data.direction, data.product)
-            q = data.product.numpy()[:, 0].copy()
-            if model.has_liquid:
-                inputs = [model.inner.face, wet, data.x, data.direction]
-                wp.launch(liquid.gradient_derivative, (nface, 1), inputs, [bend], device=model.device)
-                inputs = [model.inner.start, model.inner.slot, bend, 1.0, 0]
-                wp.launch(elasticity.gather, (model.nvert, 1), inputs, [nodal], device=model.device)
-                q -= model.rest.pressure * nodal.numpy()[:, 0]
+            direction = np.zeros((model.nvert, 1, 3))
+            direction[nodes, 0, axis] = 1
+            q = at_rest.multiply_tangent(direction, at_pressure=True)[:, 0]
             row.append((3 * part.row[:, None] + np.arange(3)).ravel())
             column.append(np.repeat(3 * nodes[part.col] + axis, 3))
             value.append(q[part.row].ravel())

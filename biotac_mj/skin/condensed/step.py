@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 
-from .condensed_linear import Compliance, Lumped, Springs, solve
+from ..rigid import rigid_motions
+from .linear import Compliance, Lumped, Springs, solve
 
 __all__ = ["Memory", "Outcome", "Step"]
 
@@ -49,7 +50,7 @@ class Memory:
     contacts: np.ndarray
 
     @classmethod
-    def rest(cls, ngeom):
+    def rest(cls, ngeom: int) -> "Memory":
         none = np.zeros(0)
         pos, mat = np.zeros((ngeom, 3)), np.zeros((ngeom, 3, 3))
         return cls(
@@ -90,7 +91,7 @@ class Outcome:
 class Step:
     """One step of a CondensedSkin: candidates, Newton's method, results."""
 
-    def __init__(self, skin, memory, u, geom_pos, geom_mat, motion):
+    def __init__(self, skin, memory: Memory, u: np.ndarray, geom_pos, geom_mat, motion: np.ndarray):
         self.skin, self.memory, self.u = skin, memory, u
         self.pose = geom_pos, geom_mat
         moved = np.abs(motion).max(initial=0.0)
@@ -127,7 +128,7 @@ class Step:
             self.inner = self.meeting.node
         return len(self.faces) + len(self.inner) > count
 
-    def missed(self):
+    def missed(self) -> bool:
         """Whether something touches that was no candidate; it is one now."""
         self.reach = self.share = 0.0
         return self._choose()
@@ -187,7 +188,7 @@ class Step:
         softening = s.correction.softening(depth, spread, squeezed)
         return np.array([softening, s.correction.swelling(self.pressure, s.model.material.youngs_modulus)])
 
-    def run(self):
+    def run(self) -> None:
         """Newton's method, repeated until the cavity's exact volume agrees."""
         s = self.skin
         if not len(self.faces) and not len(self.force):
@@ -336,11 +337,7 @@ class Step:
         springs = self._springs()
         if not len(springs.outer):  # only held nodes are touched
             return
-        rigid = np.zeros((len(self.c), 6))
-        motion = rigid[: self.m].reshape(-1, 3, 6)
-        motion[:, :, :3] = np.eye(3)
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            motion[:, i, 3 + j], motion[:, i, 3 + k] = x[:, k], -x[:, j]
+        rigid = rigid_motions(x, len(self.c))
         lumped = self.lumped if self.lumped and self.lumped.fits(springs) else Lumped(springs, self.W)
         for k in range(len(out)):
             mine = rigid

@@ -7,12 +7,15 @@ them, which also fixes the order of sums."""
 import numpy as np
 import warp as wp
 
-from .contact import Geoms, touch_face
-from .types import mat33, real, vec3
+from ..contact.faces import Geoms, Laws, contact_kernels, distance_from_afar, empty_laws
+from ..geoms import GeomSet
+from ..types import mat33, real, vec3
 
 __all__ = ["CandidateFaces"]
 
 wp.set_module_options({"enable_backward": False})
+
+touch_face = contact_kernels(False).touch_face
 
 
 @wp.kernel
@@ -26,6 +29,7 @@ def _touch(
     stiffness: real,
     stick_ratio: real,
     geoms: Geoms,
+    laws: Laws,
     x: wp.array2d(dtype=vec3),
     x_last: wp.array2d(dtype=vec3),
     anchor_geom: wp.array2d(dtype=int),
@@ -48,12 +52,16 @@ def _touch(
         lumped_out[i] = mat33()
         touched_out[i] = 0
     for f in range(count[0]):
-        touch_face(
-            f, 0, face, area, sample, stiffness, stick_ratio, geoms, x, x_last, anchor_geom,
-            anchor, corner_out, block_out, touching_out, geom_out, anchor_out, sample_force_out,
-        )  # fmt: skip
+        t = face[f]
+        touching_out[f, 0] = 0
+        for s in range(sample.shape[0]):
+            geom_out[f * sample.shape[0] + s, 0] = -1
+        if distance_from_afar(x[t[0], 0], x[t[1], 0], x[t[2], 0], 0, geoms) < real(0.0):
+            touch_face(
+                f, 0, face, area, sample, stiffness, stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
+                corner_out, block_out, touching_out, geom_out, geom_out, anchor_out, sample_force_out,
+            )  # fmt: skip
         if touching_out[f, 0] == 1:
-            t = face[f]
             b01 = block_out[6 * f + 1, 0]
             b02 = block_out[6 * f + 2, 0]
             b12 = block_out[6 * f + 4, 0]
@@ -201,11 +209,11 @@ class CandidateFaces:
         the candidates' nodes (-1: it is held), as Warp arrays.
 
     Attributes:
-      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (nnode,). geom, trial: of the samples; all
-        of the last `evaluate`.
+      force: (nnode, 3) [N]. lumped: (nnode, 3, 3) [N/m]. touched: (k,) numbers of the nodes that are touched;
+        all of the last `evaluate`.
     """
 
-    def __init__(self, model, geoms, x, x_last, slot):
+    def __init__(self, model, geoms: GeomSet, x: wp.array, x_last: wp.array, slot: wp.array):
         self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = (
             model,
             geoms,
@@ -255,6 +263,7 @@ class CandidateFaces:
                 m.contact_stiffness,
                 m.options.stick_ratio,
                 geoms.struct,
+                empty_laws("cpu"),
                 self._x,
                 self._last,
                 anchor_geom,
@@ -273,7 +282,9 @@ class CandidateFaces:
     def _record(self, kernel, inputs, outputs):
         return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
 
-    def choose(self, number, face, area, nnode, contacts):
+    def choose(
+        self, number: np.ndarray, face: np.ndarray, area: np.ndarray, nnode: int, contacts: np.ndarray
+    ) -> None:
         """Takes faces (n,), their nodes and areas (n, 3), (n,) and the sticking contacts of the last step (k,
         5) that are theirs."""
         n, nsample = len(number), self._nsample
@@ -292,26 +303,26 @@ class CandidateFaces:
             self._anchor_geom[here, 0], self._anchor[here, 0] = contacts[known, 1], contacts[known, 2:]
 
     @property
-    def force(self):
+    def force(self) -> np.ndarray:
         return self._force[: self.count[1]]
 
     @property
-    def lumped(self):
+    def lumped(self) -> np.ndarray:
         return self._lumped[: self.count[1]]
 
     @property
-    def touched(self):
+    def touched(self) -> np.ndarray:
         """Numbers of the nodes that are touched."""
         return self._touched[: self.count[1]].nonzero()[0]
 
-    def product(self, p):
+    def product(self, p: np.ndarray) -> np.ndarray:
         """Stiffness times p (3 nnode,)."""
         n = self.count[1]
         self._p[:n] = p.reshape(n, 3)
         self._multiply()
         return self._result[:n].ravel()
 
-    def matrix(self, node):
+    def matrix(self, node: np.ndarray) -> np.ndarray:
         """Stiffness over the touched nodes (k,): (3 k, 3 k)."""
         n = 3 * len(node)
         if self._dense is None or len(self._dense[0]) < n * n:
@@ -322,7 +333,7 @@ class CandidateFaces:
         self._dense[1]()
         return self._dense[0][: n * n].reshape(n, n)
 
-    def contacts(self):
+    def contacts(self) -> np.ndarray:
         """(k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches."""
         nsample = self._nsample
         geom = self._geom[: len(self.number) * nsample, 0]
@@ -332,12 +343,12 @@ class CandidateFaces:
         out[:, 1], out[:, 2:] = geom[here], self._trial[here, 0]
         return out
 
-    def sample_forces(self):
+    def sample_forces(self) -> np.ndarray:
         """(k, 3) forces on the samples that `contacts` lists [N]."""
         n = len(self.number) * self._nsample
         return self._sample_force[:n, 0][self._geom[:n, 0] >= 0]
 
-    def loads(self):
+    def loads(self) -> tuple[np.ndarray, np.ndarray]:
         """Force and moment (ngroup, 6) of the geoms on the skin, and each group's share (ngroup, nnode) in
         the contact of each node."""
         self._loads()

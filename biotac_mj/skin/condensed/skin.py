@@ -8,7 +8,7 @@ part. What is left is the contact law f = F(u) over the candidates, tens of coor
 method with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin,
 `contact.touch_face`).
 
-What skin does differently from a linear one, s and c, is fitted to the full FEM (`condensed_correction`).
+What skin does differently from a linear one, s and c, is fitted to the full FEM (`correction`).
 """
 
 import math
@@ -19,16 +19,16 @@ import warp as wp
 from scipy.linalg.blas import saxpy
 from scipy.spatial import cKDTree
 
-from . import liquid
-from .condensed_correction import correction
-from .condensed_faces import CandidateFaces
-from .condensed_search import NearSearch
-from .condensed_step import Memory, Outcome, Step
+from ...threads import single_thread
+from .. import liquid
+from ..geoms import GeomSet
+from ..types import real, vec3
+from .compliance import SurfaceCompliance
 from .core_contact import CoreContact
-from .geoms import GeomSet
-from .rest_tangent import rest_tangent
-from .surface_compliance import SurfaceCompliance
-from .types import real, vec3
+from .correction import correction
+from .faces import CandidateFaces
+from .search import NearSearch
+from .step import Memory, Outcome, Step
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
@@ -81,11 +81,7 @@ _compliances = weakref.WeakKeyDictionary()
 def _compliance(model, outer, inner, direction, cache):
     """The rows of a model, shared by all its skins."""
     if cache not in _compliances.get(model, {}):
-        factor, stiffness = model.factor, model._stiffness
-        if model.rest.pressure:
-            stiffness = rest_tangent(model)
-            factor = model._invert(stiffness)
-        made = SurfaceCompliance(model, factor, stiffness, outer, inner, direction, cache)
+        made = SurfaceCompliance(model, outer, inner, direction, cache)
         _compliances.setdefault(model, {})[cache] = made
     return _compliances[model][cache]
 
@@ -106,7 +102,7 @@ class CondensedSkin:
     Args:
       model: SkinModel on the CPU, quasi-static.
       geoms: GeomSet of one world.
-      cache: whether to keep the compliance on disk (see `surface_compliance`).
+      cache: whether to keep the compliance on disk (see `compliance`).
 
     Raises:
       ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the
@@ -122,10 +118,10 @@ class CondensedSkin:
             raise ValueError(
                 "the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier"
             )
-        if model.extensions:
+        if model.rubber_options:
             raise ValueError(
                 "the condensed tier is elastic, the same everywhere: leave "
-                f"{' and '.join(model.extensions)} out, or choose the full tier"
+                f"{' and '.join(model.rubber_options)} out, or choose the full tier"
             )
         if model.options.contact_law is not None:
             raise ValueError(
@@ -206,7 +202,7 @@ class CondensedSkin:
             _strain, [count, number, force, outer, opposite, rest, self._x_wp], [out]
         )
 
-    def strain(self, number, force):
+    def strain(self, number: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
         """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces
         (n,), as the skin is now."""
         n = len(number)
@@ -214,7 +210,7 @@ class CondensedSkin:
             return 0.0, 0.0, 0.0
         self._touched[:n], self._touched_force[:n], self._touched_count[0] = number, force, n
         self._measure_strain()
-        return self._strains.tolist()
+        return tuple(self._strains.tolist())
 
     def _prepare_liquid(self):
         m = self.model
@@ -253,7 +249,7 @@ class CondensedSkin:
 
     # --- a step  ---
 
-    def solve(self, memory: Memory, geom_pos, geom_mat) -> Outcome:
+    def solve(self, memory: Memory, geom_pos: np.ndarray, geom_mat: np.ndarray) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
         alone.
 
@@ -277,16 +273,17 @@ class CondensedSkin:
         self.search.refuse_core(geom_pos, geom_mat)
         u = self.displacement(memory)
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
-        for _ in range(4):
-            step.run()
-            if not step.missed():
-                break
-        out = step.outcome()
+        with single_thread():
+            step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
+            for _ in range(4):
+                step.run()
+                if not step.missed():
+                    break
+            out = step.outcome()
         self._keep(out.memory, step.u)
         return out
 
-    def clear(self, geom_pos, geom_mat, margin) -> bool:
+    def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         return self.search.clear(geom_pos, geom_mat, margin)
 

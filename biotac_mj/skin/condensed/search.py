@@ -1,4 +1,4 @@
-"""Which faces of the condensed skin a geom may touch, and whether one is inside the core.
+"""Which faces of a skin a geom may touch, and whether one is inside the core.
 
 Only a region around the geoms is searched, wider than what they and the skin can have moved since it was
 chosen. A few regions are kept: BioTacs of one model share a skin. Which one is used changes nothing but the
@@ -9,9 +9,10 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from .contact import Geoms
-from .shapes import distance_bound
-from .types import real, vec3
+from ..contact.faces import Geoms
+from ..geoms import GeomSet
+from ..contact.shapes import distance_bound
+from ..types import real, vec3
 
 __all__ = ["NearSearch"]
 
@@ -110,7 +111,7 @@ class NearSearch:
       rest: (nvert, 3) nodes at rest [m]. x_wp, x: (nvert, 1) present nodes, as Warp array and as its view.
     """
 
-    def __init__(self, model, geoms, rest, x_wp, x):
+    def __init__(self, model, geoms: GeomSet, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
         self._model, self._geoms, self._rest, self._x = model, geoms, rest, x
         self._nface = len(model.outer.face)
 
@@ -144,7 +145,7 @@ class NearSearch:
             kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
         ).launch
 
-    def faces(self, reach, moved, pos, mat) -> np.ndarray:
+    def faces(self, reach: float, moved: float, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest
         [m]."""
         if not self._geoms.count:
@@ -156,7 +157,7 @@ class NearSearch:
             self._asked[: len(region.faces)], self._loaded = region.faces, region
         return self._look(len(region.faces), reach)
 
-    def clear(self, pos, mat, margin) -> bool:
+    def clear(self, pos: np.ndarray, mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         if not self._geoms.count:
             return True
@@ -167,7 +168,7 @@ class NearSearch:
         self._x[:, 0] = self._rest
         return not len(self.faces(margin, 0.0, pos, mat))
 
-    def refuse_core(self, pos, mat):
+    def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Raises ValueError for a geom deep inside the core."""
         if not (self._model.has_core and self._geoms.count):
             return
@@ -180,8 +181,7 @@ class NearSearch:
             g = int(self._clearance.argmin())
             raise ValueError(
                 f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid "
-                "core: "
-                "no skin fits between them; move it out, press less deep or take smaller steps"
+                "core: no skin fits between them; move it out, press less deep or take smaller steps"
             )
 
     def _travel(self, pos, mat):

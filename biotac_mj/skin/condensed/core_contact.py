@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from .contact import Geoms, face_samples
-from .shapes import distance_bound
-from .types import real, vec3
+from ..contact.faces import Geoms, face_samples
+from ..contact.shapes import distance_bound
+from ..types import real, vec3
 
 __all__ = ["CoreContact", "Meeting"]
 
@@ -140,7 +140,7 @@ class Meeting:
     weight: np.ndarray
     stiffness: np.ndarray
 
-    def force(self, u):
+    def force(self, u: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Forces (k,) at displacements u (k,), and the weights and stiffness of the samples that touch."""
         gap = self.gap + self.weight @ (u - self.at)
         closed = np.flatnonzero(gap < 0)
@@ -160,7 +160,7 @@ class CoreContact:
       node: (nnode,) free nodes. direction: (nnode, 3) away from the core.
     """
 
-    def __init__(self, model, rest, x_wp, x):
+    def __init__(self, model, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
         free = np.zeros(model.nvert, bool)
         free[model.free] = True
         self._face = model.core_surface.face_np
@@ -220,7 +220,7 @@ class CoreContact:
         self._look()
         return self._gap[face]
 
-    def meet(self, u, share, last: Meeting | None) -> Meeting:
+    def meet(self, u: np.ndarray, share: float, last: Meeting | None) -> Meeting:
         """Faces with a sample nearer to the core than a share of their displacement, and those of the last
         meeting.
 

@@ -1,8 +1,8 @@
 """What a skin does differently from a linear one, in three numbers: fitted to the full FEM
 (`benchmarks/condensed.py --fit`).
 
-softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q e^2),  H = h (1 + (r / b)^2): contact forces move the
-skin by s times as much.
+softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: contact
+           forces move the skin by s times as much.
            Skin rolls around what is pressed into it by d, the more so the less its forces are spread (by r,
            their radius of gyration); squeezed between geom and core by the share e of its thickness, rubber
            stiffens (q > 0).
@@ -39,7 +39,7 @@ class Correction:
     squeezed: float = 0.0
     narrow: float = math.inf
 
-    def softening(self, depth, spread, squeezed):
+    def softening(self, depth: float, spread: float, squeezed: float) -> float:
         """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed
         share."""
         wide = 1 + spread / self.width**2
@@ -48,11 +48,11 @@ class Correction:
             1 + self.squeeze * math.sqrt(wide) * squeezed**2
         )
 
-    def swelling(self, pressure, youngs_modulus):
+    def swelling(self, pressure: float, youngs_modulus: float) -> float:
         """c at a pressure above that at rest [Pa]."""
         return 1 / (1 + max(pressure, 0.0) / (self.stretch * youngs_modulus))
 
-    def measured(self, poissons_ratio, squeezed, spread=0.0) -> bool:
+    def measured(self, poissons_ratio: float, squeezed: float, spread: float = 0.0) -> bool:
         """Whether the error has been measured there and is not worse than the docs state; arguments as in
         `softening`."""
         low, high = self.poissons_ratio

@@ -1,0 +1,161 @@
+"""What a process pays before its first step: import, attach, first step that touches, with both tiers.
+
+    python benchmarks/startup.py --json out/startup.json [--skins coarse,default] [--tiers full,condensed]
+                                 [--fills 0,1e-7] [--threads 1] [--runs 3] [--against DIR]
+
+Each run is a process of its own; one before the counted ones fills the caches (compiled kernels, and what the
+skin keeps on disk). Seconds of processor time and wall time, least of the runs, each stage for itself. "step"
+compiles the model too, in which MuJoCo asks the plugin for a first solution. fill: liquid beyond what the
+unstressed skin holds [m^3].
+
+--against DIR: the same of another checkout, in turns with this one, and the ratio of this one's processor
+time to that one's. --threads: of BLAS and OpenMP; without it the libraries choose, and threads that wait
+count as processor time."""
+
+import argparse
+import contextlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+
+__all__ = ["main", "measure"]
+
+HERE = pathlib.Path(__file__).resolve().parents[1]
+STAGES = ("import", "attach", "step")
+APART = ("plugin", "mjcf", "assets")  # packages that lie beside biotac_mj in a checkout
+RADIUS, PLACE = 3.5e-3, (-12e-3, -11.5e-3, 0.0)  # of the ball, 0.2 mm in the pad [m]
+
+
+def start(tier: str, skin: str, fill: float) -> dict[str, tuple[float, float]]:
+    """Processor and wall seconds of each stage, in this process."""
+    clocks = [(time.process_time(), time.perf_counter())]
+
+    def lap():
+        clocks.append((time.process_time(), time.perf_counter()))
+
+    import mujoco
+
+    import biotac_mj
+
+    lap()
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ball = spec.worldbody.add_body(name="ball", pos=PLACE)
+    ball.add_freejoint()
+    ball.add_geom(size=[RADIUS, 0, 0], mass=0.01)
+    options = {"skin": {"fill_volume": fill}} if fill else {}
+    handle = biotac_mj.attach(spec, tier=tier, skin=skin, options=options)
+    lap()
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    lap()
+    if not abs(handle.read(data, "contact_force")[:3]).max() > 1e-3:
+        raise RuntimeError("the ball does not touch the skin")
+    laps = [(b[0] - a[0], b[1] - a[1]) for a, b in zip(clocks, clocks[1:])]
+    return dict(zip(STAGES, laps, strict=True))
+
+
+@contextlib.contextmanager
+def importable(root: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A folder for PYTHONPATH: the root itself, or of a plain checkout one of symbolic links.
+
+    Raises:
+      FileNotFoundError: there is no biotac_mj.
+    """
+    package = root.resolve() / "biotac_mj"
+    if not (package / "__init__.py").is_file():
+        raise FileNotFoundError(f"{root} has no biotac_mj/__init__.py: give the root of a checkout")
+    if all((package / name).exists() for name in APART):
+        yield package.parent
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        links = pathlib.Path(folder) / "biotac_mj"
+        links.mkdir()
+        for path in (*package.iterdir(), *(package.parent / name for name in APART)):
+            if path.exists() and not (links / path.name).exists():
+                (links / path.name).symlink_to(path)
+        yield pathlib.Path(folder)
+
+
+def measure(folder: pathlib.Path, case: tuple, threads: int | None) -> dict[str, list[float]]:
+    """Stage -> processor and wall seconds, of a new process that imports from the folder.
+
+    Raises:
+      RuntimeError: the process failed.
+    """
+    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    env = {name: value for name, value in os.environ.items() if name not in limits}
+    env |= {"PYTHONPATH": str(folder)} | (dict.fromkeys(limits, str(threads)) if threads else {})
+    command = [sys.executable, __file__, "--child", *map(str, case)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"start of {case} from {folder} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _least(runs):
+    """Of each stage; and all stages together."""
+    least = {stage: [min(run[stage][clock] for run in runs) for clock in (0, 1)] for stage in STAGES}
+    least["all"] = [sum(least[stage][clock] for stage in STAGES) for clock in (0, 1)]
+    return {stage: {"cpu_s": cpu, "wall_s": wall} for stage, (cpu, wall) in least.items()}
+
+
+def main(arguments=None) -> int:
+    """The command; writes the JSON and prints a line for each case."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--skins", default="coarse,default")
+    parser.add_argument("--tiers", default="full,condensed")
+    parser.add_argument("--fills", default="0,1e-7")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--against", type=pathlib.Path)
+    args = parser.parse_args(arguments)
+    from accuracy import write_json
+
+    rows = []
+    cases = [
+        (tier, skin, float(fill))
+        for skin in args.skins.split(",")
+        for fill in args.fills.split(",")
+        for tier in args.tiers.split(",")
+    ]
+    with contextlib.ExitStack() as stack:
+        roots = {"here": HERE} | ({"against": args.against} if args.against else {})
+        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+        for case in cases:
+            runs = {name: [] for name in folders}
+            for _ in range(1 + args.runs):
+                for name, folder in folders.items():
+                    runs[name].append(measure(folder, case, args.threads))
+            row = dict(zip(("tier", "skin", "fill"), case, strict=True)) | {"threads": args.threads}
+            rows.append(row | {name: _least(found[1:]) for name, found in runs.items()})
+            print(_line(rows[-1]), flush=True)
+            write_json(args.json, {"runs": args.runs, "rows": rows})
+    return 0
+
+
+def _line(row):
+    """Processor seconds of the stages, and the ratio to the other checkout."""
+    text = f"{row['tier']:<10}{row['skin']:<9}{row['fill']:<8g}"
+    for stage in (*STAGES, "all"):
+        cpu = row["here"][stage]["cpu_s"]
+        text += f"{stage:>8} {cpu:.2f} s"
+        if "against" in row:
+            text += f" ({cpu / row['against'][stage]['cpu_s']:.2f})"
+    return text + f"   wall {row['here']['all']['wall_s']:.2f} s"
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        print(json.dumps(start(sys.argv[2], sys.argv[3], float(sys.argv[4]))))
+    else:
+        sys.exit(main())
