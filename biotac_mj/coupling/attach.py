@@ -8,13 +8,14 @@ import mujoco
 import numpy as np
 
 from ..plugin import PLUGIN_NAME
+from ..sensor.channels import ELECTRODES, WIDTHS
 from . import skins
 from .config import Config
 from .stepper import check_names
 
 __all__ = ["Handle", "attach"]
 
-CHANNELS = ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
+CHANNELS = {**WIDTHS, "contact_force": 6, "status": 5}  # width of each in sensor data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,8 +198,8 @@ def _model(geometry):
             continue
         mesh.file = ""
         mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
-    for i, position in enumerate(geometry.electrode_pos, start=1):
-        spec.site(f"e{i}").pos = position
+    for name, position in zip(ELECTRODES, geometry.electrode_pos):
+        spec.site(name).pos = position
     node, face = np.unique(geometry.outer_face, return_inverse=True)
     skin = spec.skins[0]
     skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()

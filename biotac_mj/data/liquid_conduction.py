@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ..sensor.channels import DISCS, NELECTRODE
 from ..sensor.core_surface import CoreSurface
 
 __all__ = ["LiquidConduction", "column_tetrahedra"]
@@ -72,7 +73,7 @@ class LiquidConduction:
             number[triangle],
             disc[keep],
         )
-        missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in range(23) if (disc == e).sum() < 10]
+        missing = [name for e, name in enumerate(DISCS) if (disc == e).sum() < 10]
         if missing:
             raise ValueError(
                 f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; move "
@@ -99,11 +100,11 @@ class LiquidConduction:
         solver = CholeskySolverD(
             self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO
         )
-        current = np.zeros((self._size, 19))
-        current[np.arange(19), np.arange(19)] = 1
+        current = np.zeros((self._size, NELECTRODE))
+        current[np.arange(NELECTRODE), np.arange(NELECTRODE)] = 1
         potential = np.empty_like(current)
         solver.solve(current, potential)
-        return potential[np.arange(19), np.arange(19)] / self.conductivity
+        return potential[np.arange(NELECTRODE), np.arange(NELECTRODE)] / self.conductivity
 
     def matrix(self, nodes):
         """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
@@ -165,13 +166,13 @@ class LiquidConduction:
         """Nodes of one disc share an unknown, 0..18 for e1..e19; those of X1..X4 have none."""
         n = len(disc)
         self._unknown = np.full(len(self._layers) * n, -1)
-        bottom = np.where((disc >= 0) & (disc < 19), disc, -1)
+        bottom = np.where((disc >= 0) & (disc < NELECTRODE), disc, -1)
         free = np.flatnonzero(disc < 0)
-        bottom[free] = 19 + np.arange(len(free))
+        bottom[free] = NELECTRODE + np.arange(len(free))
         self._unknown[:n] = bottom
         above = (len(self._layers) - 1) * n
-        self._unknown[n:] = 19 + len(free) + np.arange(above)
-        self._size = 19 + len(free) + above
+        self._unknown[n:] = NELECTRODE + len(free) + np.arange(above)
+        self._size = NELECTRODE + len(free) + above
 
 
 def column_tetrahedra(triangle, n, layers):

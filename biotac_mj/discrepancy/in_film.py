@@ -22,11 +22,8 @@ class RoughFilm(FilmConduction):
 
     def __init__(self, film, power):
         self.__dict__.update(film.__dict__)
-        self._power, self._rest = power, film.film(film.geometry.vert)[1]
-
-    def film(self, vert_xpos):
-        middle, thickness = super().film(vert_xpos)
-        return middle, self._rest * (thickness / self._rest) ** self._power
+        self._power = power
+        self._set_alone()
 
 
 def left(rate, clock) -> float:
