@@ -11,6 +11,7 @@ import numpy as np
 import tqdm
 
 from . import approach, plugin, press_indenter
+from .geometry.rigid import matrix, quaternion, quaternion_from_y
 from .geometry.skin_geometry import SkinGeometry
 from .press_record import PressRecord
 from .sensor.channels import CHANNELS
@@ -110,12 +111,6 @@ class Path:
         return self.start + depth * self.direction + slid * self.slide_direction
 
 
-def _rotation_from_y(direction):
-    """Quaternion of the smallest rotation that takes +y to a unit direction."""
-    quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
-    return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
-
-
 def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options: PressOptions) -> Path:
     """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the
     depth, then along the skin.
@@ -141,7 +136,7 @@ def plan_path(geometry: SkinGeometry, indenter: press_indenter.Indenter, options
         raise ValueError("slide_direction is along the press: give one across it")
     across = across / max(np.linalg.norm(across), 1e-30)
 
-    quat = _rotation_from_y(direction)
+    quat = quaternion_from_y(direction)
     spec = mujoco.MjSpec()
     back = 0.05 + np.abs(indenter.vert).max()  # clear of the finger
     press_indenter.add_indenter(
@@ -207,12 +202,10 @@ def build_scene(indenter: press_indenter.Indenter, path: Path, options: PressOpt
                 "flat geom:box"
             )
         body.mass, body.inertia, body.explicitinertial = _SERVO_MASS, [1e-3] * 3, True
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, path.quat)
         for name, axis in (("press", path.direction), ("slide", path.slide_direction))[
             : 2 if options.slide else 1
         ]:
-            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=rotation.reshape(3, 3).T @ axis)
+            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix(path.quat).T @ axis)
             servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             servo.set_to_position(kp=_SERVO_STIFFNESS, dampratio=1.0)
     press_indenter.add_indenter(spec, body, indenter, **look)
@@ -249,8 +242,7 @@ def _stage(spec):
     eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
+    quat = quaternion(np.stack([x, np.cross(z, x), z], axis=1))
     spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
     spec.worldbody.add_light(
         pos=[-0.1, -0.3, -0.1],

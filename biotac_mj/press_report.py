@@ -1,12 +1,12 @@
 """The picture of a press and its table on the terminal. No window and no global state of matplotlib is
 touched."""
 
-import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from .geometry.rigid import matrix
 from .press_record import PressRecord, replacing
 
 __all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "write_picture"]
@@ -95,9 +95,7 @@ def draw_surface(axes, record: PressRecord, step: int) -> None:
       axes: with projection "3d".
     """
     geometry = record.geometry
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(record.indenter_quat[step], float))
-    indenter = record.indenter_vert @ rotation.reshape(3, 3).T + record.indenter_pos[step]
+    indenter = record.indenter_vert @ matrix(record.indenter_quat[step]).T + record.indenter_pos[step]
     xpos = np.asarray(record.vert_xpos[step], float)
     moved = np.linalg.norm(xpos - geometry.vert, axis=1)
     # lighter where the skin moved more, so that dimple and bulge show

@@ -90,15 +90,14 @@ def test_first_touch_is_where_rays_find_it(skin, name):
     point, normal = approach.surface_point(skin, -0.011, 0.4)
     direction = -normal
     points = surface_samples(skin.vert, skin.outer_face, "cpu", order=6)
-    from biotac_mj.data.clearance import rotation_matrices
-    from biotac_mj.press import _rotation_from_y
+    from biotac_mj.geometry.rigid import matrix, quaternion_from_y
 
-    quat = _rotation_from_y(direction)
+    quat = quaternion_from_y(direction)
     got = first_touch(
         Placed(name, 1),
         points,
         (point - 0.05 * direction)[None],
-        rotation_matrices(quat)[None],
+        matrix(quat)[None],
         direction[None],
     )[0]
     spec = mujoco.MjSpec()

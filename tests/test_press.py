@@ -14,6 +14,7 @@ from matplotlib.image import imread
 from biotac_mj import approach, offscreen, press_indenter, press_record, press_report
 from biotac_mj import press as pressing
 from biotac_mj.coupling import SkinResult, register_stepper, stepper
+from biotac_mj.geometry.rigid import quaternion_from_y
 from biotac_mj.press import PressOptions
 from biotac_mj.sensor.channels import CHANNELS
 
@@ -133,9 +134,7 @@ def test_slide_goes_across_the_press(shell):
 def test_quaternion_turns_y_to_the_direction():
     for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
         out = np.empty(3)
-        mujoco.mju_rotVecQuat(
-            out, np.array([0.0, 1, 0]), pressing._rotation_from_y(np.array(direction, float))
-        )
+        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), quaternion_from_y(np.array(direction, float)))
         assert np.allclose(out, direction)
 
 

@@ -10,9 +10,9 @@ light object that meets the skin within the step, two or three."""
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import displace, displacement, rotation
 from .instance import Instance
 from .integrator import FixedPoint, Integrator
-from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
 

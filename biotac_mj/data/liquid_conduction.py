@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ..geometry.rigid import across
 from ..sensor.channels import DISCS, NELECTRODE
 from ..sensor.core_surface import CoreSurface
 
@@ -203,10 +204,7 @@ def _points(core, centre, direction, core_vert):
     """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for
     none."""
     ring, disc = [centre], [np.arange(len(centre))]
-    helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    first = np.cross(direction, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(direction, first)
+    first, second = across(direction)
     for k, (radius, count) in enumerate(_RINGS):
         angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
         around = centre[:, None] + radius * (

@@ -27,6 +27,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.special import j1
 
+from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
@@ -244,10 +245,7 @@ class FilmConduction:
         self._disc = self._footprint * np.stack(
             [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1
         ).reshape(-1, 2)
-        helper = np.where(np.abs(self._normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-        tangent = np.cross(self._normal, helper)
-        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        self._tangent = np.stack([tangent, np.cross(self._normal, tangent)], axis=1)
+        self._tangent = np.stack(across(self._normal), axis=1)
         corner = self._rest_middle[self.face]
         centre = corner.mean(1)
         reach = self._footprint + _SLACK + np.linalg.norm(corner - centre[:, None], axis=2).max(1)
