@@ -184,8 +184,8 @@ def test_a_small_set_is_physics(small, skin):
 
 
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
-    # three objects in one batch, as on a GPU, against each alone; only sums of other lengths differ (where a
-    # solve stops at its tolerance, one of these may take a step of Newton more: up to 1e-3 N, not these three)
+    # three objects in one batch, as on a GPU, against each alone; only sums of other lengths differ. Solves
+    # stop at a tolerance, so with other seeds single nodes' forces differ by up to 1e-3 N: these are chosen
     names = ["ring_7mm", "table_edge", "sphere_7mm"]
     motions = [plan_motions(skin, name, [[0, k + 21]], 8)[0] for k, name in enumerate(names)]
     model = SkinModel(skin, "default", SkinOptions())
