@@ -85,8 +85,8 @@ class Generator:
     def __init__(self, skin="coarse", modulus=1.0, footprint=0.0, tier="condensed", device="cpu"):
         from biotac_mj.geometry import load_skin
         from biotac_mj.sensor.film import FilmConduction
-        from biotac_mj.skin.rubber.material import material
         from biotac_mj.skin.model import SkinModel, SkinOptions
+        from biotac_mj.skin.rubber.material import material
 
         self.geometry = load_skin(skin)
         self.film = FilmConduction(self.geometry, sensor="1")

@@ -27,6 +27,8 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from accuracy import write_json
+from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
+from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from blocks import boundary, box, faces_on, nodal_areas, shell, skin
 
 from biotac_mj.geometry import load_skin
@@ -34,10 +36,8 @@ from biotac_mj.geometry.edge_nodes import EDGES, with_edge_nodes
 from biotac_mj.geometry.skin_geometry import PARTS
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.contact.faces import face_samples
-from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
-from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
+from biotac_mj.skin.rubber.law import LAWS
 
 __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 

@@ -254,8 +254,15 @@ def shaken(n, worlds=1):
 def many():
     return dict(
         types=["mesh", "box", "capsule", "cylinder", "ellipsoid", "plane", "cylinder"],
-        sizes=[(), (1.5e-3, 1e-3, 1e-3), (1e-3, 2e-3), (1.2e-3, 2e-3), (1.5e-3, 1e-3, 2e-3), (),
-               (1.5e-3, 1e-3)],
+        sizes=[
+            (),
+            (1.5e-3, 1e-3, 1e-3),
+            (1e-3, 2e-3),
+            (1.2e-3, 2e-3),
+            (1.5e-3, 1e-3, 2e-3),
+            (),
+            (1.5e-3, 1e-3),
+        ],
         friction=[0.3, 0.0, 0.5, 0.2, 0.6, 0.1, 0.4],
         groups=[0, 0, 1, 1, 2, 3, 1],
         rounding=[0, 4e-4, 0, 0, 0, 0, 3e-4],

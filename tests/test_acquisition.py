@@ -134,6 +134,24 @@ def test_noise_has_the_measured_size_and_depends_on_the_seed():
     assert np.abs([np.corrcoef(first[1:, k], first[:-1, k])[0, 1] for k in range(19)]).max() < 0.15
 
 
+@pytest.mark.parametrize("seed", [0, 5, 2**63 + 1])
+def test_noise_is_that_of_numpys_philox(seed):
+    """One counter for each slot of 4.4 kHz, two of its four words through Box and Muller's formula."""
+    acquisition, state = started(seed=seed)
+    electrode = channels.counts_from_impedance(REST)
+    for frame in range(-3, 40):
+        acquisition.advance(state, frame * 0.01, 0.01, REST)
+        raw = np.random.Philox(key=seed, counter=frame * SLOTS_PER_FRAME % 2**64).random_raw(4 * 44)
+        u, v = ((raw.reshape(-1, 4)[:, :2] >> np.uint64(11)) + 0.5).T * 2.0**-53
+        # the last slot of the step is the next frame's first, PAC's
+        normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
+        expected = np.rint(electrode + channels.electrode_noise(electrode) * normal[1:38:2])
+        readings = acquisition.readings(state)
+        assert np.array_equal(readings["electrodes"], expected)
+        assert readings["pdc"] == np.rint(2000 + normal[39])
+        assert np.array_equal(readings["pac"][1:], np.rint(4095 / 2 + normal[2::2]))
+
+
 def test_clipping_to_twelve_bits():
     acquisition, state = started()
     run(acquisition, state, 5e-3, 0.03, lambda t: (np.full(19, 1e12), 1e9, 31.0))

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import biotac_mj
 from biotac_mj.coupling import attach
 from biotac_mj.coupling.integrator import FixedPoint
-from biotac_mj.coupling.touching import displace, displacement, rotation
+from biotac_mj.geometry.rigid import displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
 GHOST = 'contype="0" conaffinity="0"'  # a geom that nothing collides with

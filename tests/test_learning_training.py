@@ -27,6 +27,7 @@ from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
+from biotac_mj.sensor.acquisition import HELD, HELD_PDC  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
@@ -250,7 +251,7 @@ def test_a_batch_gives_what_single_sensors_give(weights):
     u = np.stack([dent(skin, [x, -7e-3, 0], 0.6e-3, 2e-3, 0) for x in (-12e-3, -9e-3, -5e-3)])
     film = LearnedBatchFilm(skin, 3, "cpu", weights=weights, sensor="2")
     x = wp.array(np.ascontiguousarray((skin.vert + u).transpose(1, 0, 2)), dtype=wp.vec3d)
-    film.solve(x, wp.array(np.array([1, 0, 1], np.int32), dtype=int))
+    film.solve_film(x, wp.array(np.array([1, 0, 1], np.int32), dtype=int))
     one = NetworkReadings(skin, weights=weights, sensor="2", noise=False)
     got = film.impedance.numpy()
     np.testing.assert_allclose(got[1], film.rest)
@@ -369,9 +370,9 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
     x = wp.array(np.stack([skin.vert, skin.vert + u], axis=1), dtype=wp.vec3d)
     pressure = wp.zeros(2, dtype=wp.float64)
     for _ in range(3):
-        film.solve(x, acquisition.find_due(0.01))
+        film.solve_film(x, acquisition.find_due(0.01))
         acquisition.advance(0.01, film.impedance, film.valid, pressure)
-    got = acquisition.state.numpy()[:, 25:44]  # the held counts of the electrodes
+    got = acquisition.state.numpy()[:, HELD:HELD_PDC]  # the held counts of the electrodes
     np.testing.assert_allclose(got[0], REST_COUNTS["1"], atol=1)
     z = film.impedance.numpy()
     np.testing.assert_allclose(got[1], 4095 / (z[1] / 1e4 + 1), atol=1)

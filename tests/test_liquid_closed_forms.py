@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from biotac_mj.skin.solver import _Step
 from blocks import boundary, shell, skin
 
 from biotac_mj.coupling.config import Config
@@ -15,7 +16,6 @@ from biotac_mj.coupling.readings import SensorReadings
 from biotac_mj.geometry import load_skin
 from biotac_mj.press import approach
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.solver import _Step
 
 INNER, OUTER = 6e-3, 10e-3
 

@@ -13,9 +13,9 @@ from matplotlib.image import imread
 
 from biotac_mj.coupling import SkinResult, register_stepper, stepper
 from biotac_mj.files import replacing
+from biotac_mj.geometry.rigid import quaternion_from_y
 from biotac_mj.press import PressOptions, approach, plan_path, press, render, report
 from biotac_mj.press.indenter import make_indenter
-from biotac_mj.press.path import rotation_from_y
 from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import CHANNELS
 from biotac_mj.view import offscreen
@@ -143,7 +143,7 @@ def test_slide_goes_across_the_press(shell):
 def test_quaternion_turns_y_to_the_direction():
     for direction in ([0, 1, 0], [0, -1, 0], [0.6, 0.0, 0.8], [-0.48, -0.6, 0.64]):
         out = np.empty(3)
-        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), rotation_from_y(np.array(direction, float)))
+        mujoco.mju_rotVecQuat(out, np.array([0.0, 1, 0]), quaternion_from_y(np.array(direction, float)))
         assert np.allclose(out, direction)
 
 

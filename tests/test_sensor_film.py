@@ -11,7 +11,7 @@ import trimesh
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.sensor.film import FilmConduction, sheet_laplacian, spreading_resistance
+from biotac_mj.sensor.film import FilmConduction, _spreading_table, sheet_laplacian, spreading_resistance
 
 RADIUS, LENGTH, GAP, SIGMA = 5.325e-3, 100e-3, 0.4e-3, 0.5
 EXCITATION = tuple((-0.045, angle) for angle in np.radians([-135, -45, 45, 135]))
@@ -195,6 +195,44 @@ def test_rest_counts_are_the_published_ones():
     for sensor, counts in REST_COUNTS.items():
         film = FilmConduction(geometry, excitation=EXCITATION, sensor=sensor)
         np.testing.assert_allclose(counts_from_impedance(film.impedance(geometry.vert)), counts, rtol=1e-12)
+
+
+def disc_means(film, middle):
+    """(nnode, 23): weights of the nodes in the mean over each disc, sample by sample."""
+    weight = np.zeros((len(middle), len(film._pos)))
+    for e, (position, tangent) in enumerate(zip(film._pos, film._tangent)):
+        face = film.face[film._pair[1][film._pair[0] == e]]
+        corner = np.concatenate([(middle - position) @ tangent.T, np.ones((len(middle), 1))], axis=1)[face]
+        at = [
+            (face, np.linalg.solve(np.swapaxes(corner, 1, 2), np.tile([*p, 1.0], (len(face), 1))[..., None]))
+            for p in film._disc
+        ]
+        covered = [(f[(b >= 0).all((1, 2))], b[(b >= 0).all((1, 2)), :, 0]) for f, b in at]
+        covered = [(f, b) for f, b in covered if len(f)]
+        for f, b in covered:
+            np.add.at(weight[:, e], f, b / len(f) / len(covered))
+    return weight
+
+
+def test_against_a_sparse_solution(tube_film):
+    """The same film solved by scipy, the excitation discs held together by equations of their own."""
+    film, vert = tube_film, moved(tube_film.geometry, -2e-3, -0.25e-3)
+    middle, thickness = film.film(vert)
+    weight = disc_means(film, middle)
+    matrix = sheet_laplacian(middle, film.face, SIGMA * thickness[film.face].mean(1)).tocsc()
+    solved = sparse_linalg.splu(matrix[1:, 1:]).solve(weight[1:])
+    resistance = weight[1:].T @ solved  # against node 0
+    a, local = film.electrode_radius, thickness @ weight
+    step, table = _spreading_table()
+    slab = np.interp(local / (local + a), step * np.arange(len(table)), table) / a
+    resistance += np.diag(np.log(0.8e-3 / a) / (2 * np.pi * local) + slab) / SIGMA
+    ground = np.block([[resistance[19:, 19:], np.ones((4, 1))], [np.ones((1, 4)), 0]])
+    expected = np.empty(19)
+    for e in range(19):
+        # currents into X1..X4 and the potential that all four then have
+        out = np.linalg.solve(ground, np.append(-resistance[19:, e], -1.0))
+        expected[e] = resistance[e, e] + resistance[e, 19:] @ out[:4] + out[4]
+    np.testing.assert_allclose(film.impedance(vert), expected, rtol=1e-9)
 
 
 def test_worlds_equal_the_loop(tube_film):

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from biotac_mj.skin.device_step import prepare_device, step_device
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.device_step import prepare_device, step_device
 
 CUDA = wp.is_cuda_available()
 pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")

@@ -5,12 +5,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from biotac_mj.skin.device_step import prepare_device, step_device
 from blocks import four_nodes
 from test_skin_solver import finger
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.device_step import prepare_device, step_device
 from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
@@ -304,8 +304,8 @@ def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
     """Corner forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean
     dilatation."""
     import warp as wp
-
     from biotac_mj.skin.device_quadratic import Quadratic
+
     from biotac_mj.skin.rubber.material import Material
 
     rubber = Material(law, 1e6, 0.49)

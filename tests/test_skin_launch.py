@@ -3,10 +3,10 @@ few skins'."""
 
 import numpy as np
 import warp as wp
-
-from biotac_mj.skin import launch as module
 from biotac_mj.skin.elasticity import gather
 from biotac_mj.skin.launch import Launches
+
+from biotac_mj.skin import launch as module
 from biotac_mj.skin.types import vec3
 
 

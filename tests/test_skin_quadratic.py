@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import skfem
 import warp as wp
+from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from blocks import box, four_nodes, place, skin
 from skfem.helpers import ddot, div, sym_grad
 
@@ -17,7 +18,6 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from biotac_mj.skin.types import vec3
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))

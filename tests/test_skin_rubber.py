@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from biotac_mj.skin.solver import _Step
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, step
 from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.shapes import bake_distance_grid, distance_bound
-from biotac_mj.skin.solver import _Step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
 import rubber  # noqa: E402

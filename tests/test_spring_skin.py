@@ -4,7 +4,7 @@ import numpy as np
 import spring_skin
 
 from biotac_mj.coupling import Config, Geom
-from biotac_mj.coupling.touching import displace
+from biotac_mj.geometry.rigid import displace
 
 
 def test_tangent_is_the_derivative_of_the_wrench():

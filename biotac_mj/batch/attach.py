@@ -252,7 +252,9 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
     def build(tangents):
-        return BatchSkin(fem, nworld, touching.geoms, grids, frictions, materials, tangents)
+        return BatchSkin(
+            fem, nworld, touching.geoms, grids, frictions, materials, tangents, float(mjm.opt.timestep)
+        )
 
     return touching, build, geometry, config
 
@@ -356,9 +358,8 @@ def _slots(mjm, m, d, touching, prefix):
 def _readings(choice, geometry, nworld, seed, device):
     if choice is False:
         return None, None
-    from ..sensor.batch_acquisition import BatchAcquisition
-    from ..sensor.batch_film import BatchFilm
-    from ..sensor.film import FilmConduction
+    from ..sensor.acquisition import BatchAcquisition
+    from ..sensor.film import BatchFilm, FilmConduction
 
     settings = {} if choice is True else dict(choice)
     if settings.pop("signal", "physics") != "physics":

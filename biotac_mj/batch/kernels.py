@@ -6,6 +6,8 @@ nothing else is said."""
 
 import warp as wp
 
+from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
+from ..sensor.channels import NELECTRODE, NPAC
 from ..skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
 
 __all__ = [
@@ -204,17 +206,17 @@ def write_sensors(
     has no such sensor."""
     w = wp.tid()
     if address[0] >= 0:
-        for e in range(19):
-            sensordata_out[w, address[0] + e] = float(state[w, 25 + e])
+        for e in range(NELECTRODE):
+            sensordata_out[w, address[0] + e] = float(state[w, HELD + e])
     if address[1] >= 0:
-        sensordata_out[w, address[1]] = float(state[w, 44])
+        sensordata_out[w, address[1]] = float(state[w, HELD_PDC])
     if address[2] >= 0:
-        for k in range(22):
-            sensordata_out[w, address[2] + k] = float(state[w, 47 + k])
+        for k in range(NPAC):
+            sensordata_out[w, address[2] + k] = float(state[w, PAC + k])
     if address[3] >= 0:
-        sensordata_out[w, address[3]] = float(state[w, 45])
+        sensordata_out[w, address[3]] = float(state[w, HELD_TAC])
     if address[4] >= 0:
-        sensordata_out[w, address[4]] = float(state[w, 46])
+        sensordata_out[w, address[4]] = float(state[w, HELD_TDC])
     if address[5] >= 0:
         total = vec6()
         for g in range(wrench.shape[0]):

@@ -6,7 +6,8 @@ import warp as wp
 
 from ..coupling.stepper import Geom
 from ..skin import GeomSet, SkinData, SkinModel
-from ..skin.device_step import prepare_device, step_device
+from ..skin.program import Launcher
+from ..skin.step import launch_step, prepare_step
 from . import skin_kernels as kernels
 
 __all__ = ["BatchSkin"]
@@ -23,6 +24,7 @@ class BatchSkin:
       friction: (nworld, ngeom) Coulomb coefficients.
       materials: one Material for each world, or None for the model's.
       tangents: whether `tangent` is wanted.
+      dt: time step [s], of rubber that relaxes.
 
     Attributes (wp.arrays on the model's device, double precision where nothing else is said):
       data: the SkinData: positions, materials and liquids.
@@ -34,7 +36,7 @@ class BatchSkin:
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
-      reason: (nworld,) int: 0, or why the last step failed (`skin.device_worlds`). iterations: (nworld,) int
+      reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int
         of the last step.
     """
 
@@ -47,9 +49,12 @@ class BatchSkin:
         friction: np.ndarray,
         materials: list | None = None,
         tangents: bool = True,
+        dt: float | None = None,
     ):
         self.model, self.nworld, self._tangents = model, nworld, tangents
-        self.data = SkinData(model, nworld, materials, resident=True)
+        self.data = SkinData(model, nworld, materials)
+        if dt is not None:
+            self.data.dt.fill_(dt)
         self.geoms = GeomSet(
             [g.type for g in geoms],
             [g.size for g in geoms],
@@ -65,17 +70,12 @@ class BatchSkin:
         self.pos, self.mat = struct.pos, struct.mat
         self.x, self.reason, self.iterations, self.error = self.data.x, st.reason, st.iterations, st.error
         self._motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
-        prepare_device(model, self.data, self.geoms)
-        self._small = self.data.device_memory.preconditioner
+        self.data.laws.refuse_coarse_grids(self.geoms)
+        prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
             self.pressure = wp.zeros(nworld, dtype=wp.float64)
-            rows = (self._small.capacity if tangents else 0, nworld)
-            self._row_group, self._row_part = (
-                wp.zeros(rows, dtype=int),
-                wp.zeros(rows, dtype=wp.spatial_matrixd),
-            )
             self._rest = self.data.rest_vert
 
     @property
@@ -89,8 +89,8 @@ class BatchSkin:
 
         A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its
         last good state."""
-        m, d, small = self.model, self.data, self._small
-        step_device(m, d, self.geoms)
+        m, d = self.model, self.data
+        launch_step(m, d, self.geoms)
         self._launch(
             kernels.read_outputs,
             self.nworld,
@@ -98,28 +98,7 @@ class BatchSkin:
             [self.pressure, self.wrench],
         )
         if self._tangents and self.ngroup:
-            o, rows = d.outer, self._row_group.shape
-            touched = [
-                m.outer.start,
-                m.outer.slot,
-                len(m.sample),
-                o.touching,
-                o.trial_geom,
-                self.geoms.struct.group,
-            ]
-            self._launch(kernels.group_rows, rows, [small.size, small.node, *touched], [self._row_group])
-            self._launch(
-                kernels.drag_rows,
-                rows,
-                [small.liquid, small.size, small.node, small._G, d.x, self._row_group],
-                [self._row_part],
-            )
-            self._launch(
-                kernels.sum_rows,
-                self.tangent.shape,
-                [small.size, self._row_group, self._row_part],
-                [self.tangent],
-            )
+            d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
@@ -129,7 +108,10 @@ class BatchSkin:
         )
         for state in [d.outer] + ([d.core] if d.core else []):
             self._launch(
-                kernels.reset_samples, state.anchor_geom.shape, [mask], [state.anchor_geom, state.trial_geom]
+                kernels.reset_samples,
+                state.anchor_geom.shape,
+                [mask],
+                [state.anchor_geom, state.trial_geom, state.bond],
             )
             self._launch(
                 kernels.reset_faces,
@@ -149,6 +131,8 @@ class BatchSkin:
             [mask, m.rest.pressure if m.has_liquid else 0.0],
             [d.worlds, self.pressure],
         )
+        if d.memory:
+            d.memory.forget(d.x, mask)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)

@@ -1,35 +1,23 @@
-"""Kernels of `skin.py`: outputs of the device step, the stiffness that a touching body feels, reset of some
-worlds.
-
-The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its
-corrected compliance C: R' (D - D C D) R with the body's rigid motions R (`skin.preconditioner.body_tangent`).
-The device step has just made G = (I + D W)^-1 D over all touching nodes for its linear solves, and that is D
-- D C D; a body's tangent is R' G R over the nodes that it touches. Nodes that two bodies touch count for one
-of them."""
+"""Kernels of `skin.py`: outputs of the step, reset of some worlds."""
 
 import warp as wp
 
 from ..skin.newton.worlds import Worlds
 
 __all__ = [
-    "drag_rows",
-    "group_rows",
     "read_outputs",
     "reset_faces",
     "reset_geoms",
     "reset_nodes",
     "reset_samples",
     "reset_worlds",
-    "sum_rows",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
 real = wp.float64
 vec3 = wp.vec3d
-mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
-mat66 = wp.spatial_matrixd
 
 
 @wp.kernel
@@ -54,95 +42,6 @@ def read_outputs(
 
 
 @wp.kernel
-def group_rows(
-    # In:
-    size: wp.array(dtype=int),
-    node: wp.array2d(dtype=int),
-    start: wp.array(dtype=int),
-    slot: wp.array(dtype=int),
-    nsample: int,
-    touching: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    group: wp.array(dtype=int),
-    # Out:
-    group_out: wp.array2d(dtype=int),
-):
-    """Which body touches each node of the small systems from outside [row, world]; -1: none."""
-    s, w = wp.tid()
-    found = int(-1)
-    if s < size[w]:
-        i = node[s, w]
-        for k in range(start[i], start[i + 1]):
-            f = slot[k] / 3
-            if touching[f, w] == 1:
-                for j in range(nsample):
-                    g = geom[f * nsample + j, w]
-                    if g >= 0:
-                        found = wp.max(found, group[g])
-    group_out[s, w] = found
-
-
-@wp.kernel
-def drag_rows(
-    # In:
-    liquid: int,
-    size: wp.array(dtype=int),
-    node: wp.array2d(dtype=int),
-    G: wp.array3d(dtype=float),
-    x: wp.array2d(dtype=vec3),
-    group: wp.array2d(dtype=int),
-    # Out:
-    part_out: wp.array2d(dtype=mat66),
-):
-    """Each row's part R_s' sum_t G_st R_t of its body's tangent [row, world]."""
-    s, w = wp.tid()
-    if s >= size[w]:
-        return
-    mine = group[s, w]
-    if mine < 0:
-        return
-    move = mat33()  # forces on node s of the body's unit translations, and rotations
-    turn = mat33()
-    for t in range(size[w]):
-        if group[t, w] == mine:
-            g = mat33()
-            for a in range(3):
-                for b in range(3):
-                    # stored transposed; G is symmetric but for rounding
-                    g[a, b] = real(G[w, liquid + 3 * t + b, liquid + 3 * s + a])
-            move += g
-            turn -= g * wp.skew(x[node[t, w], w])
-    arm = wp.skew(x[node[s, w], w])
-    bend = arm * move
-    wind = arm * turn
-    part = mat66()
-    for a in range(3):
-        for b in range(3):
-            part[a, b] = move[a, b]
-            part[a, 3 + b] = turn[a, b]
-            part[3 + a, b] = bend[a, b]
-            part[3 + a, 3 + b] = wind[a, b]
-    part_out[s, w] = part
-
-
-@wp.kernel
-def sum_rows(
-    # In:
-    size: wp.array(dtype=int),
-    group: wp.array2d(dtype=int),
-    part: wp.array2d(dtype=mat66),
-    # Out:
-    tangent_out: wp.array2d(dtype=mat66),
-):
-    g, w = wp.tid()
-    total = mat66()
-    for s in range(size[w]):
-        if group[s, w] == g:
-            total += part[s, w]
-    tangent_out[g, w] = real(0.5) * (total + wp.transpose(total))
-
-
-@wp.kernel
 def reset_nodes(
     # In:
     mask: wp.array(dtype=bool),
@@ -163,12 +62,16 @@ def reset_nodes(
 
 @wp.kernel
 def reset_samples(
-    mask: wp.array(dtype=bool), anchor_geom_out: wp.array2d(dtype=int), trial_geom_out: wp.array2d(dtype=int)
+    mask: wp.array(dtype=bool),
+    anchor_geom_out: wp.array2d(dtype=int),
+    trial_geom_out: wp.array2d(dtype=int),
+    bond_out: wp.array2d(dtype=int),
 ):
     i, w = wp.tid()
     if mask[w]:
         anchor_geom_out[i, w] = -1
         trial_geom_out[i, w] = -1
+        bond_out[i, w] = -1
 
 
 @wp.kernel

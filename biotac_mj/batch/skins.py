@@ -5,13 +5,14 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.attachment import CHANNELS
 from ..coupling.touching import Touching
+from ..sensor.acquisition import NSTATE
+from ..sensor.channels import WIDTHS
 from . import kernels
 from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
-
-CHANNELS = {"electrodes": 19, "pdc": 1, "pac": 22, "tac": 1, "tdc": 1, "contact_force": 6, "status": 5}
 
 
 class Skins:
@@ -44,7 +45,7 @@ class Skins:
         self._core = int(touching.core)
         shape = skin.ngroup, skin.nworld
         if acquisition is None:
-            addresses = [*[-1] * 5, *addresses[5:]]
+            addresses = [-1 if c in WIDTHS else a for c, a in zip(CHANNELS, addresses)]
         with wp.ScopedDevice(self.device):
             self._body = wp.array(touching.body.astype(np.int32), dtype=int)
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
@@ -56,7 +57,7 @@ class Skins:
             self.tangent0 = wp.zeros(shape, dtype=wp.spatial_matrixd)
             self.failed = wp.zeros(self.nworld, dtype=int)
             self._valid = film.valid if film else wp.ones(self.nworld, dtype=int)
-            self._no_state = wp.zeros((self.nworld, 69), dtype=wp.float64)
+            self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.reset()
 
@@ -126,7 +127,7 @@ class Skins:
         only."""
         state, skin = self._no_state, self.skin
         if self.acquisition:
-            self.film.solve(skin.x, self.acquisition.find_due(self.dt))
+            self.film.solve_film(skin.x, self.acquisition.find_due(self.dt))
             self.acquisition.advance(self.dt, self.film.impedance, self.film.valid, skin.pressure)
             state = self.acquisition.state
         outputs = [state, self.wrench0, skin.reason, self._valid, self.failed, skin.iterations, skin.error]

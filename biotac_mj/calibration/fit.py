@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin.rubber.material import Material
 from ..skin.model import SkinOptions
+from ..skin.rubber.material import Material
 from .configurations import Configuration
 from .forward import simulate
 from .indentation import Indentation

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..press.indenter import make_indenter
 from ..skin import GeomSet, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
@@ -116,18 +117,7 @@ def _indenter(indentation, materials, device):
         device=device,
     )
     geoms.set_friction([[m.friction] for m in materials])
-    frame = _matrix(indentation.quat)
+    frame = matrix(indentation.quat / np.linalg.norm(indentation.quat))
     offset = np.zeros(3) if mesh else frame @ shape.pos
-    rotation = frame if mesh else frame @ _matrix(shape.quat)
+    rotation = frame if mesh else frame @ matrix(shape.quat)
     return geoms, lambda tip: ((tip + offset)[None], rotation[None])
-
-
-def _matrix(quat):
-    w, x, y, z = np.asarray(quat) / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

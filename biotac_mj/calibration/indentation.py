@@ -240,7 +240,7 @@ def _column(path, header, rows, name):
 
 
 def _orientation(path, header, rows, direction):
-    from ..press.path import rotation_from_y
+    from ..geometry.rigid import quaternion_from_y
 
     if direction is not None:
         direction = np.asarray(direction, float)
@@ -249,7 +249,7 @@ def _orientation(path, header, rows, direction):
                 f"direction {np.asarray(direction).tolist()} is no direction: "
                 "give three numbers that are not all zero"
             )
-        return rotation_from_y(direction / np.linalg.norm(direction))
+        return quaternion_from_y(direction / np.linalg.norm(direction))
     if "quat_w" not in header:
         return np.array([1.0, 0, 0, 0])
     quat = np.array([_column(path, header, rows, name) for name in _ORIENTATION]).T

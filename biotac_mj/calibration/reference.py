@@ -5,8 +5,8 @@ import dataclasses
 
 import numpy as np
 
-from ..skin.rubber.material import material as preset
 from ..skin.model import SkinOptions
+from ..skin.rubber.material import material as preset
 from .forward import simulate
 from .indentation import Indentation
 from .refinement import skin as named_skin

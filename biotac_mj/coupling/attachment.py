@@ -10,12 +10,13 @@ import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
+from ..sensor.channels import ELECTRODES, WIDTHS
 from .config import PLUGIN_NAME, Config
 from .stepper import check_names
 
 __all__ = ["Handle", "attach"]
 
-CHANNELS = ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
+CHANNELS = {**WIDTHS, "contact_force": 6, "status": 5}  # width of each in sensor data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,8 +199,8 @@ def _model(geometry):
             continue
         mesh.file = ""
         mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
-    for i, position in enumerate(geometry.electrode_pos, start=1):
-        spec.site(f"e{i}").pos = position
+    for name, position in zip(ELECTRODES, geometry.electrode_pos):
+        spec.site(name).pos = position
     node, face = np.unique(geometry.outer_face, return_inverse=True)
     skin = spec.skins[0]
     skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()

@@ -3,6 +3,8 @@ from rest."""
 
 import numpy as np
 
+from ..sensor.channels import ELECTRODES, NELECTRODE
+
 __all__ = ["Shown", "electrode_colors"]
 
 _FULL_SCALE = 300.0  # change of an electrode at full colour [counts]
@@ -29,7 +31,7 @@ class Shown:
         if "skin" in skins and model.skin_vertnum[skins["skin"]] == len(self.node):
             start = int(model.skin_vertadr[skins["skin"]])
             self.vert = slice(start, start + len(self.node))
-        self.site = np.array([sites[f"e{i}"] for i in range(1, 20) if f"e{i}" in sites], dtype=np.int64)
+        self.site = np.array([sites[name] for name in ELECTRODES if name in sites], dtype=np.int64)
         self.rest = setup.skin.readings.rest.get("electrodes")
 
     def update(self) -> None:
@@ -38,8 +40,8 @@ class Shown:
         if self.vert is not None:
             with skin.lock:
                 instance.model.skin_vert[self.vert] = skin.stepper.vert_xpos(state)[self.node]
-        if self.rest is not None and len(self.site) == 19 and "electrodes" in instance.sensor:
+        if self.rest is not None and len(self.site) == NELECTRODE and "electrodes" in instance.sensor:
             counts = instance.data.sensordata[instance.sensor["electrodes"]]
             instance.model.site_rgba[self.site] = electrode_colors(
-                counts - self.rest if counts.any() else np.zeros(19)
+                counts - self.rest if counts.any() else np.zeros(NELECTRODE)
             )

@@ -5,11 +5,12 @@ import math
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import cross, matrix, rotation
 from .config import Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "displace", "displacement", "rotation"]
+__all__ = ["Touching"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -54,7 +55,7 @@ class Touching:
         # centres of mass
         self._body = np.concatenate([[core], self.body]).astype(np.int64)
         self._root = model.body_rootid[self._body]
-        self._geom_pos, self._geom_mat = model.geom_pos[ids], _matrix(model.geom_quat[ids])
+        self._geom_pos, self._geom_mat = model.geom_pos[ids], matrix(model.geom_quat[ids])
 
     def key(self) -> bytes:
         """Bytes that differ whenever the skin would see other geoms."""
@@ -93,7 +94,7 @@ class Touching:
         if horizon:
             velocity = data.cvel[body]  # rotation, then translation of the point at the tree's centre of mass
             spin = velocity[:, :3]
-            pos = pos + horizon * (velocity[:, 3:] + _cross(spin, pos - data.subtree_com[root]))
+            pos = pos + horizon * (velocity[:, 3:] + cross(spin, pos - data.subtree_com[root]))
             mat = rotation(horizon * spin) @ mat
         return pos, mat
 
@@ -117,58 +118,6 @@ class Touching:
         raise ValueError(
             f"NaN in the pose of the BioTac or of geom {', '.join(names)}: check mocap_pos, qpos and qvel"
         )
-
-
-# positions of a cross product's factors: faster than np.cross on a few vectors
-_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-_SKEW = np.zeros((3, 9))
-for _i, (_j, _k) in enumerate(zip(_NEXT, _AFTER)):
-    _SKEW[_i, 3 * _k + _j], _SKEW[_i, 3 * _j + _k] = 1.0, -1.0
-_EYE = np.eye(3)
-
-
-def _cross(a, b):
-    return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
-
-
-def rotation(vector: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors (Rodrigues)."""
-    angle2 = (vector * vector).sum(axis=1)[:, None, None]
-    k = (vector @ _SKEW).reshape(-1, 3, 3)
-    if angle2.max(initial=0.0) < 1e-8:  # the series to the fourth order: exact to rounding
-        return _EYE + (1.0 - angle2 / 6) * k + (0.5 - angle2 / 24) * (k @ k)
-    angle = np.sqrt(angle2)
-    half = np.sinc(angle / (2 * np.pi))
-    return _EYE + np.sinc(angle / np.pi) * k + 0.5 * half * half * (k @ k)
-
-
-def _matrix(quat):
-    """(n, 3, 3) rotations of (n, 4) unit quaternions."""
-    w, x, y, z = quat.T
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return np.stack(rows, axis=1).reshape(-1, 3, 3)
-
-
-def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray) -> np.ndarray:
-    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0
-    (n, 3, 3) to pos, mat."""
-    turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
-    vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
-    sine = np.sqrt((vector * vector).sum(axis=1))
-    if sine.max(initial=0.0) > 1e-5:
-        angle = np.arctan2(sine, 0.5 * (turn[:, [0, 4, 8]].sum(axis=1) - 1))
-        vector = vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None]
-    return np.concatenate([pos - pos0 - _cross(vector, pos0), vector], axis=1)
-
-
-def displace(pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> tuple:
-    """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
-    turn = rotation(motion[:, 3:])
-    return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
 
 
 def _select(model, core, names):

@@ -10,10 +10,10 @@ light object that meets the skin within the step, two or three."""
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import displace, displacement, rotation
 from .instance import Instance
 from .integrator import FixedPoint, Integrator
 from .structs import DataView, ModelView
-from .touching import displace, displacement, rotation
 
 __all__ = ["World"]
 

@@ -4,13 +4,14 @@ deep they may go."""
 import numpy as np
 import warp as wp
 
+from ..geometry.rigid import matrix
 from ..skin.contact.faces import Geoms, face_samples
-from ..skin.geoms import GeomSet
 from ..skin.contact.shapes import distance
+from ..skin.geoms import GeomSet
 from ..skin.types import real, vec3
 from .objects import grid_of, make_object
 
-__all__ = ["Placed", "first_touch", "rotation_matrices", "surface_samples"]
+__all__ = ["Placed", "first_touch", "surface_samples"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,7 +52,7 @@ class Placed:
         self.geoms = GeomSet([shape.type], [shape.size], friction=[friction], rounding=[shape.rounding],
                              grids=[] if grid is None else [grid], nworld=nworld, device=device)  # fmt: skip
         self._pos = np.zeros(3) if grid is not None else np.asarray(shape.pos)
-        self._mat = np.eye(3) if grid is not None else rotation_matrices(shape.quat)
+        self._mat = np.eye(3) if grid is not None else matrix(shape.quat)
 
     def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
@@ -106,16 +107,3 @@ def first_touch(
             break
         travel += np.where(moving, gap, 0)
     return np.where(begun & (travel < reach) & (gap < 1e-5), travel, np.nan)
-
-
-def rotation_matrices(quat: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) of unit quaternions (..., 4), w x y z."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, float), -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )

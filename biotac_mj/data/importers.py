@@ -7,7 +7,7 @@ import pathlib
 import h5py
 import numpy as np
 
-from ..sensor.channels import CHANNELS, FULL_SCALE
+from ..sensor.channels import CHANNELS, ELECTRODES, FULL_SCALE, NELECTRODE
 from .columns import read_columns
 from .schema import Interaction
 from .splits import assign
@@ -15,7 +15,7 @@ from .store import shard_path, write_shard
 
 __all__ = ["FORMATS", "RUPPEL_COLUMNS", "import_recordings", "read_nvidia", "read_ruppel", "read_text"]
 
-_NVIDIA = {"electrode_vals": 19, "contact_loc": 3, "force_vec": 3, "indenter_type": 1}
+_NVIDIA = {"electrode_vals": NELECTRODE, "contact_loc": 3, "force_vec": 3, "indenter_type": 1}
 _JUMP = 0.5e-3  # [m] between two samples of one trajectory of NVIDIA's files
 _GAP = 0.5  # [s] without a sample ends an interaction of a log with times
 RUPPEL_COLUMNS = (
@@ -31,7 +31,7 @@ RUPPEL_COLUMNS = (
     "pdc",
     "tac",
     "tdc",
-    *CHANNELS[:19],
+    *ELECTRODES,
 )
 
 
@@ -188,7 +188,7 @@ def read_text(
     if not (np.isfinite(rate) and rate > 0) or (block is not None and not block > 0):
         raise ValueError(f"rate is {rate} Hz and block is {block} s: both must be positive")
     path = pathlib.Path(path)
-    counts = read_columns(path, CHANNELS[:19])
+    counts = read_columns(path, ELECTRODES)
     newtons = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
     if newtons is not None and len(newtons) != len(counts):
         raise ValueError(
@@ -265,7 +265,7 @@ def _recorded(name, what, time, electrodes, force, point, parameters, path, extr
             "0 and 4095 are needed; undo scaling and tare"
         )
     counts = np.full((len(time), len(CHANNELS)), np.nan, np.float32)
-    counts[:, :19] = electrodes
+    counts[:, :NELECTRODE] = electrodes
     for channel, value in (extra or {}).items():
         counts[:, CHANNELS.index(channel)] = value
     wrench = None

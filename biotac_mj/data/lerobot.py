@@ -12,7 +12,7 @@ import tempfile
 import numpy as np
 import tqdm
 
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE
 
 __all__ = ["VERSION", "export_lerobot"]
 
@@ -86,8 +86,8 @@ class _Export:
         self.features = {
             "observation.state": _feature(_POSE),
             "observation.force": _feature(_WRENCH),
-            "observation.tactile.electrodes": _feature(CHANNELS[:19]),
-            **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[19:]},
+            "observation.tactile.electrodes": _feature(ELECTRODES),
+            **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[NELECTRODE:]},
             "action": _feature(_POSE),
         }
         index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}
@@ -154,8 +154,11 @@ class _Export:
         out = {
             "observation.state": pose,
             "observation.force": data["wrench"][rows].astype(np.float32),
-            "observation.tactile.electrodes": counts[:, :19],
-            **{f"observation.tactile.{name}": counts[:, 19 + k] for k, name in enumerate(CHANNELS[19:])},
+            "observation.tactile.electrodes": counts[:, :NELECTRODE],
+            **{
+                f"observation.tactile.{name}": counts[:, NELECTRODE + k]
+                for k, name in enumerate(CHANNELS[NELECTRODE:])
+            },
             "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
             "timestamp": (np.arange(n) / self.fps).astype(np.float32),
             "frame_index": np.arange(n),

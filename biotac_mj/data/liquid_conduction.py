@@ -11,7 +11,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ..geometry.rigid import across
 from ..geometry.skin_geometry import SkinGeometry
+from ..sensor.channels import DISCS, NELECTRODE
 from ..sensor.core_surface import CoreSurface
 
 __all__ = ["LiquidConduction", "column_tetrahedra"]
@@ -79,7 +81,7 @@ class LiquidConduction:
             number[triangle],
             disc[keep],
         )
-        missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in range(23) if (disc == e).sum() < 10]
+        missing = [name for e, name in enumerate(DISCS) if (disc == e).sum() < 10]
         if missing:
             raise ValueError(
                 f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
@@ -106,11 +108,11 @@ class LiquidConduction:
         solver = CholeskySolverD(
             self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO
         )
-        current = np.zeros((self._size, 19))
-        current[np.arange(19), np.arange(19)] = 1
+        current = np.zeros((self._size, NELECTRODE))
+        current[np.arange(NELECTRODE), np.arange(NELECTRODE)] = 1
         potential = np.empty_like(current)
         solver.solve(current, potential)
-        return potential[np.arange(19), np.arange(19)] / self.conductivity
+        return potential[np.arange(NELECTRODE), np.arange(NELECTRODE)] / self.conductivity
 
     def matrix(self, nodes: np.ndarray) -> object:
         """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
@@ -172,13 +174,13 @@ class LiquidConduction:
         """Nodes of one disc share an unknown, 0..18 for e1..e19; those of X1..X4 have none."""
         n = len(disc)
         self._unknown = np.full(len(self._layers) * n, -1)
-        bottom = np.where((disc >= 0) & (disc < 19), disc, -1)
+        bottom = np.where((disc >= 0) & (disc < NELECTRODE), disc, -1)
         free = np.flatnonzero(disc < 0)
-        bottom[free] = 19 + np.arange(len(free))
+        bottom[free] = NELECTRODE + np.arange(len(free))
         self._unknown[:n] = bottom
         above = (len(self._layers) - 1) * n
-        self._unknown[n:] = 19 + len(free) + np.arange(above)
-        self._size = 19 + len(free) + above
+        self._unknown[n:] = NELECTRODE + len(free) + np.arange(above)
+        self._size = NELECTRODE + len(free) + above
 
 
 def column_tetrahedra(triangle: np.ndarray, n: int, layers: int | tuple) -> np.ndarray:
@@ -209,10 +211,7 @@ def _points(core, centre, direction, core_vert):
     """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for
     none."""
     ring, disc = [centre], [np.arange(len(centre))]
-    helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    first = np.cross(direction, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(direction, first)
+    first, second = across(direction)
     for k, (radius, count) in enumerate(_RINGS):
         angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
         around = centre[:, None] + radius * (

@@ -16,6 +16,7 @@ import traceback
 import numpy as np
 import tqdm
 
+from ..geometry.rigid import quaternion
 from .plan import plan_motions
 from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
@@ -294,7 +295,7 @@ class Maker:
         for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):
             columns = {
                 "indenter_pos": motion.pos,
-                "indenter_quat": _quaternions(motion.mat),
+                "indenter_quat": quaternion(motion.mat),
                 "converged": np.ones(len(self.time), bool),
             }
             if batch.simulated:
@@ -334,12 +335,6 @@ class Maker:
             self.geometry if batch.simulated else None,
             self.attributes,
         )
-
-
-def _quaternions(mat):
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(mat).as_quat(), 1, axis=-1)
 
 
 def _device_name(device):

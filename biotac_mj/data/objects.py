@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 
 from ..geometry.indenters import INDENTERS
+from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix, quaternion_from_y
 from ..press.indenter import Indenter, make_indenter
 from ..skin.contact.shapes import DistanceGrid, bake_distance_grid
 
@@ -20,8 +21,6 @@ __all__ = ["OBJECTS", "grid_of", "make_object"]
 _EDGE = 0.5e-3  # [m] rounding of pegs and of the table's edges
 _LENGTH = 12e-3  # [m] of a peg
 _TABLE = 20e-3  # [m] half width of the block that stands for the table: beyond the finger on all sides
-_UPRIGHT = np.array([1.0, 0, 0, 0])
-_Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])
 
 PEGS = (
     "peg_round_4mm",
@@ -37,13 +36,13 @@ OBJECTS = (*INDENTERS, *PEGS, *TABLE)
 
 def _box(name, half, turn):
     """A rounded box, turned about its centre and moved so that what is then foremost lies at the origin."""
-    from ..press.path import rotation_from_y
-
     half, inner = np.array(half), np.array(half) - _EDGE
     quat = (
-        _UPRIGHT if turn is None else rotation_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
+        UPRIGHT
+        if turn is None
+        else quaternion_from_y(np.array(turn) / np.linalg.norm(turn)) * [1, -1, -1, -1]
     )
-    rotation = trimesh.transformations.quaternion_matrix(quat)[:3, :3]
+    rotation = matrix(quat)
     reach = np.abs(rotation[1]) @ inner + _EDGE
     pos = np.array([0.0, -reach, 0.0])
     mesh = trimesh.creation.box(extents=2 * half)  # for rays and pictures: its edges are sharp
@@ -55,10 +54,8 @@ def _box(name, half, turn):
 def _cylinder(name, radius):
     pos = np.array([0.0, -_LENGTH / 2, 0.0])
     mesh = trimesh.creation.cylinder(radius=radius, height=_LENGTH, sections=96)
-    vert = mesh.vertices @ trimesh.transformations.quaternion_matrix(_Z_TO_Y)[:3, :3].T + pos
-    return Indenter(
-        name, "cylinder", (radius, _LENGTH / 2), _EDGE, pos, _Z_TO_Y, vert, np.asarray(mesh.faces)
-    )
+    vert = mesh.vertices @ matrix(Z_TO_Y).T + pos
+    return Indenter(name, "cylinder", (radius, _LENGTH / 2), _EDGE, pos, Z_TO_Y, vert, np.asarray(mesh.faces))
 
 
 def _prism(name, corners, width):
@@ -71,7 +68,7 @@ def _prism(name, corners, width):
     centre = np.concatenate([ring + [0, y, 0] for y in (-_EDGE, _EDGE - _LENGTH)])
     hull = trimesh.Trimesh((centre[:, None] + ball).reshape(-1, 3)).convex_hull
     return Indenter(
-        name, "mesh", (), 0.0, np.zeros(3), _UPRIGHT, np.asarray(hull.vertices), np.asarray(hull.faces)
+        name, "mesh", (), 0.0, np.zeros(3), UPRIGHT, np.asarray(hull.vertices), np.asarray(hull.faces)
     )
 
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..geometry.rigid import matrix, quaternion_from_y, rotation
 from ..geometry.skin_geometry import SkinGeometry
 from ..press.approach import nearest_point
 from ..sensor.core_surface import CoreSurface
-from .clearance import Placed, first_touch, rotation_matrices, surface_samples
+from .clearance import Placed, first_touch, surface_samples
 
 __all__ = ["Motion", "plan_motions", "sensing_faces"]
 
@@ -144,7 +145,6 @@ class _Planner:
         return out
 
     def _draw(self, rng):
-        from ..press.path import rotation_from_y
 
         kind = str(rng.choice(self.kinds, p=self.share))
         corner = self.geometry.vert[self.faces[rng.choice(len(self.faces), p=self.area)]]
@@ -155,7 +155,7 @@ class _Planner:
         side = np.cos(round_) * first + np.sin(round_) * second
         direction = -np.cos(tilt) * normal + np.sin(tilt) * side
         spin = rng.uniform(0, 2 * np.pi)
-        mat = _rotation(direction, spin) @ rotation_matrices(rotation_from_y(direction))
+        mat = rotation(spin * direction[None])[0] @ matrix(quaternion_from_y(direction))
         heading = rng.uniform(0, 2 * np.pi)
         slide = np.cos(heading) * first + np.sin(heading) * second
         return dict(
@@ -181,7 +181,7 @@ class _Planner:
             pos.append(
                 at + travel[:, None] * d["direction"] + (along * d["slide"])[:, None] * d["slide_direction"]
             )
-            mat.append(np.array([_rotation(d["direction"], a * d["twist"]) @ d["mat"] for a in along]))
+            mat.append(rotation((along * d["twist"])[:, None] * d["direction"]) @ d["mat"])
         return np.array(pos), np.array(mat)
 
 
@@ -209,9 +209,3 @@ def _across(normal):
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)
     return first, np.cross(normal, first)
-
-
-def _rotation(axis, angle):
-    """(3, 3) rotation about a unit vector (Rodrigues)."""
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)

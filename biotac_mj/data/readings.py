@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import CHANNELS, NELECTRODE
 from ..sensor.film import FilmConduction
 from .schema import DISPLACEMENT_SCALE
 
@@ -58,7 +58,7 @@ def sample(
         heat = None if temperature is None else temperature[i]
         acquisition.advance(state, before, dt, impedance[i], pressure[i], heat)
         out = acquisition.readings(state)
-        rows.append([*out["electrodes"], *(np.ravel(out[name])[-1] for name in CHANNELS[19:])])
+        rows.append([*out["electrodes"], *(np.ravel(out[name])[-1] for name in CHANNELS[NELECTRODE:])])
     return np.array(rows, np.float32)
 
 
@@ -71,7 +71,7 @@ def read_motion(
       film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa]. seed:
         of the noise.
     """
-    impedance, failed = np.empty((len(time), 19)), np.zeros(len(time), bool)
+    impedance, failed = np.empty((len(time), NELECTRODE)), np.zeros(len(time), bool)
     last = film.impedance(film.geometry.vert)
     for i, x in enumerate(vert_xpos):
         try:

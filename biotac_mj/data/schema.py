@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import CHANNELS, NELECTRODE
 
 __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
 
@@ -25,7 +25,7 @@ COLUMNS = {
     "wrench": ((6,), "f4", "N, N m"),
     "contact_force": (("nouter", 3), "f4", "N"),
     "pressure": ((), "f4", "Pa"),
-    "impedance": ((19,), "f4", "ohm"),
+    "impedance": ((NELECTRODE,), "f4", "ohm"),
     "counts": ((len(CHANNELS),), "f4", "count"),
     "indenter_pos": ((3,), "f8", "m"),
     "indenter_quat": ((4,), "f8", "w x y z"),

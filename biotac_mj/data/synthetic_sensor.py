@@ -16,7 +16,13 @@ import numpy as np
 
 from ..geometry import load_skin
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, counts_from_impedance, impedance_from_counts
+from ..sensor.channels import (
+    NELECTRODE,
+    REST_COUNTS,
+    REST_TEMPERATURE,
+    counts_from_impedance,
+    impedance_from_counts,
+)
 from ..sensor.film import EXCITATION
 from .liquid_conduction import LiquidConduction
 from .readings import sample
@@ -71,7 +77,7 @@ class SensorVariation:
         log_z = np.log([impedance_from_counts(counts) for counts in REST_COUNTS.values()])
         # what the published sensors share, and how they differ: all electrodes together, and each on its own
         common, each = log_z.mean(1).std(ddof=1), (log_z - log_z.mean(1, keepdims=True)).std(0, ddof=1).mean()
-        pattern = log_z.mean(0) + rng.normal(0, common) + rng.normal(0, each, 19)
+        pattern = log_z.mean(0) + rng.normal(0, common) + rng.normal(0, each, NELECTRODE)
         excitation = np.array(EXCITATION) + rng.uniform(-1, 1, (4, 2)) * [0.7e-3, 0.1]
         return cls(
             youngs_modulus=rng.uniform(0.8e6, 1.1e6),

@@ -23,11 +23,8 @@ class RoughFilm(FilmConduction):
 
     def __init__(self, film: FilmConduction, power: float):
         self.__dict__.update(film.__dict__)
-        self._power, self._rest = power, film.film(film.geometry.vert)[1]
-
-    def film(self, vert_xpos: np.ndarray) -> tuple:
-        middle, thickness = super().film(vert_xpos)
-        return middle, self._rest * (thickness / self._rest) ** self._power
+        self._power = power
+        self._set_alone()
 
 
 def left(rate: float, clock: float) -> float:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from ..sensor.channels import CHANNELS, counts_from_impedance, log_impedance
+from ..sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
 
 __all__ = ["Arrays", "load_arrays"]
 
@@ -120,7 +120,7 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
                 f"{path} holds displacements that are not finite: "
                 "make the set again, or leave those interactions out"
             )
-        measured = data["measured_counts"][keep][:, :19]
+        measured = data["measured_counts"][keep][:, :NELECTRODE]
         labelled = np.asarray(data.labelled[:stop])
         force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
         for a in range(0, len(keep), 2048):
@@ -129,7 +129,7 @@ def load_arrays(path, device="cpu", limit=None) -> Arrays:
         simulated = (
             counts_from_impedance(data["impedance"][keep])
             if "impedance" in data.columns
-            else data["counts"][keep][:, :19]
+            else data["counts"][keep][:, :NELECTRODE]
         )
         tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731
         return Arrays(

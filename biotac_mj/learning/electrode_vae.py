@@ -4,6 +4,8 @@ principal components."""
 import torch
 from torch import nn
 
+from ..sensor.channels import NELECTRODE
+
 __all__ = ["ElectrodeVAE", "mlp"]
 
 
@@ -30,7 +32,7 @@ class ElectrodeVAE(nn.Module):
         PCA's error. None is the paper's network.
     """
 
-    def __init__(self, channels=19, hidden=(256, 128, 64), latent=8, linear=None):
+    def __init__(self, channels=NELECTRODE, hidden=(256, 128, 64), latent=8, linear=None):
         super().__init__()
         self.latent = latent
         self.encoder = mlp([channels, *hidden, 2 * latent])

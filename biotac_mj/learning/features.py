@@ -7,6 +7,8 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from torch import nn
 
+from ..sensor.channels import NELECTRODE
+
 __all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix"]
 
 # e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline (Lin et al. 2013).
@@ -123,7 +125,7 @@ class FilmFeatures(nn.Module):
         )  # (19, 2, n)
         operators = [w_[:, None] for w_ in patches] + [1e-3 * slope]
         operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
-        linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(19 * operator.shape[1] * 3, -1)
+        linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(NELECTRODE * operator.shape[1] * 3, -1)
 
         angle = np.array(EXCITATION)
         seeds = np.stack(
@@ -151,14 +153,14 @@ class FilmFeatures(nn.Module):
         """(n, 19, count) of u (n, nvert, 3) [mm]."""
         inner = u[:, self.node].float()
         n = len(u)
-        linear = (inner.flatten(1) @ self.linear.T).view(n, 19, -1)
+        linear = (inner.flatten(1) @ self.linear.T).view(n, NELECTRODE, -1)
         film = torch.clamp(self.gap + (inner * self.away).sum(2), min=1e3 * _FILM)
         thinner = torch.log(film / self.gap)
         inverse = self.gap / film - 1
         local = torch.cat([thinner, torch.log1p(inverse.clamp(min=-0.9))], 0)
-        local = (local @ self.patch.T).view(2, n, len(_RADII), 19).permute(1, 3, 0, 2).flatten(2)
+        local = (local @ self.patch.T).view(2, n, len(_RADII), NELECTRODE).permute(1, 3, 0, 2).flatten(2)
         mean_inverse = (
-            torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), 19).transpose(1, 2)
+            torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), -1).transpose(1, 2)
         )
         local[..., len(_RADII) :] = (
             mean_inverse  # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln

@@ -10,7 +10,7 @@ import torch
 from scipy.stats import t as t_quantile
 
 from ..files import replacing
-from ..sensor.channels import FULL_SCALE
+from ..sensor.channels import FULL_SCALE, NELECTRODE
 from .arrays import load_arrays
 from .local import counts_change
 from .protocol import interaction_errors
@@ -44,7 +44,7 @@ def adapt(predicted, measured, owner, slope) -> np.ndarray:
     if (
         predicted.shape != measured.shape
         or predicted.shape != slope.shape
-        or predicted.shape[1:] != (19,)
+        or predicted.shape[1:] != (NELECTRODE,)
         or not len(predicted)
     ):
         raise ValueError(
@@ -53,7 +53,7 @@ def adapt(predicted, measured, owner, slope) -> np.ndarray:
         )
     touches = [owner == k for k in np.unique(owner)]
     if len(touches) < 3:
-        return np.ones(19)
+        return np.ones(NELECTRODE)
     x, y = (
         [slope[t] * predicted[t] for t in touches],
         [slope[t] * measured[t] for t in touches],
@@ -71,7 +71,7 @@ def adapt(predicted, measured, owner, slope) -> np.ndarray:
     sure = (
         np.mean(better) > t_quantile.ppf(0.9, len(better) - 1) * np.std(better, ddof=1) / len(better) ** 0.5
     )
-    return _posterior(gain, noise) if sure else np.ones(19)
+    return _posterior(gain, noise) if sure else np.ones(NELECTRODE)
 
 
 def _posterior(gain, noise):
@@ -139,7 +139,7 @@ def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, see
         values = []
         for _ in range(draws if k else 1):
             chosen = np.isin(owner, rng.choice(labelled, k, replace=False))
-            gain = adapt(p[chosen], y[chosen], owner[chosen], slope[chosen]) if k else np.ones(19)
+            gain = adapt(p[chosen], y[chosen], owner[chosen], slope[chosen]) if k else np.ones(NELECTRODE)
             changes = (
                 counts_change(torch.as_tensor(g * p, dtype=torch.float32, device=device), tare).cpu().numpy()
                 for g in (gain, 1.0)
@@ -170,7 +170,7 @@ def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, see
 def _log_changes(model, arrays):
     """(n, 19) of all rows; a window begins with each interaction, at rest."""
     position = torch.arange(len(arrays.owner), device=arrays.device) - arrays.first
-    out = torch.zeros(len(position), 19, device=arrays.device)
+    out = torch.zeros(len(position), NELECTRODE, device=arrays.device)
     average = torch.zeros(len(arrays.objects), *model.memory, device=arrays.device) if model.window else None
     for k in range(int(position.max()) + 1):
         row = (position == k).nonzero()[:, 0]

@@ -4,6 +4,7 @@ skin at rest."""
 import torch
 from torch import nn
 
+from ..sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["LocalHead", "PodHead", "averages", "next_average", "steady"]
@@ -22,7 +23,7 @@ class PodHead(nn.Module):
     def __init__(self, modes, width=128, dropout=0.1):
         super().__init__()
         self.register_buffer("damp", torch.ones(modes))
-        self.net = mlp([modes, 2 * width, width, 19], dropout)
+        self.net = mlp([modes, 2 * width, width, NELECTRODE], dropout)
 
     def forward(self, local, pod):
         """local is not used; pod (n, modes)."""
@@ -43,10 +44,10 @@ class LocalHead(nn.Module):
         super().__init__()
         self.register_buffer("scale", torch.ones(features))
         self.register_buffer("damp", torch.ones(modes))
-        self.embedding = nn.Parameter(0.1 * torch.randn(19, 8))
+        self.embedding = nn.Parameter(0.1 * torch.randn(NELECTRODE, 8))
         self.shared = mlp([features + 8, width, width, 1], dropout)
-        self.own = nn.Parameter(torch.zeros(19, features))
-        self.residual = mlp([modes, width, 19], 0.3)
+        self.own = nn.Parameter(torch.zeros(NELECTRODE, features))
+        self.residual = mlp([modes, width, NELECTRODE], 0.3)
         with torch.no_grad():
             self.residual[-1].weight.mul_(0.1)
 

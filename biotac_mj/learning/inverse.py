@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..sensor.channels import log_impedance
+from ..sensor.channels import NELECTRODE, log_impedance
 from .electrode_vae import mlp
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
@@ -30,8 +30,8 @@ class InverseHead(nn.Module):
         self.modes = pod.basis.shape[1]
         self.register_buffer("force_basis", torch.zeros(nouter, force_modes))
         self.register_buffer("force_scale", torch.ones(force_modes))
-        self.register_buffer("scale", torch.ones(19))
-        self.net = mlp([19, width, width, self.modes + force_modes], dropout)
+        self.register_buffer("scale", torch.ones(NELECTRODE))
+        self.net = mlp([NELECTRODE, width, width, self.modes + force_modes], dropout)
 
     def codes(self, log_change):
         """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z
@@ -158,7 +158,7 @@ def log_change_of(counts, tare):
       ValueError: not 19 channels, values that are not finite, or outside 0..4095.
     """
     counts, tare = np.asarray(counts, float), np.asarray(tare, float)
-    if counts.shape[-1:] != (19,) or tare.shape[-1:] != (19,):
+    if counts.shape[-1:] != (NELECTRODE,) or tare.shape[-1:] != (NELECTRODE,):
         raise ValueError(
             f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed"
         )

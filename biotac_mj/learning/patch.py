@@ -10,7 +10,7 @@ import torch
 from ..data.columns import read_columns
 from ..files import replacing
 from ..geometry import load_skin
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import ELECTRODES
 from .inverse import PATCH, contact_centre, log_change_of
 from .weights import load_inverse, shipped
 
@@ -49,7 +49,7 @@ def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", wei
       FileNotFoundError: no such file.
       ValueError: a bad table, or a tare or row that the recording does not have.
     """
-    counts = read_columns(source, CHANNELS[:19])
+    counts = read_columns(source, ELECTRODES)
     if not 1 <= tare < len(counts):
         raise ValueError(
             f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at"

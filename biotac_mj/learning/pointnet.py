@@ -8,6 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
+from ..sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["PointNet", "farthest_points"]
@@ -31,7 +32,7 @@ class PointNet(nn.Module):
       outputs: 19. points: of the levels. neighbours: in each group. dropout: in the head.
     """
 
-    def __init__(self, vert, free, outputs=19, points=(128, 32, 8), neighbours=16, dropout=0.3):
+    def __init__(self, vert, free, outputs=NELECTRODE, points=(128, 32, 8), neighbours=16, dropout=0.3):
         super().__init__()
         vert, free = np.asarray(vert, float), np.asarray(free)
         if len(free) < points[0]:

@@ -3,6 +3,7 @@
 import torch
 from torch import nn
 
+from ..sensor.channels import NELECTRODE
 from .features import FilmFeatures, Pod
 from .heads import LocalHead, PodHead, next_average
 from .local import counts_change
@@ -38,7 +39,7 @@ class ForwardModel(nn.Module):
     @property
     def memory(self):
         """Shape of what a window remembers for one sensor: (len(window), 19, features)."""
-        return (len(self.window), 19, FilmFeatures.count)
+        return (len(self.window), NELECTRODE, FilmFeatures.count)
 
     @torch.no_grad()
     def log_change(self, displacement, average=None, dt=0.0):

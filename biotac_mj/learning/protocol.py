@@ -4,6 +4,8 @@ paper's unit is counts / 2048."""
 import numpy as np
 from scipy.stats import wilcoxon
 
+from ..sensor.channels import NELECTRODE
+
 __all__ = ["conformal_width", "coverage_curve", "interaction_errors", "paired_test", "quartiles"]
 
 
@@ -20,7 +22,12 @@ def interaction_errors(predicted, truth, owner):
       ValueError: shapes that differ, no rows, or values that are not finite.
     """
     predicted, truth, owner = np.asarray(predicted, float), np.asarray(truth, float), np.asarray(owner)
-    if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 19 or len(owner) != len(truth):
+    if (
+        predicted.shape != truth.shape
+        or truth.ndim != 2
+        or truth.shape[1] != NELECTRODE
+        or len(owner) != len(truth)
+    ):
         raise ValueError(
             f"predicted {predicted.shape}, truth {truth.shape}, owner {owner.shape}: "
             "(n, 19), (n, 19) and (n,) are needed"

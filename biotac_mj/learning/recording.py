@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from ..data.columns import read_columns
-from ..sensor.channels import CHANNELS, FULL_SCALE
+from ..sensor.channels import ELECTRODES, FULL_SCALE
 
 __all__ = ["Recording", "load_recording"]
 
@@ -39,7 +39,7 @@ def load_recording(electrodes, force=None) -> Recording:
       ValueError: wrong number of columns, text that is no number, NaN, counts that are not 12 bit, lengths
         that differ, or a log too short.
     """
-    counts = read_columns(electrodes, CHANNELS[:19])
+    counts = read_columns(electrodes, ELECTRODES)
     low, high = counts.min(0), counts.max(0)
     if (low < 0).any() or (high > FULL_SCALE).any():
         bad = [f"e{i + 1} ({low[i]:g}..{high[i]:g})" for i in np.flatnonzero((low < 0) | (high > FULL_SCALE))]

@@ -115,7 +115,7 @@ class LearnedReadings:
 
 
 class LearnedBatchFilm:
-    """Stands where `sensor.batch_film.BatchFilm` stands: impedances of `nworld` skins, on their device.
+    """Stands where `sensor.film.BatchFilm` stands: impedances of `nworld` skins, on their device.
 
     All worlds are computed whenever one may be due, in single precision. Do not capture it in a CUDA graph:
     torch launches are not Warp's.
@@ -146,7 +146,7 @@ class LearnedBatchFilm:
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
 
     @torch.no_grad()
-    def solve(self, x, due):
+    def solve_film(self, x, due):
         """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,)
         wp.array of int."""
         import contextlib

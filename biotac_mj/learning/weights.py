@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..files import replacing
-from ..sensor.channels import CHANNELS
+from ..sensor.channels import ELECTRODES, NELECTRODE
 
 __all__ = [
     "describe",
@@ -83,7 +83,7 @@ def _save(path, tensors, geometry, meta):
         "format": _FORMAT,
         "mesh": mesh_key(geometry),
         "skin": geometry.name,
-        "channels": list(CHANNELS[:19]),
+        "channels": list(ELECTRODES),
     }
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,10 +123,9 @@ def _load(path, geometry, direction):
             f"{path} holds no {direction} model of {_FORMAT}: "
             f"it says {meta.get('format')}, {meta.get('direction')}"
         )
-    if meta["channels"] != list(CHANNELS[:19]):
+    if meta["channels"] != list(ELECTRODES):
         raise ValueError(
-            f"{path} was trained with channels {' '.join(meta['channels'])}: "
-            f"{' '.join(CHANNELS[:19])} is needed"
+            f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
         )
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(
@@ -162,7 +161,7 @@ def window_of(path) -> tuple:
     from .features import FilmFeatures
 
     meta = describe(path)
-    return (len(meta["window"]), 19, FilmFeatures.count) if meta.get("window") else (0,)
+    return (len(meta["window"]), NELECTRODE, FilmFeatures.count) if meta.get("window") else (0,)
 
 
 def load_inverse(path, geometry):

@@ -11,12 +11,11 @@ import numpy as np
 import trimesh
 
 from ..geometry.indenters import INDENTERS, indenter
+from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0}
-_UPRIGHT = np.array([1.0, 0, 0, 0])
-_Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns a geom so that its z axis goes ahead
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +85,7 @@ def _from_geom(text):
             "as in geom:capsule:0.003,0.005"
         )
     vert, face = _surface(kind, size)
-    return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), _Z_TO_Y, vert @ _matrix(_Z_TO_Y).T, face)
+    return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), Z_TO_Y, vert @ matrix(Z_TO_Y).T, face)
 
 
 def _from_file(path):
@@ -119,16 +118,10 @@ def _from_file(path):
         (),
         0.0,
         np.zeros(3),
-        _UPRIGHT,
+        UPRIGHT,
         np.asarray(mesh.vertices),
         np.asarray(mesh.faces),
     )
-
-
-def _matrix(quat):
-    out = np.empty(9)
-    mujoco.mju_quat2Mat(out, quat)
-    return out.reshape(3, 3)
 
 
 def make_indenter(text: str) -> Indenter:

@@ -5,11 +5,12 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
 from . import approach
 from .indenter import Indenter, add_indenter
 
-__all__ = ["LEAD", "Path", "PressOptions", "plan_path", "rotation_from_y"]
+__all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
 
@@ -100,12 +101,6 @@ class Path:
         return self.start + depth * self.direction + slid * self.slide_direction
 
 
-def rotation_from_y(direction: np.ndarray) -> np.ndarray:
-    """Quaternion of the smallest rotation that takes +y to a unit direction."""
-    quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
-    return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
-
-
 def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions) -> Path:
     """Where the indenter goes: from 5 um before it first touches the resting skin, in even steps to the
     depth, then along the skin.
@@ -131,7 +126,7 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
         raise ValueError("slide_direction is along the press: give one across it")
     across = across / max(np.linalg.norm(across), 1e-30)
 
-    quat = rotation_from_y(direction)
+    quat = quaternion_from_y(direction)
     spec = mujoco.MjSpec()
     back = 0.05 + np.abs(indenter.vert).max()  # clear of the finger
     add_indenter(

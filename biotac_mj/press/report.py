@@ -3,7 +3,6 @@ touched."""
 
 import pathlib
 
-import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,6 +10,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..files import replacing
+from ..geometry.rigid import matrix
 from .record import PressRecord
 
 __all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "write_picture"]
@@ -99,9 +99,7 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
       axes: with projection "3d".
     """
     geometry = record.geometry
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(record.indenter_quat[step], float))
-    indenter = record.indenter_vert @ rotation.reshape(3, 3).T + record.indenter_pos[step]
+    indenter = record.indenter_vert @ matrix(record.indenter_quat[step]).T + record.indenter_pos[step]
     xpos = np.asarray(record.vert_xpos[step], float)
     moved = np.linalg.norm(xpos - geometry.vert, axis=1)
     # lighter where the skin moved more, so that dimple and bulge show

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from ..coupling.attachment import Handle
+from ..geometry.rigid import matrix, quaternion
 from .indenter import Indenter, add_indenter
 from .path import LEAD, Path, PressOptions
 
@@ -50,12 +51,10 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
                 "press it one-way, or use a flat geom:box"
             )
         body.mass, body.inertia, body.explicitinertial = _SERVO_MASS, [1e-3] * 3, True
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, path.quat)
         for name, axis in (("press", path.direction), ("slide", path.slide_direction))[
             : 2 if options.slide else 1
         ]:
-            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=rotation.reshape(3, 3).T @ axis)
+            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix(path.quat).T @ axis)
             servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             servo.set_to_position(kp=_SERVO_STIFFNESS, dampratio=1.0)
     add_indenter(spec, body, indenter, **look)
@@ -92,8 +91,7 @@ def _stage(spec):
     eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(z, x), z], axis=1).ravel())
+    quat = quaternion(np.stack([x, np.cross(z, x), z], axis=1))
     spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
     spec.worldbody.add_light(
         pos=[-0.1, -0.3, -0.1],

@@ -2,49 +2,258 @@
 it.
 
 One frame is 10 ms = 44 slots at 4.4 kHz, 0.227 ms apart. Even slots are PAC (22 per frame, 2.2 kHz); the 22
-odd ones are e1..e19, PDC,
-TAC, TDC, in this order, once per frame. Source of rates: SynTouch manual; which channel has which slot is not
-  published: CHOSEN as above.
+odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Source of rates: SynTouch manual; which
+channel has which slot is not published: CHOSEN as above.
 
 Slot k lies at time k / 4400 s, so what is sampled when depends on the time alone, never on the time step. All
-memory lives in a flat state vector that the caller owns; noise is a function of (seed, slot), so a replay
-from a saved state is bit-equal."""
+memory lies in state vectors of NSTATE numbers; noise is numpy's Philox 4x64 with one counter block per slot,
+a function of (seed, slot), so a replay from a saved state is bit-equal.
 
-import functools
+`Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
+their device; both launch the kernels below."""
+
+import inspect
 import math
+import threading
+import types
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
 
 from biotac_mj.sensor import channels
+from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE, NPAC
 
-__all__ = ["Acquisition", "FRAME_TIME", "SLOTS_PER_FRAME", "SLOT_RATE"]
+__all__ = [
+    "Acquisition",
+    "BatchAcquisition",
+    "FRAME_TIME",
+    "HELD",
+    "HELD_PDC",
+    "HELD_TAC",
+    "HELD_TDC",
+    "NSTATE",
+    "PAC",
+    "SLOTS_PER_FRAME",
+    "SLOT_RATE",
+]
+
+wp.set_module_options({"enable_backward": False})
 
 SLOT_RATE = 4400.0  # [Hz]
 SLOTS_PER_FRAME = 44
-_DRAWN = 1024  # slots whose noise is drawn at once
 FRAME_TIME = SLOTS_PER_FRAME / SLOT_RATE  # [s]
 
-_LOW_PASS, _HIGH_PASS, _TAC_LOW_PASS = (
-    2 * np.pi * hertz for hertz in (1040.0, 10.0, 22.6)
-)  # [rad/s], manual
+# The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
+# temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 22.6 Hz [C/s]; counts.
+PRESSURE = NELECTRODE
+TEMPERATURE, IMPEDANCE_TIME, FILTER = PRESSURE + 1, PRESSURE + 2, PRESSURE + 3
+HELD = FILTER + 3  # e1..e19, pdc, tac, tdc
+HELD_PDC, HELD_TAC, HELD_TDC = HELD + NELECTRODE, HELD + NELECTRODE + 1, HELD + NELECTRODE + 2
+PAC = HELD_TDC + 1  # the frame's slots
+NSTATE = PAC + NPAC
 
-# The state vector.
-_IMPEDANCE = slice(0, 19)  # at _IMPEDANCE_TIME [ohm]
-_PRESSURE, _TEMPERATURE, _IMPEDANCE_TIME = 19, 20, 21
-_FILTER = slice(22, 25)  # pressure below 1040 Hz and below 10 Hz [Pa], heating below 22.6 Hz [C/s]
-_HELD = slice(25, 47)  # counts of e1..e19, pdc, tac, tdc
-_PAC = slice(47, 69)  # counts of the frame's 22 PAC slots
-_PDC_CHANNEL, _TAC_CHANNEL, _TDC_CHANNEL = 19, 20, 21
+_LOW, _HIGH, _TAC = (2 * math.pi * hertz for hertz in (1040.0, 10.0, 22.6))  # [rad/s], manual
+_BAND = _LOW / (_LOW - _HIGH)  # s w2 / ((s + w1)(s + w2)) = band (w2 / (s + w2) - w1 / (s + w1))
 
-_CORNER = np.array([_LOW_PASS, _HIGH_PASS, _TAC_LOW_PASS])
-_BAND = _LOW_PASS / (
-    _LOW_PASS - _HIGH_PASS
-)  # s w2 / ((s + w1)(s + w2)) = band (w2 / (s + w2) - w1 / (s + w1))
-_POSITION = np.arange(SLOTS_PER_FRAME)
-_ELECTRODE = (_POSITION % 2 == 1) & (_POSITION < 38)  # whether a slot of the frame is an electrode's
-_ADDRESS = (
-    np.where(_POSITION % 2 == 1, _HELD.start, _PAC.start) + _POSITION // 2
-)  # of a slot's count in the state
+real = wp.float64
+block = wp.types.vector(4, wp.uint64)
+_FRAME = wp.constant(wp.int64(SLOTS_PER_FRAME))
+
+
+def _compiled(formula):
+    """A formula of `channels.py` for kernels."""
+    copy = types.FunctionType(formula.__code__, formula.__globals__, formula.__name__)
+    copy.__annotations__ = dict.fromkeys(inspect.signature(formula).parameters, real)
+    return wp.func(copy)
+
+
+_impedance_counts = _compiled(channels.counts_from_impedance)
+_pressure_counts = _compiled(channels.counts_from_pressure)
+_pac_counts = _compiled(channels.counts_from_pac)
+_thermistor_counts = _compiled(channels.thermistor_counts)
+_heating_exponent = _compiled(channels.heating_exponent)
+_temperature_exponent = _compiled(channels.temperature_exponent)
+_electrode_noise = _compiled(channels.electrode_noise)
+
+
+@wp.func
+def _slots_until(time: real):
+    """How many slots lie up to a time, slot 0 left out; the allowance keeps a slot on one side of a time that
+    was summed up with rounding."""
+    return wp.int64(wp.floor(time * real(SLOT_RATE) + real(1.0e-6)))
+
+
+@wp.func
+def _position(slot: wp.int64):
+    """Of a slot in its frame; time may be negative."""
+    position = wp.int32(slot % _FRAME)
+    return wp.where(position < 0, position + SLOTS_PER_FRAME, position)
+
+
+@wp.kernel
+def find_due(
+    # In:
+    time: wp.array(dtype=real),
+    dt: real,
+    every_step: int,
+    # Out:
+    due_out: wp.array(dtype=int),
+):
+    """`Acquisition.needs_impedance` of each world."""
+    w = wp.tid()
+    before = _slots_until(time[w])
+    count = wp.int32(_slots_until(time[w] + dt) - before)
+    due = int(0)
+    if every_step == 1:
+        for k in range(1, wp.min(count, SLOTS_PER_FRAME) + 1):
+            position = _position(before + wp.int64(k))
+            if position % 2 == 1 and position < 2 * NELECTRODE:
+                due = 1
+    elif SLOTS_PER_FRAME - _position(before - wp.int64(1)) <= count:
+        due = 1  # slot 1 of a frame, the first electrode's
+    due_out[w] = due
+
+
+@wp.func
+def _high_product(a: wp.uint64, b: wp.uint64):
+    """Upper half of the 128-bit product."""
+    half = wp.uint64(32)
+    mask = wp.uint64(0xFFFFFFFF)
+    a0 = a & mask
+    a1 = a >> half
+    b0 = b & mask
+    b1 = b >> half
+    middle = a1 * b0 + ((a0 * b0) >> half)
+    carry = a0 * b1 + (middle & mask)
+    return a1 * b1 + (middle >> half) + (carry >> half)
+
+
+@wp.func
+def philox(counter: wp.uint64, key: wp.uint64):
+    """Block `counter` of Philox 4x64-10 (Salmon et al., SC 2011) with this key, the upper words of which are
+    zero."""
+    c0 = counter
+    c1 = wp.where(counter == wp.uint64(0), wp.uint64(1), wp.uint64(0))  # numpy's carries, before slot 0
+    c2 = wp.uint64(0)
+    c3 = wp.uint64(0)
+    k0 = key
+    k1 = wp.uint64(0)
+    m0 = wp.uint64(0xD2E7470EE14C6C93)
+    m1 = wp.uint64(0xCA5A826395121157)
+    for _ in range(10):
+        n0 = _high_product(m1, c2) ^ c1 ^ k0
+        n1 = m1 * c2
+        n2 = _high_product(m0, c0) ^ c3 ^ k1
+        n3 = m0 * c0
+        c0 = n0
+        c1 = n1
+        c2 = n2
+        c3 = n3
+        k0 += wp.uint64(0x9E3779B97F4A7C15)
+        k1 += wp.uint64(0xBB67AE8584CAA73B)
+    return block(c0, c1, c2, c3)
+
+
+@wp.func
+def _normal(slot: wp.int64, seed: wp.uint64):
+    """Standard normal draw of a slot (Box-Muller: a fixed number of draws)."""
+    raw = philox(wp.uint64(slot) + wp.uint64(1), seed)  # numpy counts on before it draws
+    shift = wp.uint64(11)
+    unit = real(1.0) / real(9007199254740992.0)
+    u = (real(raw[0] >> shift) + real(0.5)) * unit
+    v = (real(raw[1] >> shift) + real(0.5)) * unit
+    return wp.sqrt(real(-2.0) * wp.log(u)) * wp.cos(real(2.0) * real(wp.pi) * v)
+
+
+@wp.func
+def _ramp(old: real, rise: real, memory: real, corner: real, t: real):
+    """Exact response of corner / (s + corner) to the ramp old + rise t."""
+    lag = rise / corner
+    return old - lag + rise * t + (memory - old + lag) * wp.exp(-corner * t)
+
+
+@wp.kernel
+def sample_slots(
+    # In:
+    dt: real,
+    noise: int,
+    seed: wp.array(dtype=wp.uint64),
+    due: wp.array(dtype=int),
+    valid: wp.array(dtype=int),
+    impedance: wp.array2d(dtype=real),
+    pressure: wp.array(dtype=real),
+    temperature: wp.array(dtype=real),
+    # In, out:
+    time: wp.array(dtype=real),
+    state: wp.array2d(dtype=real),
+):
+    """`Acquisition.advance` of each world over (time, time + dt]."""
+    w = wp.tid()
+    now = time[w]
+    fresh = due[w] * valid[w]
+    span = now + dt - wp.min(state[w, IMPEDANCE_TIME], now)  # a clock that was set back does not extrapolate
+    old = state[w, PRESSURE]
+    rise = (pressure[w] - old) / dt
+    warm = state[w, TEMPERATURE]
+    heating = (temperature[w] - warm) / dt
+    low = state[w, FILTER]
+    high = state[w, FILTER + 1]
+    tac = state[w, FILTER + 2]
+    before = _slots_until(now)
+    for k in range(1, wp.int32(_slots_until(now + dt) - before) + 1):
+        slot = before + wp.int64(k)
+        since = real(slot) / real(SLOT_RATE) - now
+        position = _position(slot)
+        channel = position / 2
+        address = PAC + channel
+        fast = _ramp(old, rise, low, real(_LOW), since)
+        value = _pac_counts(real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since)))
+        deviation = real(channels.OTHER_NOISE)
+        if position % 2 == 1:
+            address = HELD + channel
+            if channel < NELECTRODE:
+                z = state[w, channel]
+                if fresh == 1:
+                    z += (impedance[w, channel] - z) * (real(1.0) - (dt - since) / span)
+                value = _impedance_counts(z)
+                deviation = _electrode_noise(value)
+            elif address == HELD_PDC:
+                value = _pressure_counts(fast)
+            elif address == HELD_TAC:
+                value = _thermistor_counts(
+                    _heating_exponent(_ramp(heating, real(0.0), tac, real(_TAC), since))
+                )
+            else:
+                value = _thermistor_counts(_temperature_exponent(warm + heating * since))
+        if noise == 1:
+            value += deviation * _normal(slot, seed[w])
+        # a step longer than a frame meets a channel more than once: the last one stays
+        state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
+    state[w, FILTER] = _ramp(old, rise, low, real(_LOW), dt)
+    state[w, FILTER + 1] = _ramp(old, rise, high, real(_HIGH), dt)
+    state[w, FILTER + 2] = _ramp(heating, real(0.0), tac, real(_TAC), dt)
+    state[w, PRESSURE] = pressure[w]
+    state[w, TEMPERATURE] = temperature[w]
+    if fresh == 1:
+        for e in range(NELECTRODE):
+            state[w, e] = impedance[w, e]
+        state[w, IMPEDANCE_TIME] = now + dt
+    time[w] = now + dt
+
+
+@wp.kernel
+def reset_states(
+    mask: wp.array(dtype=bool),
+    rest: wp.array(dtype=real),
+    time_out: wp.array(dtype=real),
+    state_out: wp.array2d(dtype=real),
+):
+    w, i = wp.tid()
+    if mask[w]:
+        state_out[w, i] = rest[i]
+        if i == 0:
+            time_out[w] = real(0.0)
 
 
 class Acquisition:
@@ -62,16 +271,26 @@ class Acquisition:
 
     Attributes:
       nstate: length of the state vector.
+
+    Raises:
+      ValueError: the seed is out of range.
     """
 
-    nstate = 69
+    nstate = NSTATE
 
-    def __init__(self, seed=0, noise=True, film_every_step=False):
+    def __init__(self, seed: int = 0, noise: bool = True, film_every_step: bool = False):
         if int(seed) != seed or not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}: pass an integer from 0 to 2**64 - 1")
         self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
 
-    def reset(self, state, impedance, pressure=0.0, temperature=channels.REST_TEMPERATURE, time=0.0):
+    def reset(
+        self,
+        state: np.ndarray,
+        impedance: ArrayLike,
+        pressure: float = 0.0,
+        temperature: float = channels.REST_TEMPERATURE,
+        time: float = 0.0,
+    ) -> None:
         """Writes the steady state: every channel holds the noise-free count of these signals.
 
         Args:
@@ -79,39 +298,37 @@ class Acquisition:
           impedance: (19,) [ohm]; pressure: above rest [Pa]; temperature: [C]; time: now [s].
         """
         self._check_state(state)
-        state[_IMPEDANCE] = self._check_impedance(impedance)
-        state[_PRESSURE], state[_TEMPERATURE] = self._check_scalars(pressure, temperature)
-        state[_IMPEDANCE_TIME] = time
-        state[_FILTER] = pressure, pressure, 0.0
-        state[_HELD] = np.concatenate(
-            [
-                channels.counts_from_impedance(impedance),
-                [
-                    channels.counts_from_pressure(pressure),
-                    channels.counts_from_heating(0.0),
-                    channels.counts_from_temperature(temperature),
-                ],
-            ]
-        )
-        state[_PAC] = channels.counts_from_pac(0.0)
-        state[_HELD.start :] = _quantise(state[_HELD.start :])
+        state[:NELECTRODE] = self._check_impedance(impedance)
+        state[PRESSURE], state[TEMPERATURE] = self._check_scalars(pressure, temperature)
+        state[IMPEDANCE_TIME] = time
+        state[FILTER:HELD] = pressure, pressure, 0.0
+        state[HELD:HELD_PDC] = channels.counts_from_impedance(impedance)
+        state[HELD_PDC] = channels.counts_from_pressure(pressure)
+        state[HELD_TAC] = channels.counts_from_heating(0.0)
+        state[HELD_TDC] = channels.counts_from_temperature(temperature)
+        state[PAC:] = channels.counts_from_pac(0.0)
+        state[HELD:] = np.clip(np.rint(state[HELD:]), 0, channels.FULL_SCALE)
 
-    def needs_impedance(self, state, time, dt):
+    def needs_impedance(self, state: np.ndarray, time: float, dt: float) -> bool:
         """Whether `advance` over (time, time + dt] wants a new impedance, so that the film need not be solved
         otherwise.
 
         By default once per frame: in the step that holds the frame's first electrode slot. Until the next
-          solution the electrodes hold
-        that impedance, so what e19 reads is up to one frame (10 ms) old, 5 ms on average: causal, and what
-        makes a 0.1 ms step affordable. With `film_every_step` whenever an electrode slot falls into the step.
+        solution the electrodes hold that impedance, so what e19 reads is up to one frame (10 ms) old, 5 ms on
+        average: causal, and what makes a 0.1 ms step affordable. With `film_every_step` whenever an electrode
+        slot falls into the step.
         """
-        first, last = _slots(time, dt)
-        if self.film_every_step:
-            slot = np.arange(first, min(last, first + SLOTS_PER_FRAME) + 1) % SLOTS_PER_FRAME
-            return bool(np.any((slot % 2 == 1) & (slot < 2 * 19)))
-        return (last - 1) // SLOTS_PER_FRAME > (first - 2) // SLOTS_PER_FRAME
+        return _one().find_due(time, dt, self.film_every_step)
 
-    def advance(self, state, time, dt, impedance=None, pressure=0.0, temperature=None):
+    def advance(
+        self,
+        state: np.ndarray,
+        time: float,
+        dt: float,
+        impedance: ArrayLike | None = None,
+        pressure: float = 0.0,
+        temperature: float | None = None,
+    ) -> None:
         """Samples the slots in (time, time + dt].
 
         Args:
@@ -130,52 +347,10 @@ class Acquisition:
             raise ValueError(f"time is {time} and dt is {dt}: pass finite seconds, dt positive")
         if impedance is not None:
             impedance = self._check_impedance(impedance)
-        new_pressure, new_temperature = self._check_scalars(
-            pressure, state[_TEMPERATURE] if temperature is None else temperature
-        )
+        signals = self._check_scalars(pressure, state[TEMPERATURE] if temperature is None else temperature)
+        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals)
 
-        first, last = _slots(time, dt)
-        slot = np.arange(first, last + 1)
-        end = np.append(
-            slot / SLOT_RATE - time, dt
-        )  # the last entry is the end of the step: the filters' new memory
-        since = end[:-1]
-        heating = (new_temperature - state[_TEMPERATURE]) / dt
-        old = np.array([state[_PRESSURE], state[_PRESSURE], heating])
-        rise = (new_pressure - state[_PRESSURE]) / dt
-        lag = np.array([rise / _LOW_PASS, rise / _HIGH_PASS, 0.0])
-        # Exact response of w / (s + w) to the ramp old + rise t.
-        filtered = (
-            (old - lag)
-            + (_CORNER * lag) * end[:, None]
-            + (state[_FILTER] - old + lag) * np.exp(-_CORNER * end[:, None])
-        )
-
-        if len(slot):
-            position = slot % SLOTS_PER_FRAME
-            electrode = _ELECTRODE[position]
-            value = self._signals(
-                state,
-                time,
-                dt,
-                impedance,
-                position,
-                electrode,
-                since,
-                filtered,
-                state[_TEMPERATURE] + heating * since,
-            )
-            if self.noise:
-                value += self._noise(first, electrode, value)
-            # A step longer than a frame meets a channel more than once: numpy keeps the last assignment.
-            state[_ADDRESS[position]] = _quantise(value)
-
-        state[_FILTER] = filtered[-1]
-        state[_PRESSURE], state[_TEMPERATURE] = new_pressure, new_temperature
-        if impedance is not None:
-            state[_IMPEDANCE], state[_IMPEDANCE_TIME] = impedance, time + dt
-
-    def readings(self, state):
+    def readings(self, state: np.ndarray) -> dict:
         """What the bus would report now.
 
         Returns:
@@ -183,46 +358,14 @@ class Acquisition:
             tac int, tdc int.
         """
         self._check_state(state)
-        held = state[_HELD].astype(int)
+        held = state.astype(int)
         return {
-            "electrodes": held[:19],
-            "pdc": int(held[_PDC_CHANNEL]),
-            "pac": state[_PAC].astype(int),
-            "tac": int(held[_TAC_CHANNEL]),
-            "tdc": int(held[_TDC_CHANNEL]),
+            "electrodes": held[HELD:HELD_PDC],
+            "pdc": int(held[HELD_PDC]),
+            "pac": held[PAC:],
+            "tac": int(held[HELD_TAC]),
+            "tdc": int(held[HELD_TDC]),
         }
-
-    def _signals(self, state, time, dt, impedance, position, electrode, since, filtered, temperature):
-        """Noise-free counts (nslot,) of what each slot samples."""
-        value = channels.counts_from_pac(_BAND * (filtered[:-1, 0] - filtered[:-1, 1]))
-        channel = position[electrode] // 2
-        now = state[_IMPEDANCE][channel]
-        if impedance is not None:
-            span = (
-                time + dt - min(state[_IMPEDANCE_TIME], time)
-            )  # a clock that was set back does not extrapolate
-            now += (impedance[channel] - now) * (1 - (dt - since[electrode]) / span)
-        value[electrode] = channels.counts_from_impedance(now)
-        for which, convert, source in (
-            (_PDC_CHANNEL, channels.counts_from_pressure, filtered[:, 0]),
-            (_TAC_CHANNEL, channels.counts_from_heating, filtered[:, 2]),
-            (_TDC_CHANNEL, channels.counts_from_temperature, temperature),
-        ):
-            start = (
-                int(2 * which + 1 - position[0]) % SLOTS_PER_FRAME
-            )  # this channel's first slot in the step
-            if start < len(value):
-                value[start::SLOTS_PER_FRAME] = convert(source[start : len(value) : SLOTS_PER_FRAME])
-        return value
-
-    def _noise(self, first, electrode, value):
-        """White noise (nslot,)."""
-        block, start = divmod(first, _DRAWN)
-        normal = _normals(self.seed, block)[start : start + len(value)]
-        while len(normal) < len(value):
-            block += 1
-            normal = np.append(normal, _normals(self.seed, block)[: len(value) - len(normal)])
-        return np.where(electrode, channels.electrode_noise(value), channels.OTHER_NOISE) * normal
 
     def _check_state(self, state):
         if not (
@@ -240,12 +383,13 @@ class Acquisition:
     @staticmethod
     def _check_impedance(impedance):
         impedance = np.asarray(impedance, dtype=float)
-        if impedance.shape != (19,):
+        if impedance.shape != (NELECTRODE,):
             raise ValueError(
-                f"impedance has shape {impedance.shape}: pass (19,) [ohm], one per electrode e1..e19"
+                f"impedance has shape {impedance.shape}: pass ({NELECTRODE},) [ohm], one per electrode "
+                f"{ELECTRODES[0]}..{ELECTRODES[-1]}"
             )
         if not (impedance.min() > 0 and impedance.max() < np.inf):
-            bad = [f"e{i + 1}" for i in np.flatnonzero(~(np.isfinite(impedance) & (impedance > 0)))]
+            bad = [ELECTRODES[i] for i in np.flatnonzero(~(np.isfinite(impedance) & (impedance > 0)))]
             raise ValueError(
                 f"impedance of {', '.join(bad)} is not a positive finite number [ohm]: check the skin's "
                 "positions; keep the last good ones"
@@ -262,26 +406,130 @@ class Acquisition:
         return float(pressure), float(temperature)
 
 
-@functools.lru_cache(maxsize=64)
-def _normals(seed, block):
-    """Standard normal draws (_DRAWN,) of a block of slots: one Philox counter per slot, whatever steps cut
-    the time into."""
-    raw = (
-        np.random.Philox(key=seed, counter=block * _DRAWN % 2**64)
-        .random_raw(4 * _DRAWN)
-        .reshape(-1, 4)[:, :2]
-    )
-    uniform = ((raw >> np.uint64(11)) + 0.5) * 2.0**-53
-    return np.sqrt(-2 * np.log(uniform[:, 0])) * np.cos(
-        2 * np.pi * uniform[:, 1]
-    )  # Box-Muller: a fixed number of draws per slot
+class _One:
+    """One world's arrays on the CPU and the kernels' recorded launches, a thread's own: what every
+    `Acquisition` fills in and reads back."""
+
+    def __init__(self):
+        self._time, self._pressure, self._temperature = (wp.zeros(1, dtype=real, device="cpu") for _ in "tpT")
+        self._due, self._seed = (
+            wp.zeros(1, dtype=int, device="cpu"),
+            wp.zeros(1, dtype=wp.uint64, device="cpu"),
+        )
+        self._impedance = wp.zeros((1, NELECTRODE), dtype=real, device="cpu")
+        self._state = wp.zeros((1, NSTATE), dtype=real, device="cpu")
+        self.time, self.pressure, self.temperature, self.due, self.seed = (
+            array.numpy() for array in (self._time, self._pressure, self._temperature, self._due, self._seed)
+        )
+        self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
+        valid = wp.ones(1, dtype=int, device="cpu")
+        inputs = [1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
+        state = [self._time, self._state]
+        self._sample = wp.launch(sample_slots, 1, inputs, state, device="cpu", record_cmd=True)
+        self._find = wp.launch(find_due, 1, [self._time, 1.0, 0], [self._due], device="cpu", record_cmd=True)
+
+    def find_due(self, time, dt, every_step):
+        self.time[0] = time
+        self._find.set_param_at_index_from_ctype(1, dt)
+        self._find.set_param_at_index_from_ctype(2, int(every_step))
+        self._find.launch()
+        return bool(self.due[0])
+
+    def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature):
+        self.state[:] = state
+        self.seed[0], self.time[0], self.pressure[0], self.temperature[0] = seed, time, pressure, temperature
+        self.due[0] = impedance is not None
+        if impedance is not None:
+            self.impedance[:] = impedance
+        self._sample.set_param_at_index_from_ctype(0, dt)
+        self._sample.set_param_at_index_from_ctype(1, int(noise))
+        self._sample.launch()
+        state[:] = self.state
 
 
-def _slots(time, dt):
-    """First and last slot in (time, time + dt]; the allowance keeps a slot on one side of a time that was
-    summed up with rounding."""
-    return math.floor(time * SLOT_RATE + 1e-6) + 1, math.floor((time + dt) * SLOT_RATE + 1e-6)
+_mine = threading.local()
 
 
-def _quantise(counts):
-    return np.minimum(np.maximum(np.rint(counts), 0), channels.FULL_SCALE)
+def _one():
+    """This thread's `_One`, made when it is first used: that compiles the kernels."""
+    if not hasattr(_mine, "one"):
+        _mine.one = _One()
+    return _mine.one
+
+
+class BatchAcquisition:
+    """The multiplexers of `nworld` sensors on one device, each with its own clock and seed: worlds get the
+    counts, noise included, of single ones with their seeds.
+
+    Args:
+      rest: (19,) impedance at rest [ohm], at which every world begins.
+      nworld: number of worlds.
+      seed: of world 0; world w has seed + w. Or (nworld,) of them, 0 .. 2**64 - 1.
+      noise: False leaves quantisation only.
+      film_every_step: see `Acquisition.needs_impedance`.
+      temperature: of the core at rest [C].
+      device: Warp device.
+
+    Attributes:
+      state: (nworld, NSTATE) wp.array float64, each row the state vector of an `Acquisition`.
+      time: (nworld,) wp.array float64 [s], each sensor's clock, zero at its reset.
+      temperature: (nworld,) wp.array float64 [C], of the core at the end of the next step.
+      due: (nworld,) wp.array int, written by `find_due`.
+
+    Raises:
+      ValueError: a seed out of range or another number of seeds than worlds.
+    """
+
+    def __init__(
+        self,
+        rest: ArrayLike,
+        nworld: int,
+        seed: ArrayLike = 0,
+        noise: bool = True,
+        film_every_step: bool = False,
+        temperature: float = channels.REST_TEMPERATURE,
+        device="cpu",
+    ):
+        state = np.zeros(NSTATE)
+        Acquisition().reset(state, rest, temperature=temperature)
+        seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
+        if len(seeds) != nworld:
+            raise ValueError(
+                f"{len(seeds)} seeds for {nworld} worlds: pass one for each, or a single one from which "
+                "they count on"
+            )
+        for s in (min(seeds), max(seeds)):
+            Acquisition(seed=s)  # refuses what is out of range
+        self.nworld, self.device = nworld, wp.get_device(device)
+        self._noise, self._every = int(bool(noise)), int(bool(film_every_step))
+        with wp.ScopedDevice(self.device):
+            self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
+            self._rest = wp.array(state, dtype=real)
+            self.state = wp.array(np.tile(state, (nworld, 1)), dtype=real)
+            self.time = wp.zeros(nworld, dtype=real)
+            self.temperature = wp.full(nworld, temperature, dtype=real)
+            self.due = wp.zeros(nworld, dtype=int)
+
+    def reset(self, mask: wp.array) -> None:
+        """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
+        wp.launch(
+            reset_states, self.state.shape, [mask, self._rest], [self.time, self.state], device=self.device
+        )
+
+    def find_due(self, dt: float) -> wp.array:
+        """Writes which worlds want a new impedance for the step of dt [s] from now; returns `due`."""
+        wp.launch(find_due, self.nworld, [self.time, dt, self._every], [self.due], device=self.device)
+        return self.due
+
+    def advance(self, dt: float, impedance: wp.array, valid: wp.array, pressure: wp.array) -> None:
+        """Samples the slots of a step and moves the clocks. Launches only: may be captured in a CUDA graph.
+
+        Args:
+          dt: length of the step [s].
+          impedance: (nworld, 19) wp.array float64 at the end of the step [ohm], looked at in the worlds that
+            are `due` and `valid`.
+          valid: (nworld,) wp.array int.
+          pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
+        """
+        inputs = [dt, self._noise, self.seed, self.due, valid, impedance, pressure, self.temperature]
+        wp.launch(sample_slots, self.nworld, inputs, [self.time, self.state], device=self.device)

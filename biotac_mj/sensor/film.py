@@ -10,35 +10,51 @@ Electrodes are discs with uniform current density, so the result does not depend
 Two parts of the field near a disc are closed forms with the film's local thickness h: the mesh carries the
 current in over a disc of radius b that it resolves, and ln(b / a) / (2 pi sigma h) is the sheet between that
 and the electrode's radius a; and a sheet is exact only where it is thinner than the disc is wide, so what a
-slab of thickness h adds is `spreading_resistance`."""
+slab of thickness h adds is `spreading_resistance`.
+
+`FilmConduction` holds the constants of one skin and answers for one deformed skin at a time; `BatchFilm` has
+the impedances of many on one device. Both launch the kernels of `film_kernels.py`: distances from the core's
+triangles, the sheet Laplacian as a band of tiles, its Cholesky factor by one thread block per world. A direct
+solution costs some 20 million operations per world; conjugate gradients would need tens of iterations, since
+a film pressed to a twentieth of its thickness is far from the one at rest."""
+
+import threading
 
 import numpy as np
-from scipy.linalg import lapack
+import warp as wp
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.special import j1
 
+from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
-from biotac_mj.sensor.channels import REST_COUNTS, impedance_from_counts
+from biotac_mj.sensor import film_kernels as kernels
+from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.threads import single_thread
+from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
 
-__all__ = ["CONDUCTIVITY", "EXCITATION", "FilmConduction", "sheet_laplacian", "spreading_resistance"]
+__all__ = [
+    "CONDUCTIVITY",
+    "EXCITATION",
+    "BatchFilm",
+    "FilmConduction",
+    "sheet_laplacian",
+    "spreading_resistance",
+]
 
 # X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for
 # this sensor; the two pairs, symmetric about z = 0, that best explain the published rest counts
 # (scripts/fit_excitation.py on the paper's mesh: ln Z correlates 0.978, RMS 0.054).
 EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 1.299))
-# [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at 25
-# C
+# [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at
+# 25 C
 CONDUCTIVITY = 0.367
-_CORE_RADIUS = (
-    5.325e-3  # [m], published cylinder about the x axis; only says where to look for the core's surface
-)
+# [m], published cylinder about the x axis; only says where to look for the core's surface
+_CORE_RADIUS = 5.325e-3
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
-_SLACK = (
-    2.0e-3  # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
-)
+# [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
+_SLACK = 2.0e-3
 
 
 class FilmConduction:
@@ -58,20 +74,23 @@ class FilmConduction:
 
     Attributes:
       cell_constant: (19,), what the film's impedance is multiplied with.
+      rest: (19,) impedance of the skin at rest [ohm].
       excitation_pos: (4, 3), X1..X4 on the core [m].
 
     Raises:
       ValueError: a parameter out of range, or an electrode that the film does not cover.
     """
 
+    _power = 1.0  # of the thickness, as which the conductance goes
+
     def __init__(
         self,
         geometry: SkinGeometry,
-        conductivity=CONDUCTIVITY,
-        residual_film=50e-6,
-        electrode_radius=0.5e-3,
-        excitation=EXCITATION,
-        sensor="1",
+        conductivity: float = CONDUCTIVITY,
+        residual_film: float = 50e-6,
+        electrode_radius: float = 0.5e-3,
+        excitation: ArrayLike = EXCITATION,
+        sensor: str | None = "1",
     ):
         for name, value in (
             ("conductivity", conductivity),
@@ -86,10 +105,10 @@ class FilmConduction:
                 "calibration"
             )
         excitation = np.asarray(excitation, dtype=float)
-        if excitation.ndim != 2 or excitation.shape[1] != 2 or not np.all(np.isfinite(excitation)):
+        if excitation.shape != (NEXCITATION, 2) or not np.all(np.isfinite(excitation)):
             raise ValueError(
-                f"excitation has shape {excitation.shape}: pass (n, 2) finite numbers, position x [m] and "
-                "angle [rad] of each electrode"
+                f"excitation has shape {excitation.shape}: pass ({NEXCITATION}, 2) finite numbers, position "
+                "x [m] and angle [rad] of each electrode"
             )
 
         self.geometry, self.conductivity, self.residual_film, self.electrode_radius = (
@@ -106,12 +125,15 @@ class FilmConduction:
         self._normal = np.concatenate([geometry.electrode_normal, self.core.normal[triangle]])
         self._set_mesh()
         self._set_discs()
-        self._spreading = _spreading_table()
-        self.cell_constant = np.ones(19)
+        self.cell_constant = self.rest = np.ones(NELECTRODE)
+        self._set_alone()
+        self.rest = self.impedance(geometry.vert)
         if sensor is not None:
-            self.cell_constant = impedance_from_counts(REST_COUNTS[sensor]) / self.impedance(geometry.vert)
+            self.cell_constant = impedance_from_counts(REST_COUNTS[sensor]) / self.rest
+            self.rest = self.cell_constant * self.rest
+            self._set_alone()
 
-    def impedance(self, vert_xpos):
+    def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
         """Impedance of E1..E19.
 
         Args:
@@ -128,24 +150,33 @@ class FilmConduction:
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
             raise ValueError(
                 f"vert_xpos has shape {vert_xpos.shape}: the skin '{self.geometry.name}' needs "
-                f"({self.geometry.nvert}, 3), "
-                f"or (nworld, {self.geometry.nvert}, 3)"
+                f"({self.geometry.nvert}, 3), or (nworld, {self.geometry.nvert}, 3)"
             )
         if vert_xpos.ndim == 3:
-            return (
-                np.stack([self.impedance(world) for world in vert_xpos])
-                if len(vert_xpos)
-                else np.empty((0, 19))
+            out = np.empty((len(vert_xpos), NELECTRODE))
+            for w, world in enumerate(vert_xpos):
+                out[w] = self.impedance(world)
+            return out
+        self._check_finite(vert_xpos)
+        with self._lock:
+            alone = self._alone
+            self._x.numpy()[:, 0] = vert_xpos
+            alone.solve_film(self._x, self._now)
+            if alone.valid.numpy()[0]:
+                return alone.impedance.numpy()[0].copy()
+            local = alone.local.numpy()[:, 0].copy()
+        missing = [name for name, thickness in zip(DISCS, local) if thickness == 0]
+        if missing:
+            raise ValueError(
+                f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than "
+                f"{_SLACK * 1e3:g} mm, or is bonded there"
             )
-        middle, thickness = self.film(vert_xpos)
-        weight = self._disc_weights(middle)
-        resistance = self._resistances(middle, thickness, weight)
-        a, local = self.electrode_radius, thickness @ weight
-        near = np.log(self._footprint / a) / (2 * np.pi * local) + self._spreading(local / a) / a
-        resistance[np.diag_indices(len(self._pos))] += near / self.conductivity
-        return self.cell_constant * _driving_point(resistance, 19)
+        raise ValueError(
+            "the film's conductance is not positive definite: the inner surface is folded; keep the last "
+            "good state"
+        )
 
-    def film(self, vert_xpos):
+    def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """The film under the skin.
 
         Args:
@@ -155,15 +186,29 @@ class FilmConduction:
           middle (nnode, 3), the surface halfway between skin and core, and thickness (nnode,), at least
           `residual_film` [m], at the nodes `self.node`.
         """
-        point = vert_xpos[self.node]
-        if not np.all(np.isfinite(point)):
-            bad = self.node[~np.all(np.isfinite(point), axis=1)]
+        vert_xpos = np.asarray(vert_xpos, dtype=float)
+        self._check_finite(vert_xpos)
+        with self._lock:
+            self._x.numpy()[:, 0] = vert_xpos
+            self._alone.lay(self._x, self._now)
+            return self._alone.middle.numpy()[:, 0].copy(), self._alone.thickness.numpy()[:, 0].copy()
+
+    def _check_finite(self, vert_xpos):
+        finite = np.isfinite(vert_xpos[self.node]).all(axis=1)
+        if not finite.all():
+            bad = self.node[~finite]
             raise ValueError(
                 f"vert_xpos is not finite at {len(bad)} inner node(s), first {bad[0]}: "
                 "the skin's step did not converge; keep the last good state"
             )
-        distance, foot, _ = self.core.closest(point)
-        return 0.5 * (point + foot), np.maximum(distance, self.residual_film)
+
+    def _set_alone(self):
+        """The arrays of one world on the CPU, which one thread at a time may use."""
+        self._alone, self._lock = BatchFilm(self, 1), threading.Lock()
+        self._x, self._now = (
+            wp.zeros((self.geometry.nvert, 1), dtype=vec3, device="cpu"),
+            wp.ones(1, dtype=int, device="cpu"),
+        )
 
     def _set_mesh(self):
         """Film nodes in an order of small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)
@@ -186,13 +231,10 @@ class FilmConduction:
         index = np.full(self.geometry.nvert, -1)
         index[self.node] = np.arange(len(node))
         self.face = index[face]
-        i, j = _edges(self.face)
-        low, high = np.minimum(i, j), np.maximum(i, j)
-        # LAPACK's lower band storage, column-major: entry (row, column) lies at column * (bandwidth + 1) +
-        # row - column.
-        self._band = int((high - low).max()) + 1
-        diagonal = self._band * np.arange(len(node))
-        self._slot = np.concatenate([diagonal[low] + high - low, diagonal[low], diagonal[high]])
+        self._pattern = _Pattern(self.face, len(node))
+        distance, foot, _ = self.core.closest(self.geometry.vert[self.node])
+        self._rest_middle = 0.5 * (self.geometry.vert[self.node] + foot)
+        self._rest_thickness = np.maximum(distance, self.residual_film)
 
     def _set_discs(self):
         """Points that stand for equal parts of a disc, and the faces that may come to lie over each
@@ -203,11 +245,8 @@ class FilmConduction:
         self._disc = self._footprint * np.stack(
             [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1
         ).reshape(-1, 2)
-        helper = np.where(np.abs(self._normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-        tangent = np.cross(self._normal, helper)
-        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        self._tangent = np.stack([tangent, np.cross(self._normal, tangent)], axis=1)
-        corner = self.film(self.geometry.vert)[0][self.face]
+        self._tangent = np.stack(across(self._normal), axis=1)
+        corner = self._rest_middle[self.face]
         centre = corner.mean(1)
         reach = self._footprint + _SLACK + np.linalg.norm(corner - centre[:, None], axis=2).max(1)
         offset = centre[None] - self._pos[:, None]
@@ -217,66 +256,166 @@ class FilmConduction:
         # it.
         self._pair = np.nonzero((tangential < reach) & (np.abs(height) < _SLACK))
 
-    def _disc_weights(self, middle):
-        """(nnode, 23): mean over each disc = weights applied to nodal values; columns sum to one."""
-        electrode, face = self._pair
-        offset = middle[self.face[face]] - self._pos[electrode, None]
-        flat = np.einsum("pck,pak->pca", offset, self._tangent[electrode])
-        near = np.all((flat.min(1) <= self._footprint) & (flat.max(1) >= -self._footprint), axis=1)
-        electrode, face, flat = electrode[near], face[near], flat[near]
-        e1, e2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
-        area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
-        d = self._disc[None] - flat[:, None, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            s = (d[..., 0] * e2[:, None, 1] - d[..., 1] * e2[:, None, 0]) / area[:, None]
-            t = (e1[:, None, 0] * d[..., 1] - e1[:, None, 1] * d[..., 0]) / area[:, None]
-            pair, sample = np.nonzero((s >= 0) & (t >= 0) & (s + t <= 1))
-        s, t, electrode = s[pair, sample], t[pair, sample], electrode[pair]
-        key = electrode * len(self._disc) + sample
-        hits = np.bincount(
-            key, minlength=len(self._pos) * len(self._disc)
-        )  # a sample on an edge or under a fold is shared
-        covered = (hits.reshape(len(self._pos), -1) > 0).sum(1)
-        if not covered.all():
-            missing = [f"E{e + 1}" if e < 19 else f"X{e - 18}" for e in np.flatnonzero(covered == 0)]
-            raise ValueError(
-                f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than "
-                f"{_SLACK * 1e3:g} mm, "
-                "or is bonded there"
+
+class BatchFilm:
+    """The film of `nworld` sensors of one geometry on one device. Only worlds that are due compute anything,
+    so the same launches can be recorded in a CUDA graph and replayed every step.
+
+    Args:
+      film: the `FilmConduction` whose constants it takes.
+      nworld: number of worlds.
+      device: Warp device.
+
+    Attributes:
+      impedance: (nworld, 19) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
+      valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
+        position that is not finite.
+      rest: (19,) impedance at rest [ohm].
+      middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
+        world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
+      nbytes: device memory of all worlds.
+    """
+
+    def __init__(self, film: FilmConduction, nworld: int, device="cpu"):
+        self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
+        pattern, n = film._pattern, len(film.node)
+        nblock, reach = pattern.nblock, pattern.reach
+        self._rhs = nblock * (reach + 1) * TILE
+        electrode, face = film._pair
+        order = np.argsort(electrode, kind="stable")
+        table_step, table = _spreading_table()
+        geometry = film.geometry
+        with wp.ScopedDevice(self.device):
+            self._core = (
+                film.core
+                if self.device == film.core.device
+                else CoreSurface(geometry.core_vert, geometry.core_face, self.device)
             )
-        share = 1.0 / (hits[key] * covered[electrode])
-        node = self.face[face[pair]]
-        weight = np.zeros((len(self.node), len(self._pos)), order="F")
-        value = np.stack([1 - s - t, s, t], axis=1) * share[:, None]
-        np.add.at(weight, (node, electrode[:, None]), value)
-        return weight
+            self._node = wp.array(film.node, dtype=int)
+            self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
+            self._face = wp.array(film.face, dtype=wp.vec3i)
+            self._gather = [
+                wp.array(pattern.entry, dtype=wp.vec2i),
+                wp.array(pattern.sign, dtype=real),
+                wp.array(pattern.start, dtype=int),
+                wp.array(pattern.slot, dtype=int),
+            ]
+            self._discs = [
+                wp.array(film._pos, dtype=vec3),
+                wp.array(film._tangent, dtype=vec3, ndim=2),
+                wp.array(np.searchsorted(electrode[order], np.arange(NDISC + 1)), dtype=int),
+                wp.array(face[order], dtype=int),
+                wp.array(film._disc, dtype=wp.vec2d),
+                self._face,
+                film._footprint,
+                self._rhs,
+            ]
+            self._near = [
+                wp.array(table, dtype=real),
+                table_step,
+                film.electrode_radius,
+                film._footprint,
+                film.conductivity,
+                wp.array(film.cell_constant, dtype=real),
+            ]
+            self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=real)
+            self.valid = wp.ones(nworld, dtype=int)
+            self.middle = wp.zeros((n, nworld), dtype=vec3)
+            self.thickness = wp.zeros((n, nworld), dtype=real)
+            self.local = wp.zeros((NDISC, nworld), dtype=real)
+            self._edge = wp.zeros((3 * len(film.face), nworld), dtype=real)
+            self._quads = wp.zeros((nworld, (self._rhs + nblock * TILE) * TILE // 4), dtype=vec4)
+            self._resistance = wp.zeros((nworld, TILE, TILE), dtype=real)
+        self._system = wp.array(
+            ptr=self._quads.ptr,
+            dtype=real,
+            shape=(nworld, self._rhs + nblock * TILE, TILE),
+            device=self.device,
+            copy=False,
+        )
+        per_world = [self.middle, self.thickness, self.local, self._edge, self._quads, self._resistance]
+        self.nbytes = sum(array.capacity for array in per_world)
 
-    def _resistances(self, middle, thickness, weight):
-        """(23, 23) [ohm]: mean potential of disc i for a unit current into disc j, up to a constant that
-        balanced currents cancel."""
-        conductance = self.conductivity * thickness[self.face].mean(
-            1
-        )  # of a linear thickness: its mean is exact
-        off = _cotangent_weights(middle, self.face, conductance).ravel()
-        band = np.bincount(
-            self._slot, np.concatenate([-off, off, off]), minlength=self._band * len(self.node)
-        ).reshape(-1, self._band)
-        band[0, 0] += band[
-            :, 0
-            # holds the free constant; no current flows through it, so the impedances do not depend on it
-        ].mean()
-        with single_thread():
-            factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
-            if info:
-                raise ValueError(
-                    "the film's conductance is not positive definite: the inner surface is folded; keep the "
-                    "last good state"
-                )
-            half, _ = lapack.dtbtrs(factor, weight, uplo="L")
-            return half.T @ half
+    def lay(self, x: wp.array, due: wp.array) -> None:
+        """Writes `middle` and `thickness`; arguments and errors as `solve_film`."""
+        if x.device != self.device or due.device != self.device:
+            raise ValueError(
+                f"the film is on {self.device}, x on {x.device} and due on {due.device}: make both where "
+                "the film is"
+            )
+        f = self.film
+        constants = [self._core.core, self._node, f.residual_film, f._power, self._rest_thickness]
+        self._launch(
+            kernels.film_surface, self.middle.shape, [due, *constants, x], [self.middle, self.thickness]
+        )
+
+    def solve_film(self, x: wp.array, due: wp.array) -> None:
+        """New impedances of the worlds that are due. Launches only: may be captured in a CUDA graph.
+
+        Args:
+          x: (nvert, nworld) wp.array of vec3d, nodes in the BioTac frame [m].
+          due: (nworld,) wp.array of int, 0 where the last impedances stay.
+
+        Raises:
+          ValueError: an array is on another device.
+        """
+        self.lay(x, due)
+        pattern, surface, system = self.film._pattern, [self.middle, self.thickness], self._system
+        sheet = [due, self._face, self.film.conductivity, *surface]
+        self._launch(kernels.face_conductance, (len(self._face), self.nworld), sheet, [self._edge])
+        self._launch(kernels.clear_system, self._quads.shape, [due], [self._quads])
+        entries = len(pattern.entry), self.nworld
+        self._launch(kernels.assemble, entries, [due, *self._gather, self._edge], [system])
+        discs = [due, *self._discs, *surface]
+        self._launch(kernels.cover_discs, self.local.shape, discs, [system, self.local])
+        wp.launch_tiled(
+            kernels.solve_band,
+            dim=[self.nworld],
+            inputs=[due, pattern.nblock, pattern.reach, system],
+            outputs=[self._resistance],
+            block_dim=128,
+            device=self.device,
+        )
+        network = [due, self._resistance, self.local, *self._near]
+        self._launch(kernels.driving_point, self.nworld, network, [self.impedance, self.valid])
+
+    def _launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
-def sheet_laplacian(point, face, conductance):
+class _Pattern:
+    """Where the Laplacian's entries come from and go to: tiles of the band, the lower ones stored transposed
+    under their column's diagonal.
+
+    nblock: tiles of the diagonal; reach: tiles beside it. entry (nentry, 2): row and column in the stored
+    band; entry 0 is the first diagonal. sign (nentry,), start (nentry + 1,), slot: edges of faces (3 face +
+    corner) that add up to it, none for padding."""
+
+    def __init__(self, face, n):
+        i, j = _edges(face)
+        low, high = np.minimum(i, j), np.maximum(i, j)
+        self.nblock = -(-n // TILE)
+        self.reach = max(int((high // TILE - low // TILE).max()), 1)
+        # row <= column; the diagonal takes every edge at its node
+        used, number = np.unique(
+            np.concatenate([low * (n + 1), high * (n + 1), low * n + high]), return_inverse=True
+        )
+        order = np.argsort(number, kind="stable")
+        slot = np.split(np.tile(np.arange(len(low)), 3)[order], np.cumsum(np.bincount(number))[:-1])
+        padding = np.arange(n, self.nblock * TILE)
+        row, column = np.concatenate([used // n, padding]), np.concatenate([used % n, padding])
+        slot += [np.zeros(0, int)] * len(padding)
+        # Cholesky's factor of a tile on the diagonal needs its lower triangle too
+        within = np.flatnonzero((column // TILE == row // TILE) & (row != column))
+        row, column = np.concatenate([row, column[within]]), np.concatenate([column, row[within]])
+        slot += [slot[k] for k in within]
+        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
+        self.sign = np.where(row == column, 1.0, -1.0)
+        block, down = row // TILE, column // TILE - row // TILE
+        self.entry = np.stack([(block * (self.reach + 1) + down) * TILE + row % TILE, column % TILE], axis=1)
+
+
+def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike):
     """P1 finite-element matrix of div(s grad u) on a triangulated surface.
 
     Args:
@@ -286,7 +425,12 @@ def sheet_laplacian(point, face, conductance):
       scipy.sparse CSR (n, n) [S], positive semi-definite, constants in its kernel.
     """
     i, j = _edges(face)
-    off = _cotangent_weights(point, face, np.asarray(conductance)).ravel()
+    with wp.ScopedDevice("cpu"):
+        edge = wp.zeros((3 * len(face), 1), dtype=real)
+        surface = wp.array(point[:, None], dtype=vec3, ndim=2), wp.ones((len(point), 1), dtype=real)
+        sheet = [wp.ones(1, dtype=int), wp.array(face, dtype=wp.vec3i), 1.0, *surface]
+        wp.launch(kernels.face_conductance, (len(face), 1), sheet, [edge])
+    off = np.repeat(conductance, 3) * edge.numpy()[:, 0]
     n = len(point)
     return coo_matrix(
         (
@@ -297,7 +441,7 @@ def sheet_laplacian(point, face, conductance):
     ).tocsr()
 
 
-def spreading_resistance(ratio, npoint=20000):
+def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
     """Resistance near a disc that a thin sheet leaves out, times sigma a.
 
     A disc of radius a injects uniformly into a slab of thickness h between insulating planes. Its mean
@@ -316,45 +460,18 @@ def spreading_resistance(ratio, npoint=20000):
     x = (np.arange(npoint) + 0.5) * width
     weight = 2 / np.pi * width * (j1(x) / x) ** 2
     y = ratio[..., None] * x
-    tail = 1 / (
-        np.pi**2 * 60.0**2
-    )  # J1^2 averages 1 / (pi x) and coth - 1/y is about one beyond the last point
+    # J1^2 averages 1 / (pi x) and coth - 1/y is about one beyond the last point
+    tail = 1 / (np.pi**2 * 60.0**2)
     return (weight * (1 / np.tanh(y) - 1 / y)).sum(-1) + tail * np.where(
         ratio > 0.05, 1 - 1 / np.maximum(40 * ratio, 1), 0
     )
 
 
 def _spreading_table():
-    """F as a fast interpolant, linear in r / (1 + r)."""
-    s = np.linspace(0, 0.98, 200)[1:]
-    value = np.concatenate([[0.0], spreading_resistance(s / (1 - s), 2000)])
-    s = np.concatenate([[0.0], s])
-    return lambda ratio: np.interp(ratio / (1 + ratio), s, value)
-
-
-def _driving_point(resistance, nsense):
-    """Impedance of each sensing disc against the excitation discs, which share one potential and together
-    sink the current."""
-    sense, ground = slice(0, nsense), slice(nsense, None)
-    nground = len(resistance) - nsense
-    bordered = np.ones((nground + 1, nground + 1))
-    bordered[:nground, :nground] = resistance[ground, ground]
-    bordered[nground, nground] = 0
-    rhs = np.concatenate([resistance[ground, sense], np.ones((1, nsense))])
-    solution = np.linalg.solve(bordered, rhs)  # currents into the ground discs, then their common potential
-    return np.diag(resistance)[sense] - (rhs[:nground] * solution[:nground]).sum(0) - solution[nground]
-
-
-def _cotangent_weights(point, face, conductance):
-    """(m, 3): conductance * cot / 2 of the angle opposite each edge of `_edges`."""
-    corner = point[face]
-    edge = np.roll(corner, -2, axis=1) - np.roll(corner, -1, axis=1)  # edge k is opposite corner k
-    double_area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
-    double_area = np.maximum(
-        double_area, 1e-6 * (edge**2).sum((1, 2))
-    )  # a face squeezed to a line stays finite
-    dot = -(np.roll(edge, -1, axis=1) * np.roll(edge, -2, axis=1)).sum(2)
-    return 0.5 * conductance[:, None] * dot / double_area[:, None]
+    """Step in r / (1 + r), r = h / a, and values of `spreading_resistance`, between which the kernels
+    interpolate."""
+    s = np.linspace(0, 0.98, 200)
+    return float(s[1]), np.concatenate([[0.0], spreading_resistance(s[1:] / (1 - s[1:]), 2000)])
 
 
 def _edges(face):

@@ -1,10 +1,18 @@
-"""Kernels of `batch_film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item,
-world] unless they are tiles."""
+"""Kernels of `film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item, world]
+unless they are tiles.
+
+A world's system is one array of rows of TILE numbers: the band of its Laplacian, in tiles, the lower ones
+stored transposed under their column's diagonal, and after it the right-hand sides, a column for each disc."""
 
 import warp as wp
 
+from biotac_mj.sensor.channels import DISCS, NELECTRODE
+from biotac_mj.sensor.core_surface import Core, nearest_on_core
+
 __all__ = [
     "NDISC",
+    "NEXCITATION",
+    "NSAMPLE",
     "TILE",
     "assemble",
     "clear_system",
@@ -17,67 +25,43 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-NDISC = 23  # 19 electrodes and X1..X4
+NDISC = len(DISCS)
+NEXCITATION = NDISC - NELECTRODE
+NSAMPLE = 24  # points that stand for equal parts of a disc
 TILE = 32  # rows of a tile, and columns of right-hand sides: the discs, padded
-_MAX_GAP = 8.0  # [mm] how far from the core a node may be; a film is at most some 2 mm thick
 real = wp.float64
 vec3 = wp.vec3d
-samples = wp.types.vector(24, int)
-ground = wp.types.matrix((5, 5), wp.float64)
-
-
-@wp.func
-def _double(p: wp.vec3):
-    return vec3(real(p[0]), real(p[1]), real(p[2]))
-
-
-@wp.func
-def nearest_on_core(mesh: wp.uint64, p: vec3):
-    """Gap vector (foot to p) and its signed length [m]: nearest triangle of the core's mesh (in mm), exact on
-    that one."""
-    mm = real(1.0e3) * p
-    query = wp.mesh_query_point_no_sign(
-        mesh, wp.vec3(wp.float32(mm[0]), wp.float32(mm[1]), wp.float32(mm[2])), wp.float32(_MAX_GAP)
-    )
-    if not query.result:
-        return wp.vec4d(real(0.0), real(0.0), real(0.0), real(wp.nan))
-    a = _double(wp.mesh_get_point(mesh, 3 * query.face))
-    ab = _double(wp.mesh_get_point(mesh, 3 * query.face + 1)) - a
-    ac = _double(wp.mesh_get_point(mesh, 3 * query.face + 2)) - a
-    n = wp.normalize(wp.cross(ab, ac))
-    u = real(query.u)
-    v = real(query.v)
-    gap = mm - (u * a + v * (a + ab) + (real(1.0) - u - v) * (a + ac))
-    edge = real(1.0e-5)
-    if wp.min(u, wp.min(v, real(1.0) - u - v)) > edge:
-        gap = wp.dot(mm - a, n) * n  # over the inside of a face: its plane, exactly
-    d = wp.length(gap)
-    if wp.dot(gap, n) < real(0.0):
-        d = -d
-    gap = real(1.0e-3) * gap
-    return wp.vec4d(gap[0], gap[1], gap[2], real(1.0e-3) * d)
+vec4 = wp.vec4d
+samples = wp.types.vector(NSAMPLE, int)
+ground = wp.types.matrix((NEXCITATION + 1, NEXCITATION + 1), wp.float64)
 
 
 @wp.kernel
 def film_surface(
     # In:
     due: wp.array(dtype=int),
-    mesh: wp.uint64,
+    core: Core,
     node: wp.array(dtype=int),
     residual_film: real,
+    power: real,
+    rest: wp.array(dtype=real),
     x: wp.array2d(dtype=vec3),
     # Out:
     middle_out: wp.array2d(dtype=vec3),
     thickness_out: wp.array2d(dtype=real),
 ):
-    """The surface halfway between skin and core, and the film's thickness [node, world]."""
+    """The surface halfway between skin and core, and the film's thickness [node, world]; `power` other than
+    one: that of a smooth film of the same conductance."""
     i, w = wp.tid()
     if due[w] == 0:
         return
     p = x[node[i], w]
-    near = nearest_on_core(mesh, p)
-    middle_out[i, w] = p - real(0.5) * vec3(near[0], near[1], near[2])
-    thickness_out[i, w] = wp.where(near[3] == near[3], wp.max(near[3], residual_film), near[3])  # nan stays
+    gap, distance, _face = nearest_on_core(core, p)
+    thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
+    if power != real(1.0):
+        thickness = rest[i] * wp.pow(thickness / rest[i], power)
+    middle_out[i, w] = p - real(0.5) * gap
+    thickness_out[i, w] = thickness
 
 
 @wp.kernel
@@ -114,15 +98,12 @@ def clear_system(
     # In:
     due: wp.array(dtype=int),
     # Out:
-    band_out: wp.array3d(dtype=real),
-    rhs_out: wp.array3d(dtype=real),
+    quads_out: wp.array2d(dtype=vec4),
 ):
-    w, i, j = wp.tid()
-    if due[w] == 0:
-        return
-    band_out[w, i, j] = real(0.0)
-    if i < rhs_out.shape[1]:
-        rhs_out[w, i, j] = real(0.0)
+    """Zeros in the systems of the worlds that are due, four numbers a thread."""
+    w, i = wp.tid()
+    if due[w] != 0:
+        quads_out[w, i] = vec4()
 
 
 @wp.kernel
@@ -135,7 +116,7 @@ def assemble(
     slot: wp.array(dtype=int),
     edge: wp.array2d(dtype=real),
     # Out:
-    band_out: wp.array3d(dtype=real),
+    system_out: wp.array3d(dtype=real),
 ):
     """Gathers the Laplacian's entries from the faces' edges; padding gets a diagonal of one."""
     e, w = wp.tid()
@@ -148,10 +129,9 @@ def assemble(
     if start[e] == start[e + 1]:
         value = real(1.0)
     if e == 0:
-        value = (
-            real(2.0) * value
-        )  # holds the free constant; no current flows through it, so the impedances do not depend on it
-    band_out[w, entry[e][0], entry[e][1]] = value
+        # holds the free constant; no current flows through it, so the impedances do not depend on it
+        value = real(2.0) * value
+    system_out[w, entry[e][0], entry[e][1]] = value
 
 
 @wp.func
@@ -170,14 +150,15 @@ def cover_discs(
     disc: wp.array(dtype=wp.vec2d),
     face: wp.array(dtype=wp.vec3i),
     footprint: real,
+    rhs: int,
     middle: wp.array2d(dtype=vec3),
     thickness: wp.array2d(dtype=real),
     # Out:
-    rhs_out: wp.array3d(dtype=real),
+    system_out: wp.array3d(dtype=real),
     local_out: wp.array2d(dtype=real),
 ):
-    """Mean over each disc as weights of nodal values (columns of the right-hand side), and the mean thickness
-    [disc, world]."""
+    """Mean over each disc as weights of nodal values (columns of the right-hand side, from row `rhs` on), and
+    the mean thickness [disc, world]."""
     e, w = wp.tid()
     if due[w] == 0:
         return
@@ -196,7 +177,7 @@ def cover_discs(
                 e1 = b - a
                 e2 = c - a
                 area = e1[0] * e2[1] - e1[1] * e2[0]
-                for i in range(24):
+                for i in range(NSAMPLE):
                     d = disc[i] - a
                     u = (d[0] * e2[1] - d[1] * e2[0]) / area
                     v = (e1[0] * d[1] - e1[1] * d[0]) / area
@@ -207,9 +188,11 @@ def cover_discs(
                             hits[i] += 1
                         else:
                             share = real(1.0) / real(hits[i] * covered)
-                            rhs_out[w, t[0], e] = rhs_out[w, t[0], e] + (real(1.0) - u - v) * share
-                            rhs_out[w, t[1], e] = rhs_out[w, t[1], e] + u * share
-                            rhs_out[w, t[2], e] = rhs_out[w, t[2], e] + v * share
+                            system_out[w, rhs + t[0], e] = (
+                                system_out[w, rhs + t[0], e] + (real(1.0) - u - v) * share
+                            )
+                            system_out[w, rhs + t[1], e] = system_out[w, rhs + t[1], e] + u * share
+                            system_out[w, rhs + t[2], e] = system_out[w, rhs + t[2], e] + v * share
                             mean = (
                                 (real(1.0) - u - v) * thickness[t[0], w]
                                 + u * thickness[t[1], w]
@@ -219,17 +202,15 @@ def cover_discs(
     local_out[e, w] = local  # zero where no film is left over the disc
 
 
-@wp.kernel(
-    module="unique", enable_backward=False
-)  # launched with blocks of its own size: else all kernels here were compiled for both
+# launched with blocks of its own size: in this module it would have all kernels here compiled for both
+@wp.kernel(module="unique", enable_backward=False)
 def solve_band(
     # In:
     due: wp.array(dtype=int),
     nblock: int,
     reach: int,
     # In, out:
-    band: wp.array3d(dtype=real),
-    rhs: wp.array3d(dtype=real),
+    system: wp.array3d(dtype=real),
     # Out:
     resistance_out: wp.array3d(dtype=real),
 ):
@@ -238,29 +219,32 @@ def solve_band(
     w = wp.tid()
     if due[w] == 0:
         return
+    rhs = nblock * (reach + 1) * TILE
     total = wp.tile_zeros(shape=(TILE, TILE), dtype=real, storage="shared")
     for k in range(nblock):
         first = k * (reach + 1) * TILE
-        factor = wp.tile_load(band[w], shape=(TILE, TILE), offset=(first, 0), storage="shared")
+        factor = wp.tile_load(system[w], shape=(TILE, TILE), offset=(first, 0), storage="shared")
         wp.tile_cholesky_inplace(factor)
-        y = wp.tile_load(rhs[w], shape=(TILE, TILE), offset=(k * TILE, 0), storage="shared")
+        y = wp.tile_load(system[w], shape=(TILE, TILE), offset=(rhs + k * TILE, 0), storage="shared")
         wp.tile_lower_solve_inplace(factor, y)
         wp.tile_matmul(wp.tile_transpose(y), y, total)
         for i in range(1, wp.min(reach, nblock - 1 - k) + 1):
-            z = wp.tile_load(band[w], shape=(TILE, TILE), offset=(first + i * TILE, 0), storage="shared")
+            z = wp.tile_load(system[w], shape=(TILE, TILE), offset=(first + i * TILE, 0), storage="shared")
             wp.tile_lower_solve_inplace(factor, z)
-            wp.tile_store(band[w], z, offset=(first + i * TILE, 0))
-            below = wp.tile_load(rhs[w], shape=(TILE, TILE), offset=((k + i) * TILE, 0), storage="shared")
+            wp.tile_store(system[w], z, offset=(first + i * TILE, 0))
+            below = wp.tile_load(
+                system[w], shape=(TILE, TILE), offset=(rhs + (k + i) * TILE, 0), storage="shared"
+            )
             wp.tile_matmul(wp.tile_transpose(z), y, below, alpha=-1.0)
-            wp.tile_store(rhs[w], below, offset=((k + i) * TILE, 0))
+            wp.tile_store(system[w], below, offset=(rhs + (k + i) * TILE, 0))
             for j in range(1, i + 1):
                 other = wp.tile_load(
-                    band[w], shape=(TILE, TILE), offset=(first + j * TILE, 0), storage="shared"
+                    system[w], shape=(TILE, TILE), offset=(first + j * TILE, 0), storage="shared"
                 )
                 row = ((k + j) * (reach + 1) + i - j) * TILE
-                rest = wp.tile_load(band[w], shape=(TILE, TILE), offset=(row, 0), storage="shared")
+                rest = wp.tile_load(system[w], shape=(TILE, TILE), offset=(row, 0), storage="shared")
                 wp.tile_matmul(wp.tile_transpose(other), z, rest, alpha=-1.0)
-                wp.tile_store(band[w], rest, offset=(row, 0))
+                wp.tile_store(system[w], rest, offset=(row, 0))
     wp.tile_store(resistance_out[w], total)
 
 
@@ -286,25 +270,29 @@ def driving_point(
     if due[w] == 0:
         return
     a = ground()
-    for i in range(4):
-        for j in range(4):
-            a[i, j] = resistance[w, 19 + i, 19 + j]
-        a[i, 4] = real(1.0)
-        a[4, i] = real(1.0)
+    for i in range(NEXCITATION):
+        for j in range(NEXCITATION):
+            a[i, j] = resistance[w, NELECTRODE + i, NELECTRODE + j]
+        a[i, NEXCITATION] = real(1.0)
+        a[NEXCITATION, i] = real(1.0)
         a[i, i] = a[i, i] + _near(
-            local[19 + i, w], spreading, spreading_step, radius, footprint, conductivity
+            local[NELECTRODE + i, w], spreading, spreading_step, radius, footprint, conductivity
         )
-    inverse = _inverse5(a)
+    inverse = _inverse(a)
     for sweep in range(2):  # check all, then write
-        for e in range(19):
+        for e in range(NELECTRODE):
             z = resistance[w, e, e] + _near(
                 local[e, w], spreading, spreading_step, radius, footprint, conductivity
             )
-            for i in range(5):
+            for i in range(NEXCITATION + 1):
                 current = real(0.0)
-                for j in range(5):
-                    current += inverse[i, j] * wp.where(j < 4, resistance[w, 19 + wp.min(j, 3), e], real(1.0))
-                z -= current * wp.where(i < 4, resistance[w, 19 + wp.min(i, 3), e], real(1.0))
+                for j in range(NEXCITATION + 1):
+                    current += inverse[i, j] * wp.where(
+                        j < NEXCITATION, resistance[w, NELECTRODE + wp.min(j, NEXCITATION - 1), e], real(1.0)
+                    )
+                z -= current * wp.where(
+                    i < NEXCITATION, resistance[w, NELECTRODE + wp.min(i, NEXCITATION - 1), e], real(1.0)
+                )
             z = cell_constant[e] * z
             if sweep == 0:
                 if not (z > real(0.0) and z < real(1.0e12)):
@@ -335,23 +323,23 @@ def _near(
 
 
 @wp.func
-def _inverse5(a: ground):
+def _inverse(a: ground):
     """Gauss-Jordan with row pivots: the last diagonal entry is zero."""
     scale = real(0.0)
-    for i in range(4):
+    for i in range(NEXCITATION):
         scale = wp.max(scale, wp.abs(a[i, i]))
     b = ground()
-    for i in range(5):
+    for i in range(NEXCITATION + 1):
         b[i, i] = real(1.0)
-    for i in range(4):  # resistances are some ten thousand ohm, the border is one
-        a[i, 4] = scale
-        a[4, i] = scale
-    for k in range(5):
+    for i in range(NEXCITATION):  # resistances are some ten thousand ohm, the border is one
+        a[i, NEXCITATION] = scale
+        a[NEXCITATION, i] = scale
+    for k in range(NEXCITATION + 1):
         pivot = int(k)
-        for i in range(k + 1, 5):
+        for i in range(k + 1, NEXCITATION + 1):
             if wp.abs(a[i, k]) > wp.abs(a[pivot, k]):
                 pivot = i
-        for j in range(5):
+        for j in range(NEXCITATION + 1):
             swap = a[k, j]
             a[k, j] = a[pivot, j]
             a[pivot, j] = swap
@@ -359,16 +347,16 @@ def _inverse5(a: ground):
             b[k, j] = b[pivot, j]
             b[pivot, j] = swap
         inverse = real(1.0) / a[k, k]
-        for j in range(5):
+        for j in range(NEXCITATION + 1):
             a[k, j] = a[k, j] * inverse
             b[k, j] = b[k, j] * inverse
-        for i in range(5):
+        for i in range(NEXCITATION + 1):
             if i != k:
                 factor = a[i, k]
-                for j in range(5):
+                for j in range(NEXCITATION + 1):
                     a[i, j] = a[i, j] - factor * a[k, j]
                     b[i, j] = b[i, j] - factor * b[k, j]
-    for i in range(5):
-        b[i, 4] = b[i, 4] * scale
-        b[4, i] = b[4, i] * scale
+    for i in range(NEXCITATION + 1):
+        b[i, NEXCITATION] = b[i, NEXCITATION] * scale
+        b[NEXCITATION, i] = b[NEXCITATION, i] * scale
     return b

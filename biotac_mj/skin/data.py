@@ -84,12 +84,12 @@ class SkinData:
     On the device, [item, world] in Warp arrays that may be overwritten between steps:
       worlds: `newton.worlds.Worlds`, scalars of every world. rubber: `rubber.points.Rubber`.
       laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
-      x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s], and
-        the pose of the BioTac frame in the world at the end of the step.
+      x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
+        and the pose of the BioTac frame in the world at the end of the step.
 
     Raises:
-      ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or a
-        modulus of another shape.
+      ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or
+        a modulus of another shape.
     """
 
     # touching nodes in a world's dense small system; None: 63, all that a block of threads holds, but 127 on
@@ -336,8 +336,8 @@ class SkinData:
         Args:
           x, increment: (nvert, 3) positions and last increment [m].
           motion: (ngeom, 3) of the geoms in the last step [m].
-          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts` gives
-            them.
+          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts`
+            gives them.
           pressure: of the liquid above the surroundings [Pa], `liquid.last_pressure`.
         """
         for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
@@ -386,7 +386,8 @@ def _refuse_other_kinds(materials, options):
         counts = {len(getattr(m, name)) for m in materials}
         if len(counts) > 1:
             raise ValueError(
-                f"the worlds' materials have {min(counts)} to {max(counts)} terms of {name}: give all the same "
+                f"the worlds' materials have {min(counts)} to {max(counts)} terms of {name}: give all the "
+                "same "
                 "number, with a strength of zero if need be"
             )
 

@@ -330,8 +330,8 @@ class SkinModel:
 
     @property
     def rest(self) -> liquid.Rest:
-        """The skin and its liquid without touching geoms: inflated where the options say so, solved when first
-        asked for."""
+        """The skin and its liquid without touching geoms: inflated where the options say so, solved when
+        first asked for."""
         if self._rest is None:
             self._rest = solve_rest(self)
         return self._rest

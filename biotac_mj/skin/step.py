@@ -1,25 +1,23 @@
-"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned conjugate
-gradients.
+"""One step of the skin: Newton's method on the balance of forces, each linear system by preconditioned
+conjugate gradients.
 
     step(model, data, geoms, dt)               # poses that were set in, positions and wrenches out
 
 A step is launches alone, with loops and branches between them that look at flags on the device (`program`): a
 recorded list on the CPU, one captured graph on CUDA, alone or inside the caller's own graph:
 
-    prepare_step(model, data, geoms)           # allocates and compiles; then, inside a capture or without one:
-    launch_step(model, data, geoms)
+    prepare_step(model, data, geoms)           # allocates and compiles; then, inside a capture or without
+    one: launch_step(model, data, geoms)
 
 Everything that changes between steps is read from device arrays: poses and frictions `geoms.struct.pos, .mat,
 .friction` [geom, world], materials `data.rubber`, laws of contact `data.laws.struct`, the liquids
-`data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos, .frame_mat`
-(implicit dynamics). Overwrite them, then step.
+`data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos,
+.frame_mat` (implicit dynamics). Overwrite them, then step.
 
-A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its last
-good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do not
-notice. Worlds that are done idle inside the loops.
-"""
+A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its
+last good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do
+not notice. Worlds that are done idle inside the loops."""
 
-import functools
 import weakref
 
 import numpy as np
@@ -46,15 +44,15 @@ def step(
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
-    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is counted
-    in `data.nonconverged` and flagged in `data.converged`.
+    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is
+    counted in `data.nonconverged` and flagged in `data.converged`.
 
     Args:
       model, data: the skin.
       geoms: touching geoms, poses in the BioTac frame at the end of the step.
       dt: time step [s]; needed by implicit dynamics and by skin with a Prony series.
-      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of the
-        step, for the inertia of implicit dynamics; None means that it does not move.
+      core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
+        the step, for the inertia of implicit dynamics; None means that it does not move.
 
     Raises:
       ValueError: a geom deep inside the rigid core, geoms of another number of worlds, adhesion that reaches
@@ -78,7 +76,8 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
     """
     if geoms.nworld != data.nworld:
         raise ValueError(
-            f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same number"
+            f"geoms are for {geoms.nworld} worlds and the data for {data.nworld}: make both for the same "
+            "number"
         )
     key = (id(geoms), model.options)
     if key not in data.steps:
@@ -91,8 +90,8 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
 
 
 def launch_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> None:
-    """Launches a step of every world on the device's current stream: for use inside a captured graph, or without
-    one.
+    """Launches a step of every world on the device's current stream: for use inside a captured graph, or
+    without one.
 
     Takes the poses from `geoms.struct` as they are when it runs. Raises what `prepare_step` raises.
     """
@@ -125,7 +124,8 @@ def _refuse_core(model, geoms):
     depth = depth.numpy()
     geom, world = np.unravel_index(depth.argmax(), depth.shape)
     raise ValueError(
-        f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid core: "
+        f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid "
+        "core: "
         "no skin fits between them; move it out, press less deep or take smaller steps"
     )
 
@@ -229,7 +229,8 @@ class SkinStep:
         self._once(lambda: self._evaluate(self.st.moving))
 
     def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
-        """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed nodes.
+        """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed
+        nodes.
 
         Args:
           at_pressure: of a liquid that keeps its pressure, instead of one that resists changes of its volume.
@@ -370,10 +371,24 @@ class SkinStep:
             *self._blocks(m.core_surface if d.core else None, d.core),
         ]
         self._launch(
-            self._of_krylov.assemble_product, d.x.shape,
-            [e.start, e.slot, e.corner, *surfaces, *wet, m.free_mask, inertia, k.node_volume, d.dt, d.x, k.p, st],
+            self._of_krylov.assemble_product,
+            d.x.shape,
+            [
+                e.start,
+                e.slot,
+                e.corner,
+                *surfaces,
+                *wet,
+                m.free_mask,
+                inertia,
+                k.node_volume,
+                d.dt,
+                d.x,
+                k.p,
+                st,
+            ],
             [k.q],
-        )  # fmt: skip
+        )
 
     def _search(self):
         d, k, first = self.d, self.k, self._of_krylov.first_length
@@ -493,8 +508,12 @@ class SkinStep:
         gap, tangent = k.by_sample[still]
         self._launch(kernels.by_sample, out[0].shape, law, [*out, gap, tangent])
         samples = [state.trial_geom, state.sample_force, gap, tangent]
-        self._launch(faces.sum_samples, (dim[0], 3, dim[1]), [still, s.face, m.sample, d.x, on, near, *samples],
-                     [*total, *known])  # fmt: skip
+        self._launch(
+            faces.sum_samples,
+            (dim[0], 3, dim[1]),
+            [still, s.face, m.sample, d.x, on, near, *samples],
+            [*total, *known],
+        )
 
     def _fill(self, on):
         """The liquid's volume; with it, its pressure."""
@@ -539,7 +558,8 @@ class SkinStep:
         self._launcher.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
 
     def _beside(self, *branches):
-        """Launches up to three functions, which do not need each other's results, as branches of the graph."""
+        """Launches up to three functions, which do not need each other's results, as branches of the
+        graph."""
         if not self._streams:
             for branch in branches:
                 branch()
@@ -556,8 +576,8 @@ class SkinStep:
             main.wait_event(done)
 
     def _warm_up(self):
-        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made, before
-        anything is captured."""
+        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made,
+        before anything is captured."""
         self._launcher = Launcher(self.m.device)
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
             flag.zero_()

@@ -6,6 +6,8 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from ..geometry.rigid import quaternion
+
 __all__ = ["HANDS", "Mount", "attach_to_hand"]
 
 _TIP, _CLAMP = 21.3e-3, 7.65e-3  # from the BioTac's origin to its tip and to the end of its clamp [m]
@@ -43,9 +45,7 @@ class Mount:
                 "a BioTac's pad looks sideways"
             )
         x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
-        out = np.empty(4)
-        mujoco.mju_mat2Quat(out, np.stack([x, y, np.cross(x, y)], axis=1).ravel())
-        return out
+        return quaternion(np.stack([x, y, np.cross(x, y)], axis=1))
 
 
 # The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the

@@ -1,8 +1,9 @@
 """The machines that carry BioTacs in the tasks: a gantry for one finger, a parallel gripper with two."""
 
-import mujoco
 import numpy as np
 from dm_control import composer, mjcf
+
+from ..geometry.rigid import quaternion
 
 __all__ = ["Gantry", "Gripper"]
 
@@ -17,9 +18,7 @@ _ROD = dict(type="capsule", size=[0.005], rgba=[0.55, 0.58, 0.62, 1.0], contype=
 
 def _quaternion(columns):
     """(w, x, y, z) of the rotation whose columns are the BioTac's axes in the parent frame."""
-    out = np.empty(4)
-    mujoco.mju_mat2Quat(out, np.asarray(columns, float).T.ravel())
-    return out
+    return quaternion(np.transpose(columns))
 
 
 class _Machine(composer.Entity):

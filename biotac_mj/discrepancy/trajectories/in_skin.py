@@ -131,8 +131,8 @@ class _Remembering(Simulator):
         )
 
     def _model(self, log_friction, bubble):
-        from ...skin.rubber.material import material
         from ...skin.model import SkinModel
+        from ...skin.rubber.material import material
 
         if bubble not in self._models:
             super()._model(0.0, bubble)

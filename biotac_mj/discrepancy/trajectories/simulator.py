@@ -132,8 +132,8 @@ class Simulator:
     def _model(self, log_friction, bubble):
         from ...geometry.skins import load_skin
         from ...sensor.film import FilmConduction
-        from ...skin.rubber.material import material
         from ...skin.model import SkinModel, SkinOptions
+        from ...skin.rubber.material import material
 
         store = self.__dict__.setdefault("_models", {})
         if bubble not in store:

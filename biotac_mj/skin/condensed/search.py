@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..contact.faces import Geoms
-from ..geoms import GeomSet
 from ..contact.shapes import distance_bound
+from ..geoms import GeomSet
 from ..types import real, vec3
 
 __all__ = ["NearSearch"]

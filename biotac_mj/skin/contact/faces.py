@@ -1,4 +1,5 @@
-"""Contact of a skin surface with geoms, sampled inside the faces: pressure over overclosure, friction, adhesion.
+"""Contact of a skin surface with geoms, sampled inside the faces: pressure over overclosure, friction,
+adhesion.
 
 Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too
 (as surface-to-surface contact does in ANSYS and CalculiX). Normal traction is k * overclosure; friction is an
@@ -6,9 +7,8 @@ elastic stick of k * stick_ratio about an anchor that stays put on the geom, ret
 normal force where it slips. Surfaces with a `law.ContactLaw` have kernels of their own, in which friction
 depends on pressure and surfaces stick together; Coulomb's law is the case without.
 
-Far faces are left out by one distance of their centre. Few worlds are evaluated sample by sample, many face by
-face; on the CPU always face by face.
-"""
+Far faces are left out by one distance of their centre. Few worlds are evaluated sample by sample, many face
+by face; on the CPU always face by face."""
 
 import functools
 import types
@@ -267,8 +267,8 @@ def cull_faces(
 
 @functools.cache
 def contact_kernels(lawful: bool) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_face` is a function of
-    theirs."""
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_face` is a function
+    of theirs."""
     module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
 
     @wp.func
@@ -289,8 +289,8 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
     ):
-        """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the geom
-        that it has touched, least distance [m], force [N], its tangent [N/m], anchor."""
+        """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
+        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor."""
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
         clearance = real(1.0)
@@ -490,9 +490,22 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         share = area[f] / real(sample.shape[0])
         k = stiffness * share
         touched, bond, gap, force, K, stick = touch_sample(
-            i, w, sample[i % sample.shape[0]], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share,
-            laws, geoms, x_last, anchor_geom, anchor,
-        )  # fmt: skip
+            i,
+            w,
+            sample[i % sample.shape[0]],
+            t,
+            x[t[0], w],
+            x[t[1], w],
+            x[t[2], w],
+            k,
+            k * stick_ratio,
+            share,
+            laws,
+            geoms,
+            x_last,
+            anchor_geom,
+            anchor,
+        )
         geom_out[i, w] = touched
         bond_out[i, w] = bond
         gap_out[i, w] = gap

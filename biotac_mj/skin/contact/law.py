@@ -171,7 +171,8 @@ class WorldLaws:
         if (4 * parting > self.stiffness * reach**2).any():
             most = np.max(parting)
             raise ValueError(
-                f"adhesion_range {np.max(reach):g} m is too short for a work of {most:g} J/m^2: the contact's "
+                f"adhesion_range {np.max(reach):g} m is too short for a work of {most:g} J/m^2: the "
+                "contact's "
                 f"own springs of {self.stiffness:g} Pa/m stretch by half of it; take a range above "
                 f"{2 * np.sqrt(most / self.stiffness):.1e} m"
             )
@@ -195,5 +196,6 @@ class WorldLaws:
         if len(spacing) and reach > 0.4 * spacing.min():
             raise ValueError(
                 f"adhesion reaches {reach * 1e6:.0f} um, and the distance to a mesh geom is exact within "
-                f"{0.4e6 * spacing.min():.0f} um: bake its grid with a larger spacing, or shorten adhesion_range"
+                f"{0.4e6 * spacing.min():.0f} um: bake its grid with a larger spacing, or shorten "
+                "adhesion_range"
             )

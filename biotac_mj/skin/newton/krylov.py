@@ -1,4 +1,5 @@
-"""Conjugate gradients and the line search of all worlds: products with the tangent, steps, what they bring."""
+"""Conjugate gradients and the line search of all worlds: products with the tangent, steps, what they
+bring."""
 
 import functools
 import types
@@ -126,8 +127,8 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         q_out: wp.array2d(dtype=vec),
     ):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: density, damping
-        by mass, by stiffness."""
+        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: density,
+        damping by mass, by stiffness."""
         i, w = wp.tid()
         if st.running[w] == 0:
             return

@@ -240,8 +240,8 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         touch_out: wp.array(dtype=int),
         go_on: wp.array(dtype=int),
     ):
-        """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the work
-        of inertia."""
+        """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the
+        work of inertia."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             go_on[0] = 0

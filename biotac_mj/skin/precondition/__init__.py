@@ -9,8 +9,8 @@ __all__ = ["Preconditioner"]
 
 
 class Preconditioner(Protocol):
-    """The approximate inverse of the tangent, for all worlds of one SkinData: of the rest stiffness, corrected
-    for contact and liquid. Methods put what they do into a program.
+    """The approximate inverse of the tangent, for all worlds of one SkinData: of the rest stiffness,
+    corrected for contact and liquid. Methods put what they do into a program.
 
     Attributes:
       precision: of directions.

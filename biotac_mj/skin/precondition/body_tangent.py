@@ -1,4 +1,5 @@
-"""Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the BioTac frame's origin.
+"""Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the BioTac frame's
+origin.
 
 The body drags the contact springs D of the nodes that it touches, and the skin behind them gives way by its
 corrected compliance C = (A0 + U D U^T)^-1: R' (D - D C D) R with the body's rigid motions R, translations

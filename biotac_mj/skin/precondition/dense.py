@@ -395,14 +395,14 @@ class DensePreconditioner:
 class DenseInverse:
     """The dense inverse of a stiffness as a half-precision matrix; sums are in single precision.
 
-    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs nothing
-    as long as everything is computed from the same rounded entries. Rounding the right-hand side would cost:
-    contact makes results that are small differences of large ones. So it travels as a sum of two halves, 22
-    bits in all.
+    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs
+    nothing as long as everything is computed from the same rounded entries. Rounding the right-hand side
+    would cost: contact makes results that are small differences of large ones. So it travels as a sum of two
+    halves, 22 bits in all.
 
-    Nearly incompressible rubber gives way to changes of volume lambda / mu times less than to others: rounded to
-    half precision the inverse no longer knows how much less. A second matrix then has what rounding took. By
-    torch on CUDA, by numpy on the CPU.
+    Nearly incompressible rubber gives way to changes of volume lambda / mu times less than to others: rounded
+    to half precision the inverse no longer knows how much less. A second matrix then has what rounding took.
+    By torch on CUDA, by numpy on the CPU.
 
     Args:
       stiffness: scipy sparse matrix, positive definite. device: Warp device.

@@ -5,7 +5,8 @@ Contact adds stiffness only between the touching nodes T, the liquid only along 
 With U = [unit vectors of T, g] and the small matrix D = diag(contact stiffness over T, K/V0), Woodbury's
 identity gives
 
-  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T and g).
+  (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T
+  and g).
 """
 
 import contextlib
@@ -97,8 +98,9 @@ def _bisection_order(points: np.ndarray) -> np.ndarray:
 class SparsePreconditioner:
     """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
 
-    Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose solve
-    takes many products gets the factor of its present shape, for this step alone, so that a step remains a
+    Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
+    solve takes many products gets the factor of its present shape, for this step alone, so that a step
+    remains a
     function of the state it starts from. Worlds share a factor: not where there are many.
     """
 
@@ -223,8 +225,8 @@ class SparsePreconditioner:
         return nodes, rows, _Solver(np.eye(size) + D @ compliance, D), compliance
 
     def _compliance(self, w, nodes):
-        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes stays
-        the same."""
+        """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes
+        stays the same."""
         key = nodes.tobytes()
         if w not in self._rows or self._rows[w][0] != key:
             rows = self.factor.rows(nodes)

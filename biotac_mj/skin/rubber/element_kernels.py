@@ -1,9 +1,9 @@
 """Forces of the elements' corners, their tangent times a direction, stress and energy.
 
 Positions and forces are double to the end: an inflated skin that is hardly touched balances forces far larger
-than its load, and their rounding would be felt. Tangents have the precision of directions. In double, deformation
-gradients and rotations are kept from force to product; in single, on CUDA, reading them back would cost more
-than computing them again.
+than its load, and their rounding would be felt. Tangents have the precision of directions. In double,
+deformation gradients and rotations are kept from force to product; in single, on CUDA, reading them back
+would cost more than computing them again.
 
 On CUDA the four integration points of an element are four threads of a warp, which exchange what they know:
 the mean dilatation, and their stresses, of which each thread makes the forces of its share of the ten nodes.

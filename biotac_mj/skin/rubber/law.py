@@ -2,10 +2,12 @@
 
 The four laws take the same two Lame-like constants and differ in the energy W(F):
 
-  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar decomposition
+  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar
+  decomposition
   svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2       Saint Venant-Kirchhoff
-  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and CalculiX
-  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not invariant to rotation
+  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and
+  CalculiX linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not
+  invariant to rotation
 """
 
 import warp as wp
@@ -77,8 +79,8 @@ def polar_single(F: wp.mat33):
 
 @wp.func
 def polar(F: mat33):
-    """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal, then turned by what is
-    left (error squared)."""
+    """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal,
+    then turned by what is left (error squared)."""
     R = widen(polar_single(narrow(F)))
     eye = wp.identity(n=3, dtype=real)
     R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)

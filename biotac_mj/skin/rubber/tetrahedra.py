@@ -1,4 +1,5 @@
-"""The skin's elements: tetrahedra of four nodes with constant strain, or of ten nodes with averaged dilatation.
+"""The skin's elements: tetrahedra of four nodes with constant strain, or of ten nodes with averaged
+dilatation.
 
 Ten nodes have four integration points: Gauss's, pulled towards the centroid by `CONTRACTION`. That lowers the
 energy of a strain's variation inside an element, of which a mesh as coarse as the wall has too much, by

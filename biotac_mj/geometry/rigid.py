@@ -1,0 +1,99 @@
+"""Rigid motions in numpy: rotations as matrices, unit quaternions (w, x, y, z) and rotation vectors [rad],
+and poses."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = [
+    "UPRIGHT",
+    "Z_TO_Y",
+    "across",
+    "cross",
+    "displace",
+    "displacement",
+    "matrix",
+    "quaternion",
+    "quaternion_from_y",
+    "rotation",
+    "skew",
+]
+
+UPRIGHT = np.array([1.0, 0, 0, 0])
+Z_TO_Y = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])  # turns a geom so that its z axis goes ahead
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])  # positions of a cross product's factors
+_SKEW = np.zeros((3, 9))
+for _i, (_j, _k) in enumerate(zip(_NEXT, _AFTER)):
+    _SKEW[_i, 3 * _k + _j], _SKEW[_i, 3 * _j + _k] = 1.0, -1.0
+_EYE = np.eye(3)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n, 3) of (n, 3) and (n, 3): faster than np.cross on a few vectors."""
+    return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
+
+
+def skew(vector: ArrayLike) -> np.ndarray:
+    """(..., 3, 3) of (..., 3): skew(a) @ b = a x b."""
+    vector = np.asarray(vector, dtype=float)
+    return (vector @ _SKEW).reshape(*vector.shape, 3)
+
+
+def rotation(vector: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors (Rodrigues)."""
+    angle2 = (vector * vector).sum(axis=1)[:, None, None]
+    k = skew(vector)
+    if angle2.max(initial=0.0) < 1e-8:  # the series to the fourth order: exact to rounding
+        return _EYE + (1.0 - angle2 / 6) * k + (0.5 - angle2 / 24) * (k @ k)
+    angle = np.sqrt(angle2)
+    half = np.sinc(angle / (2 * np.pi))
+    return _EYE + np.sinc(angle / np.pi) * k + 0.5 * half * half * (k @ k)
+
+
+def matrix(quat: ArrayLike) -> np.ndarray:
+    """(..., 3, 3) rotations of (..., 4) unit quaternions."""
+    quat = np.asarray(quat, dtype=float)
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return np.stack(rows, axis=-1).reshape(*quat.shape[:-1], 3, 3)
+
+
+def quaternion(mat: ArrayLike) -> np.ndarray:
+    """(..., 4) unit quaternions of (..., 3, 3) rotations."""
+    from scipy.spatial.transform import Rotation
+
+    return np.roll(Rotation.from_matrix(mat).as_quat(), 1, axis=-1)
+
+
+def quaternion_from_y(direction: np.ndarray) -> np.ndarray:
+    """(4,) of the smallest rotation that takes +y to a unit direction (3,)."""
+    quat = np.array([1 + direction[1], direction[2], 0.0, -direction[0]])
+    return quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (n, 3) at right angles to unit vectors (n, 3) and to each other."""
+    first = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(direction, first)
+
+
+def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray) -> np.ndarray:
+    """(n, 6) small motions (translation of the origin's point, rotation vector) from poses pos0 (n, 3), mat0
+    (n, 3, 3) to pos, mat."""
+    turn = (mat @ mat0.transpose(0, 2, 1)).reshape(-1, 9)
+    vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
+    sine = np.sqrt((vector * vector).sum(axis=1))
+    if sine.max(initial=0.0) > 1e-5:
+        angle = np.arctan2(sine, 0.5 * (turn[:, [0, 4, 8]].sum(axis=1) - 1))
+        vector = vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None]
+    return np.concatenate([pos - pos0 - cross(vector, pos0), vector], axis=1)
+
+
+def displace(pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
+    turn = rotation(motion[:, 3:])
+    return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
