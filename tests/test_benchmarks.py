@@ -254,3 +254,19 @@ def test_unknown_skin_is_refused(repo, tmp_path):
     done = _run(repo, "speed.py", "--json", tmp_path / "speed.json", "--skins", "huge")
     assert done.returncode == 2
     assert "unknown skin huge: choose from coarse, default, fine" in done.stderr
+
+
+def test_startup_beside_another_checkout(repo, tmp_path):
+    out = tmp_path / "out.json"
+    case = ["--tiers", "condensed", "--skins", "coarse", "--fills", "0", "--runs", "1", "--threads", "1"]
+    done = _run(repo, "startup.py", "--json", out, *case, "--against", repo)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(out.read_text())["rows"]
+    for name in ("here", "against"):
+        stages = row[name]
+        assert all(0 < stages[stage]["cpu_s"] < 60 for stage in ("import", "attach", "step"))
+        assert stages["all"]["cpu_s"] == pytest.approx(sum(v["cpu_s"] for v in stages.values()) / 2)
+    ratio = row["here"]["all"]["cpu_s"] / row["against"]["all"]["cpu_s"]
+    assert f"({ratio:.2f})" in done.stdout
+    done = _run(repo, "startup.py", "--json", out, *case, "--against", tmp_path)
+    assert done.returncode and "give the root of a checkout" in done.stderr

@@ -45,7 +45,7 @@ class _Rows:
             raise ValueError("not as long as it should be, or another checksum")
         self._largest = np.frombuffer(scales, np.float32, count)
         self._sum = np.frombuffer(scales, np.uint32, offset=4 * count)
-        self._rows = np.memmap(path, np.float16, "r", shape=(count, size))
+        self._rows = np.asarray(np.memmap(path, np.float16, "r", shape=(count, size)))  # indexing is faster
         self._sound = np.zeros(count, bool)
 
     def check(self, coordinates: np.ndarray) -> bool:
