@@ -77,11 +77,12 @@ class Case:
     tangent: bool = True
 
 
-def solve(case, device="cpu", modulus=1.0, **options):
+def solve(case, device="cpu", modulus=1.0, preconditioner=None, **options):
     """The answers of a case.
 
     Args:
       modulus: factor on Young's moduli.
+      preconditioner: of SkinData; None: the device's own.
       options: beyond or instead of the case's.
 
     Returns:
@@ -91,7 +92,7 @@ def solve(case, device="cpu", modulus=1.0, **options):
     rubber, *worlds = (dataclasses.replace(m, youngs_modulus=modulus * m.youngs_modulus) for m in given)
     options = SkinOptions(**{**TIGHT, **case.options, **options})
     model = SkinModel(case.geometry(), rubber, options, device=device, **case.model)
-    data = SkinData(model, len(worlds), worlds)
+    data = SkinData(model, len(worlds), worlds, preconditioner=preconditioner)
     touching = case.geoms() if callable(case.geoms) else case.geoms
     geoms = GeomSet(**touching, nworld=len(worlds), device=device)
     if case.liquid:
