@@ -119,6 +119,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     scalar, vec, mat = precision.scalar, precision.vec, precision.mat
     thin, wide = precision.narrow, precision.widen
     is_single = precision.name == "single"
+    polar_thin = polar_single if is_single else polar
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
     gradients = wp.types.matrix(shape=(corners, 3), dtype=real)
@@ -136,10 +137,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
 
     @wp.func
     def rotation_thin(F: mat):
-        if wp.static(corotational and is_single):
-            return polar_single(F)
         if wp.static(corotational):
-            return polar(F)
+            return polar_thin(F)
         return mat()
 
     @wp.func
@@ -223,7 +222,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                 for c in range(3):
                     out[a, c] = scalar(g[a, c])
             return out
-        return g
+        else:  # Warp compiles what follows a return
+            return g
 
     if averaged:
 
@@ -412,9 +412,10 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         if wp.static(is_single):
             F = thin(X * shape[q] * mesh.inverse[e, q])
             return F, rotation_thin(F)
-        if wp.static(corotational):
+        elif wp.static(corotational):
             return kept_deformation[i, w], kept_rotation[i, w]
-        return kept_deformation[i, w], mat33()
+        else:
+            return kept_deformation[i, w], mat33()
 
     @wp.kernel(module=module, enable_backward=False)
     def product_serial(
