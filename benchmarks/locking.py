@@ -27,8 +27,6 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from accuracy import write_json
-from biotac_mj.skin.elasticity import LinearTetrahedra, rest_shape, rest_stiffness
-from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from blocks import boundary, box, faces_on, nodal_areas, shell, skin
 
 from biotac_mj.geometry import load_skin
@@ -38,6 +36,7 @@ from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, 
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 from biotac_mj.skin.rubber.law import LAWS
+from biotac_mj.skin.rubber.tetrahedra import Tetrahedra
 
 __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 
@@ -48,16 +47,19 @@ PATCH_CENTER, PATCH_SIZE, PATCH_MOTION = -10e-3, 1e-3, 1e-4  # [m]
 def discretise(geometry, element, material, project=None):
     """The geometry with all its nodes, and its stiffness at rest (3 nvert, 3 nvert) [N/m]."""
     if element == "linear":
-        formulation = LinearTetrahedra(geometry.vert, geometry.tets, LAWS[material.law], wp.get_device("cpu"))
+        formulation = tetrahedra(geometry.vert, geometry.tets, material)
         return geometry, formulation.rest_stiffness(material.mu, material.lame)
     if element == "nodal":
         return geometry, nodal_pressure(geometry, material)
     geometry = with_edge_nodes(geometry, project) if geometry.element == "linear" else geometry
     points = {"contraction": 1.0} if element == "gauss" else {}
-    formulation = QuadraticTetrahedra(
-        geometry.vert, geometry.elem, LAWS[material.law], wp.get_device("cpu"), **points
-    )
+    formulation = tetrahedra(geometry.vert, geometry.elem, material, **points)
     return geometry, formulation.rest_stiffness(material.mu, material.lame)
+
+
+def tetrahedra(vert, elem, material, **options):
+    """The package's elements, on the CPU."""
+    return Tetrahedra(vert, elem, LAWS[material.law], wp.get_device("cpu"), **options)
 
 
 def refined(geometry):
@@ -79,7 +81,8 @@ def refined(geometry):
 def nodal_pressure(geometry, material):
     """Stiffness at rest of linear tetrahedra whose dilatation is averaged at the nodes (Bonet and Burton
     1998)."""
-    elem, (inverse, volume) = geometry.tets, rest_shape(geometry.vert, geometry.tets)
+    elem, formulation = geometry.tets, tetrahedra(geometry.vert, geometry.tets, material)
+    inverse, volume = formulation.mesh.inverse.numpy()[:, 0], formulation.mesh.volume.numpy()
     gradient = np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
     size, cells = 3 * geometry.nvert, np.arange(len(elem))
     dof = (3 * elem[:, :, None] + np.arange(3)).ravel()
@@ -91,9 +94,7 @@ def nodal_pressure(geometry, material):
     )
     at_nodes = share @ growth
     pressures = material.bulk * at_nodes.T @ sp.diags(1 / (share @ volume)) @ at_nodes
-    return (
-        rest_stiffness(geometry.nvert, elem, inverse, volume, material.mu, -2 / 3 * material.mu) + pressures
-    ).tocsc()
+    return (formulation.rest_stiffness(material.mu, -2 / 3 * material.mu) + pressures).tocsc()
 
 
 def solve(stiffness, load, free, prescribed=None):

@@ -4,13 +4,13 @@ closed form."""
 import numpy as np
 import pytest
 import skfem
-import warp as wp
 from blocks import boundary, box, faces_on, nodal_areas, place, shell, skin
+from forces import Elements
 from skfem.helpers import ddot, identity, mul, sym_grad, trace, transpose
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.types import SINGLE
 
 NOTHING = GeomSet([], [])
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -29,17 +29,10 @@ def block(
 
 
 def forces(model, x):
-    """Nodal elastic forces (nvert, 3) at positions x, and the data that hold what `product` needs."""
-    data = SkinData(model)
-    data.x.numpy()[:, 0] = x
-    model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
-    return data.force.numpy()[:, 0].copy(), data
-
-
-def product(model, data, p):
-    p = wp.array(p[:, None], dtype=vec3, ndim=2)
-    model.elasticity.product(data.elastic, data.mu, data.lam, data.x, p, data.product)
-    return data.product.numpy()[:, 0].copy()
+    """Nodal elastic forces (nvert, 3) at positions x, and the elements, whose `product` is the tangent
+    there."""
+    elements = Elements(SkinData(model))
+    return elements.force(x), elements
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -75,11 +68,11 @@ def test_rigid_motion_makes_no_force(law):
 def test_hessian_at_rest_is_the_rest_stiffness(law):
     model = block(law)
     g, m = model.geometry, model.material
-    K = model.elasticity.rest_stiffness(m.mu, m.lame)
+    K = model.elements.rest_stiffness(m.mu, m.lame)
     p = np.random.default_rng(0).standard_normal((g.nvert, 3))
-    _, data = forces(model, g.vert)
+    _, elements = forces(model, g.vert)
     np.testing.assert_allclose(
-        product(model, data, p).ravel(), K @ p.ravel(), rtol=0, atol=1e-10 * abs(K @ p.ravel()).max()
+        elements.product(p).ravel(), K @ p.ravel(), rtol=0, atol=1e-10 * abs(K @ p.ravel()).max()
     )
     assert abs(K - K.T).max() < 1e-12 * abs(K).max()
     rigid = np.concatenate(
@@ -94,17 +87,31 @@ def test_forces_balance_and_hessian_is_their_derivative(law):
     rng = np.random.default_rng(1)
     x = model.geometry.vert * [1.2, 0.9, 1.1] + 2e-4 * rng.standard_normal((model.nvert, 3))
     p, q = rng.standard_normal((2, model.nvert, 3))
-    f, data = forces(model, x)
+    f, elements = forces(model, x)
     size = abs(f).max()
     assert abs(f.sum(0)).max() < 1e-11 * size * len(f)
     if law != "linear":  # small strain has no torque balance about the deformed positions
         assert abs(np.cross(x, f).sum(0)).max() < 1e-11 * size * len(f) * 1e-2
-    Kp = product(model, data, p)
+    Kp = elements.product(p)
     h = 1e-8  # of the edges of 2.5 mm: fourth order differences, truncation (h/2.5e-3)^4, rounding 1e-16/1e-5
     near, far = [forces(model, x + s * p)[0] - forces(model, x - s * p)[0] for s in (h, 2 * h)]
     fd = -(8 * near - far) / (12 * h)
     np.testing.assert_allclose(Kp, fd, rtol=0, atol=1e-7 * abs(Kp).max())
-    assert np.vdot(q, Kp) == pytest.approx(np.vdot(p, product(model, data, q)), rel=1e-10)
+    assert np.vdot(q, Kp) == pytest.approx(np.vdot(p, elements.product(q)), rel=1e-10)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_directions_in_single_precision(law):
+    """The tangent that CUDA and the dense preconditioner use, to the digits of single precision."""
+    model = block(law)
+    rng = np.random.default_rng(1)
+    x = model.geometry.vert * [1.2, 0.9, 1.1] + 2e-4 * rng.standard_normal((model.nvert, 3))
+    p = rng.standard_normal((model.nvert, 3))
+    data = SkinData(model)
+    double, single = Elements(data), Elements(data, SINGLE)
+    np.testing.assert_array_equal(single.force(x), double.force(x))
+    Kp = double.product(p)
+    np.testing.assert_allclose(single.product(p), Kp, rtol=0, atol=1e-5 * abs(Kp).max())
 
 
 # --- scikit-fem  ---

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import skfem
 import warp as wp
-from biotac_mj.skin.quadratic import QuadraticTetrahedra
 from blocks import box, four_nodes, place, skin
+from forces import Elements, gradients
 from skfem.helpers import ddot, div, sym_grad
 
 import biotac_mj
@@ -18,7 +18,8 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.rubber.tetrahedra import Tetrahedra
+from biotac_mj.skin.types import SINGLE
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
 import locking  # noqa: E402
@@ -36,17 +37,10 @@ def block(law, nu=0.3, cells=2, jitter=0.25, **options):
     )
 
 
-def state(model, amplitude=4e-4, seed=0):
-    """Data at a random deformation."""
-    data = SkinData(model)
-    data.x.numpy()[:, 0] += amplitude * np.random.default_rng(seed).uniform(-1, 1, (model.nvert, 3))
-    return data
-
-
-def force(model, data, x):
-    data.x.numpy()[:, 0] = x
-    model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
-    return data.force.numpy()[:, 0].copy()
+def deformed(model, amplitude=4e-4, seed=0):
+    """Positions at random about rest."""
+    rng = np.random.default_rng(seed)
+    return model.geometry.vert + amplitude * rng.uniform(-1, 1, (model.nvert, 3))
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.4999])  # full integration, and mostly mean dilatation
@@ -55,22 +49,20 @@ def test_derivatives(law, nu):
     """Force is minus the energy's gradient, the product is the force's derivative: central differences along
     a random direction."""
     model = block(law, nu)
-    data = state(model)
-    x, h = data.x.numpy()[:, 0].copy(), 1e-8
+    elements = Elements(SkinData(model))
+    x, h = deformed(model), 1e-8
     p = np.random.default_rng(1).standard_normal(x.shape)
-    energy = []
-    for sign in (1, -1):
-        data.x.numpy()[:, 0] = x + sign * h * p
-        energy.append(model.elasticity.energy(data.mu, data.lam, data.x).sum())
-    slope, work = (energy[0] - energy[1]) / (2 * h), -(force(model, data, x) * p).sum()
+    energy = [elements.energy(x + sign * h * p) for sign in (1, -1)]
+    slope, work = (energy[0] - energy[1]) / (2 * h), -(elements.force(x) * p).sum()
     assert work == pytest.approx(slope, rel=1e-6)
-    change = (force(model, data, x + h * p) - force(model, data, x - h * p)) / (2 * h)
-    force(model, data, x)
-    model.elasticity.product(
-        data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product
-    )
-    product = data.product.numpy()[:, 0]
+    change = (elements.force(x + h * p) - elements.force(x - h * p)) / (2 * h)
+    elements.force(x)
+    product = elements.product(p)
     assert abs(product + change).max() < 1e-6 * abs(change).max()
+    single = Elements(SkinData(model), SINGLE)  # what CUDA and the dense preconditioner use
+    np.testing.assert_array_equal(single.force(x), elements.force(x))
+    # nearly incompressible, the parts of the product are far larger than their sum
+    assert abs(single.product(p) - product).max() < 1e-5 * abs(product).max()
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.4999])
@@ -78,16 +70,12 @@ def test_derivatives(law, nu):
 def test_rest_stiffness(law, nu):
     """The assembled matrix is the tangent at rest, so that it can precondition."""
     model = block(law, nu)
-    data = SkinData(model)
-    force(model, data, model.geometry.vert)
+    elements = Elements(SkinData(model))
+    elements.force(model.geometry.vert)
     p = np.random.default_rng(2).standard_normal((model.nvert, 3))
-    model.elasticity.product(
-        data.elastic, data.mu, data.lam, data.x, wp.array(p[:, None], dtype=vec3, ndim=2), data.product
-    )
-    wanted = (model.elasticity.rest_stiffness(model.material.mu, model.material.lame) @ p.ravel()).reshape(
-        -1, 3
-    )
-    assert abs(data.product.numpy()[:, 0] - wanted).max() < 1e-10 * abs(wanted).max()
+    stiffness = model.elements.rest_stiffness(model.material.mu, model.material.lame)
+    wanted = (stiffness @ p.ravel()).reshape(-1, 3)
+    assert abs(elements.product(p) - wanted).max() < 1e-10 * abs(wanted).max()
 
 
 def test_stiffness_equals_scikit_fem():
@@ -111,7 +99,7 @@ def test_stiffness_equals_scikit_fem():
     order = np.array([mine[tuple(v)] for v in where[::3]])
     assert (where[::3] == where[2::3]).all()  # scikit-fem's coordinates x, y, z of a node follow each other
     u = np.random.default_rng(0).standard_normal((len(refined.vert), 3))
-    element = QuadraticTetrahedra(refined.vert, refined.elem, LAWS["linear"], CPU, contraction=1.0)
+    element = Tetrahedra(refined.vert, refined.elem, LAWS["linear"], CPU, contraction=1.0)
     ours = u.ravel() @ element.rest_stiffness(mu, lame) @ u.ravel()
     theirs = u[order].ravel()
     assert ours == pytest.approx(theirs @ stiffness @ theirs, rel=1e-12)
@@ -141,9 +129,9 @@ def test_rigid_motion_makes_no_force(law):
     model = block(law, nu=0.4999)
     Q, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))
     Q *= np.sign(np.linalg.det(Q))
-    data = SkinData(model)
-    moved = force(model, data, model.geometry.vert @ Q.T + 0.05)
-    stretched = force(model, data, 1.01 * model.geometry.vert)
+    elements = Elements(SkinData(model))
+    moved = elements.force(model.geometry.vert @ Q.T + 0.05)
+    stretched = elements.force(1.01 * model.geometry.vert)
     assert abs(moved).max() < 1e-9 * abs(stretched).max()
 
 
@@ -194,8 +182,8 @@ def test_refined_geometry():
     corner = fine.vert[fine.tets]
     volume = np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
     assert (volume > 0).all()
-    np.testing.assert_allclose(volume.reshape(-1, 8).sum(1), model.elasticity.volume.numpy(), rtol=1e-9)
-    assert model.elasticity.node_volume.sum() == pytest.approx(volume.sum())
+    np.testing.assert_allclose(volume.reshape(-1, 8).sum(1), model.elements.mesh.volume.numpy(), rtol=1e-9)
+    assert model.elements.node_volume.sum() == pytest.approx(volume.sum())
 
 
 def test_ansys_preset_presses():
@@ -231,7 +219,7 @@ def test_folded_element():
     bent, elem = refined.vert.copy(), refined.elem
     bent[elem[0, 4]] += 2 * (bent[elem[0, 2]] - bent[elem[0, 4]])  # an edge's node beyond the opposite corner
     with pytest.raises(ValueError, match="quadratic tetrahedra are folded .*: straighten their edges"):
-        QuadraticTetrahedra(bent, elem, 0, CPU)
+        Tetrahedra(bent, elem, 0, CPU)
 
 
 def test_factor_at_a_turned_shape():
@@ -251,7 +239,7 @@ def test_linear_elements_of_ten_nodes():
     linear, curved = (SkinModel(geometry, "default", SkinOptions(element=e)) for e in ("linear", None))
     assert (linear.element, curved.element) == ("linear", "quadratic")
     assert linear.nvert == curved.nvert == geometry.nvert and linear.nelem == 8 * curved.nelem
-    volumes = [m.elasticity.volume.numpy() for m in (linear, curved)]
+    volumes = [m.elements.mesh.volume.numpy() for m in (linear, curved)]
     assert volumes[0].sum() == pytest.approx(volumes[1].sum(), rel=0.02)
     assert (linear.fixed == curved.fixed).all()
 
@@ -281,7 +269,8 @@ def test_coupled_skin_keeps_its_nodes(tmp_path):
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("law", LAWS)
 def test_cuda_equals_cpu(law):
-    """The same kernels on CUDA: forces and products of three worlds, to rounding."""
+    """Four threads to an element there: forces of three worlds to rounding, products to single
+    precision."""
     vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, 0.25)
     results = []
     for device in ("cpu", "cuda:0"):
@@ -289,13 +278,25 @@ def test_cuda_equals_cpu(law):
         model = SkinModel(
             geometry, Material(law, 1e6, 0.4999), SkinOptions(element="quadratic"), device=device
         )
-        data, rng = SkinData(model, 3), np.random.default_rng(0)
+        rng, elements = np.random.default_rng(0), Elements(SkinData(model, 3), SINGLE)
         x = np.repeat(model.geometry.vert[:, None], 3, 1) + 4e-4 * rng.uniform(-1, 1, (model.nvert, 3, 3))
-        x, p = (wp.array(a, dtype=vec3, ndim=2, device=device) for a in (x, rng.standard_normal(x.shape)))
-        model.elasticity.force(data.elastic, data.mu, data.lam, x, data.force)
-        model.elasticity.product(data.elastic, data.mu, data.lam, x, p, data.product)
-        results.append(
-            (data.force.numpy(), data.product.numpy(), model.elasticity.smallest_jacobian(data.elastic))
-        )
-    for cpu, cuda in zip(*results, strict=True):
-        assert abs(cpu - cuda).max() < 1e-11 * abs(cpu).max()
+        results.append((elements.force(x), elements.product(rng.standard_normal(x.shape))))
+        folded = x.copy()
+        folded[model.geometry.elem[5, 0], 1] += 0.1
+        assert elements.upright(x).all() and elements.upright(folded).tolist() == [True, False, True]
+    for cpu, cuda, close in zip(*results, (1e-11, 1e-5), strict=True):
+        assert abs(cpu - cuda).max() < close * abs(cpu).max()
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_inverted_elements_are_seen(element):
+    """By the determinant at the integration points, in the worlds that have one."""
+    vert, elem = box([np.linspace(0, 1e-2, 3)] * 3, 0.25)
+    model = SkinModel(skin(vert, elem, [0]), Material("svk", 1e6, 0.3), SkinOptions(element=element))
+    elements = Elements(SkinData(model, 2))
+    for fold in np.linspace(0, 1, 5) * 1e-2:
+        x = np.repeat(model.geometry.vert[:, None], 2, 1)
+        x[model.geometry.elem[5, 0], 1] += fold
+        least = [np.linalg.det(gradients(model.elements, x[:, w])[0]).min() for w in range(2)]
+        assert elements.upright(x).tolist() == [v > 0 for v in least]
+    assert least[1] < 0 < least[0]

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from biotac_mj.skin.solver import _Step
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, step
 from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.shapes import bake_distance_grid, distance_bound
+from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.step import SkinStep, prepare_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
 import rubber  # noqa: E402
@@ -75,10 +76,10 @@ def test_a_trial_far_away_does_not_make_the_skin_lose_the_core(model, trial):
 
     def core_force(first):
         data = SkinData(model)
-        solved = _Step(model, data, NOTHING, None, None, None)
+        solved = prepare_step(model, data, NOTHING)
         for place in first:
             data.x.numpy()[:, 0] = place
-            solved._evaluate()
+            solved.evaluate_forces()
         return data.core_force[0].copy()
 
     away = model.geometry.vert.copy()
@@ -90,12 +91,15 @@ def test_a_trial_far_away_does_not_make_the_skin_lose_the_core(model, trial):
 
 def test_a_shape_that_no_skin_can_have_is_not_converged(model):
     data = SkinData(model)
-    solved = _Step(model, data, NOTHING, None, None, None)
+    solved = prepare_step(model, data, NOTHING)
 
     def possible(x):
         data.x.numpy()[:, 0] = x
-        solved._evaluate()
-        return solved._possible()[0]
+        data.worlds.asked.fill_(1)
+        data.worlds.failed.zero_()
+        solved._launcher = Launcher("cpu")
+        solved._refuse_impossible()
+        return data.worlds.failed.numpy()[0] == 0
 
     rest = model.geometry.vert
     assert possible(rest)
@@ -112,13 +116,19 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
     """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
     inside the core counts."""
-    contact = _Step._contact
+    contact = SkinStep._contact
 
-    def blind(self, state, geoms):
-        if state is self.d.core:
+    def blind(self, state, *arguments):
+        if state is not self.d.core:
+            contact(self, state, *arguments)
+            return
+
+        def look_away():
             state.clearance.fill_(1.0)
             state.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
-        contact(self, state, geoms)
+
+        self._launcher.call(look_away)
+        contact(self, state, *arguments)
 
     def press():
         model = SkinModel(load_skin("coarse"), "default")
@@ -128,13 +138,13 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
             step(model, data, _sphere_at(geoms, depth))
             volume.append(data.volume[0])
             good.append(bool(data.converged[0]))
-            deepest.append(rubber.shape(model, SkinData(model), data.vert_xpos[0])[1])
+            deepest.append(rubber.shape(model, data.vert_xpos[0])[1])
         np.testing.assert_allclose(volume, model.liquid_volume, rtol=1e-5)  # kept, on the core too
         return good, np.array(deepest)
 
     good, deepest = press()
     assert all(good) and deepest.max() < 5e-5
-    monkeypatch.setattr(_Step, "_contact", blind)
+    monkeypatch.setattr(SkinStep, "_contact", blind)
     good, deepest = press()
     assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
 
@@ -158,16 +168,19 @@ def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypa
     )
     made.clear()
     step(model, data, _sphere_at(geoms, 9e-4))
-    assert made and data.converged.all() and data.preconditioner.factor is model.factor
+    assert made and data.converged.all() and data.preconditioner.factor is not model.factor
     fresh, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5])
     fresh.load(**state)
     _sphere_at(geoms, 6e-4).advance()
     step(model, fresh, _sphere_at(geoms, 9e-4))
     np.testing.assert_array_equal(fresh.vert_xpos, data.vert_xpos)
     np.testing.assert_array_equal(fresh.wrench, data.wrench)
+    made.clear()
+    step(model, data, geoms)  # where the sphere is
+    assert not made and data.preconditioner.factor is model.factor
     enclosed = [
         trimesh.Trimesh(v, model.geometry.inner_face, process=False).volume
-        for v in (model.geometry.vert, data.vert_xpos[0])
+        for v in (model.geometry.vert, fresh.vert_xpos[0])
     ]
     assert abs((enclosed[1] - enclosed[0]) / model.liquid_volume) < 2e-6  # the liquid's volume is kept
 

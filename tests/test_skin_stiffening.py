@@ -1,17 +1,21 @@
 """Stiffening of every law: Yeoh's closed forms in large strain, forces against differences of an energy
 written down here, robustness."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-import warp as wp
-from bars import NOTHING, E, cube, deform
+from bars import NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import box, skin
+from forces import Elements, gradients
 from scipy.linalg import polar
 from scipy.optimize import minimize
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+
+
+PATH = (1.05, 1.1, 1.15, 1.12)  # stretches of a bar, whose elements at the end bear each jump first
 
 
 def invariant(law, F):
@@ -32,17 +36,6 @@ def invariant(law, F):
 def beyond(s, q):
     """Energy over mu / 2 beyond q."""
     return s * q**2 if s >= 0 else (np.sqrt(1 - 4 * s * q) - 1) / (-2 * s) - q
-
-
-def gradients(elements, x):
-    """Deformation gradients at all integration points and the volumes that belong to them, from the shape
-    functions."""
-    if hasattr(elements, "_gradient"):
-        return np.einsum("eai,eqaj->eqij", x[elements._elem], elements._gradient).reshape(
-            -1, 3, 3
-        ), elements._weight.ravel()
-    edges = np.moveaxis(x[elements._elem[:, 1:]] - x[elements._elem[:, :1]], 1, 2)
-    return edges @ elements._inverse_edges, elements._volume
 
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
@@ -88,21 +81,19 @@ def test_a_bar_with_free_sides(s, t):
 @pytest.mark.parametrize("s", [0.9, -0.5])
 def test_force_is_the_energys_gradient(law, element, s):
     model = cube(law, element, stiffening=s)
-    data, rng = SkinData(model), np.random.default_rng(6)
+    plain, rng = cube(law, element), np.random.default_rng(6)
     rest = model.geometry.vert
     x = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T + 1e-4 * rng.standard_normal(rest.shape)
     p = 1e-4 * rng.standard_normal(rest.shape)
 
     def energy(h):
-        F, volume = gradients(model.elasticity, x + h * p)
+        F, volume = gradients(model.elements, x + h * p)
         return volume @ (model.material.mu / 2 * beyond(s, invariant(law, F)))
 
     h = 1e-2
     expected = -(8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
-    force = wp.zeros_like(data.force)
-    data.memory.begin(None)
-    data.memory.add_force(wp.array(x[:, None], dtype=vec3, ndim=2), force)
-    assert np.vdot(force.numpy()[:, 0], p) == pytest.approx(expected, rel=1e-6)
+    force = Elements(SkinData(model)).force(x) - Elements(SkinData(plain)).force(x)
+    assert np.vdot(force, p) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -133,7 +124,8 @@ def test_absurd_presses_leave_a_sound_state(law, s):
         ball.set_pose(np.array([[5e-3, 7e-3 - depth, 5e-3]]), np.eye(3)[None])
         step(model, data, ball)
         assert np.isfinite(data.vert_xpos).all() and np.isfinite(data.force.numpy()).all()
-        assert not data.converged[0] or model.elasticity.smallest_jacobian(data.elastic)[0] > 0
+        F, _ = gradients(model.elements, data.vert_xpos[0])
+        assert not data.converged[0] or np.linalg.det(F).min() > 0
         forces.append(data.wrench[0, 0, 1] if data.converged[0] else None)
     assert forces[0] == 0 and forces[1] == pytest.approx(forces[3], rel=0.02) and forces[3] > 0.1
 
@@ -144,14 +136,38 @@ def test_without_stiffening_nothing_is_added():
     assert not Material(stiffening=0.2).remembers
 
 
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+def test_worlds_stiffen_each_its_own_way(law, element):
+    """Without, Yeoh's and Knowles's rubber in one batch."""
+    model = bar(law, element, nu=0.4, stiffening=0.7)
+    materials = [dataclasses.replace(model.material, stiffening=s) for s in (0.0, 0.7, -0.4)]
+    together, alone, own = batch(
+        model, materials, lambda m, data: [pull_worlds(m, data, s) for s in PATH]
+    )
+    peak = abs(together).max()
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * peak)
+    np.testing.assert_allclose(together, own, rtol=0, atol=1e-6 * peak)  # of models: the solver's tolerance
+    assert abs(np.diff(together, axis=1)).max() > 0.01 * peak
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_directions_in_single_precision(law):
+    """The same answer with those of CUDA."""
+    model = bar(law, "quadratic", nu=0.4, stiffening=0.7)
+    data = [SkinData(model, preconditioner=p) for p in ("sparse", "dense")]
+    force = np.array([[pull(model, d, s, None) for s in PATH] for d in data])
+    np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
+    assert all(d.iterations[0] > 0 for d in data)
+
+
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="stiffening is nan: pass a finite number"):
         Material(stiffening=np.nan)
     model = cube("corotational", "linear", stiffening=0.3)
-    with pytest.raises(ValueError, match="skin with stiffening is solved on the CPU's full tier only"):
-        SkinData(model, resident=True)
-    with pytest.raises(ValueError, match="stiffening are the model's: give the worlds' materials the same"):
-        SkinData(model, material=[Material("corotational", E, 0.3)])
+    plain = cube("corotational", "linear")
+    with pytest.raises(ValueError, match="a world's material has stiffening and the model's has not"):
+        SkinData(plain, material=[model.material])
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(

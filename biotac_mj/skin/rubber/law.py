@@ -2,12 +2,14 @@
 
 The four laws take the same two Lame-like constants and differ in the energy W(F):
 
-  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2                 R the rotation of the polar
-  decomposition
-  svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2       Saint Venant-Kirchhoff
-  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2       isochoric split, as ANSYS and
-  CalculiX linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I              small strain; not
-  invariant to rotation
+  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2
+                R the rotation of the polar decomposition
+  svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2
+                Saint Venant-Kirchhoff
+  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2
+                isochoric split, as ANSYS and CalculiX
+  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I
+                small strain; not invariant to rotation
 """
 
 import warp as wp
@@ -78,20 +80,35 @@ def polar_single(F: wp.mat33):
 
 
 @wp.func
+def turn_left(S: mat33):
+    """Newton's step of the rotation with the largest trace, at most 0.3, S = R^T F: what is left to turn, in
+    the frame of R.
+
+    In single precision: where little is left, that gives the rest of its digits.
+    """
+    s = narrow(S)
+    H = wp.trace(s) * wp.identity(n=3, dtype=float) - 0.5 * (s + wp.transpose(s))
+    a = axial(S)
+    turn = wp.vec3(float(a[0]), float(a[1]), float(a[2]))
+    if H[0, 0] > 0.0 and H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0] and wp.determinant(H) > 0.0:
+        turn = wp.inverse(H) * turn
+    else:  # far away: as `turn_towards`
+        turn = turn / (wp.abs(wp.trace(s)) + 1.0e-9)
+    return turn * wp.min(1.0, 0.3 / (wp.length(turn) + 1.0e-9))
+
+
+@wp.func
 def polar(F: mat33):
     """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal,
     then turned by what is left (error squared)."""
     R = widen(polar_single(narrow(F)))
-    eye = wp.identity(n=3, dtype=real)
-    R = R * (real(1.5) * eye - real(0.5) * wp.transpose(R) * R)
-    S = wp.transpose(R) * F
-    # what is left is 1e-7: single precision gives the rest of its digits
-    s = narrow(S)
-    a = axial(S)
-    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * wp.vec3(
-        float(a[0]), float(a[1]), float(a[2])
-    )
-    return R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
+    # where the determinant is small, `turn_towards` may have come near only
+    steps = wp.where(wp.determinant(F) < real(1.0e-3), 15, 1)
+    for _ in range(steps):
+        R = R * (real(1.5) * wp.identity(n=3, dtype=real) - real(0.5) * wp.transpose(R) * R)
+        turn = turn_left(wp.transpose(R) * F)
+        R = R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
+    return R
 
 
 @wp.func

@@ -1,0 +1,91 @@
+"""Forces of the elements alone, as nodes feel them, and what their points remember, without a step."""
+
+import numpy as np
+import warp as wp
+
+from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.types import vec3
+
+__all__ = ["Elements", "begin", "commit", "gradients"]
+
+
+class Elements:
+    """Elastic forces, with all that the rubber remembers, of a SkinData's elements.
+
+    Args:
+      data: SkinData.
+      precision: `types.Precision` of directions; None: the data's.
+    """
+
+    def __init__(self, data, precision=None):
+        if precision is not None:
+            from biotac_mj.skin.rubber.element_kernels import ElementForces
+
+            self.elements = ElementForces(data.model.elements, data.rubber, data.options, precision)
+            self.precision = precision
+        else:
+            self.elements, self.precision = data.element_forces(), data.precision
+        self.nvert, self.nworld = data.model.nvert, data.nworld
+        self.device = data.model.device
+        self._launcher = Launcher(self.device)
+        self._on = wp.full(self.nworld, 1, dtype=int, device=self.device)
+        self._inverted = wp.zeros(self.nworld, dtype=int, device=self.device)
+        self._x = None
+
+    def force(self, x) -> np.ndarray:
+        """Nodal forces [N] at positions x, (nvert, 3) of a single world or (nvert, nworld, 3) [m]."""
+        self._x, x = self._array(x, vec3), np.asarray(x)
+        self.elements.push_corners(self._launcher, self._x, self._on, self._inverted)
+        return self._gather(self.elements.corner_force).reshape(x.shape)
+
+    def product(self, p) -> np.ndarray:
+        """Tangent where `force` was last, times p, of the same shape [N]."""
+        p = np.asarray(p)
+        along = self._array(p, self.precision.vec)
+        self.elements.multiply_corners(self._launcher, self._x, along, self._on)
+        return self._gather(self.elements.corner).reshape(p.shape)
+
+    def energy(self, x) -> float:
+        """Of all elements of a single world by their law [J]."""
+        return self.elements.energy(self._array(x, vec3)).sum()
+
+    def upright(self, x) -> np.ndarray:
+        """Whether no element of a world (nworld,) is inverted at x."""
+        self._inverted.zero_()
+        self.elements.refuse_inverted(self._launcher, self._array(x, vec3), self._on, self._inverted)
+        inverted = self._inverted.numpy() == 1
+        self._inverted.zero_()
+        return ~inverted
+
+    def _array(self, x, kind):
+        nodal = np.ascontiguousarray(np.asarray(x, float).reshape(self.nvert, self.nworld, 3))
+        return wp.array(nodal, dtype=kind, ndim=2, device=self.device)
+
+    def _gather(self, corner):
+        start, slot = self.elements.start.numpy(), self.elements.slot.numpy()
+        out = np.zeros((self.nvert, self.nworld, 3))
+        np.add.at(out, np.repeat(np.arange(self.nvert), np.diff(start)), corner.numpy()[slot])
+        return out
+
+
+def gradients(elements, x) -> tuple[np.ndarray, np.ndarray]:
+    """Deformation gradients (n, 3, 3) at all integration points of `Tetrahedra` at x (nvert, 3), from the
+    shape functions, and the volumes (n,) that belong to them [m^3]."""
+    mesh = elements.mesh
+    shape = np.einsum("qak,eqki->eqai", mesh.shape.numpy(), mesh.inverse.numpy())
+    F = np.einsum("aei,eqaj->eqij", x[mesh.elem.numpy()], shape).reshape(-1, 3, 3)
+    return F, mesh.weight.numpy().ravel()
+
+
+def begin(data, dt=1.0) -> None:
+    """Prepares what the points remember for a step of dt [s]."""
+    data.dt.fill_(dt)
+    data.worlds.softness.fill_(1.0)
+    data.memory.begin_step(Launcher(data.model.device), data.dt, data.worlds.softness)
+
+
+def commit(data, ended=None) -> None:
+    """Takes over a step that has ended at data.x, in the worlds of the mask `ended`."""
+    ended = np.ones(data.nworld, bool) if ended is None else np.asarray(ended)
+    failed = wp.array((~ended).astype(np.int32), dtype=int, device=data.model.device)
+    data.memory.commit_step(Launcher(data.model.device), data.x, data.dt, failed)
