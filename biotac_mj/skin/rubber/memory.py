@@ -236,6 +236,14 @@ class RubberMemory:
         """Makes x [nvert, nworld] the relaxed and virgin state, of the worlds of mask (nworld,) bool."""
         self._launch(self._kernels.forget, [x, self._all if mask is None else mask])
 
+    def relax(self, x):
+        """As `forget`, in all worlds, but for the largest energies that points have borne."""
+        borne = self.rubber.worst.numpy().copy()
+        self.forget(x)
+        if borne.size:
+            self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))
+            self._launch(self._kernels.recall, [x])
+
     def at_present(self) -> Rubber:
         """The rubber between steps: what it remembers is a stress, and time stands still."""
         now, rubber = Rubber(), self.rubber
