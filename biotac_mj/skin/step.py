@@ -370,7 +370,7 @@ class SkinStep:
         e.multiply_corners(self._launcher, d.x, k.p, st.running)
         inertia = wp.vec3d(0.0, 0.0, 0.0)
         if self.implicit:
-            inertia = wp.vec3d(m.material.density, m.options.mass_damping, m.options.stiffness_damping)
+            inertia = wp.vec3d(1.0, m.options.mass_damping, m.options.stiffness_damping)
         wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
         if m.has_liquid:
             wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
@@ -470,7 +470,7 @@ class SkinStep:
     def _resist_motion(self, on):
         """Inertia and damping."""
         m, d, k, o, kernels = self.m, self.d, self.k, self.m.options, self._of_nodes
-        mass = [m.material.density, o.mass_damping, k.node_volume, d.dt]
+        mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
         positions = [k.target, d.x_last, d.x]
         self._launch(kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
         e = k.damped
