@@ -76,7 +76,9 @@ def _add_skin(verb, seed="of the sensor's noise"):
         choices=TIERS,
         help="full finite elements, or the condensed skin for real time on one core",
     )
-    verb.add_argument("--material", default="default", help=f"preset: {', '.join(MATERIALS)}")
+    verb.add_argument(
+        "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"
+    )
     verb.add_argument(
         "--liquid",
         action=argparse.BooleanOptionalAction,
@@ -85,6 +87,16 @@ def _add_skin(verb, seed="of the sensor's noise"):
     )
     verb.add_argument("--seed", type=int, default=0, help=seed)
     verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+    _add_options(verb)
+
+
+def _add_options(verb, name="--options", of="the skin"):
+    verb.add_argument(
+        name,
+        metavar="JSON",
+        help=f"further settings of {of}, JSON or a file of it: "
+        '{"skin": {"contact_law": {"adhesion": 0.05}}, "modulus": "factors.npy"} (docs/features.md)',
+    )
 
 
 def _add_press(verbs):
@@ -178,6 +190,7 @@ def _press(args):
         friction=args.mu,
         seed=args.seed,
         device=args.device,
+        options=args.options,
     )
     _calm_warp()
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
@@ -346,8 +359,10 @@ def _add_calibrate(verbs):
     verb.add_argument(
         "--material",
         default="paper",
-        help=f"law and starting values: {', '.join(MATERIALS)}, or a calibration's JSON",
+        help=f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json",
     )
+    _add_options(verb)
+    _add_options(verb, "--truth-options", "the synthetic skin")
     verb.add_argument(
         "--liquid",
         action=argparse.BooleanOptionalAction,
@@ -414,9 +429,11 @@ def _add_compare(verbs):
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(
         "--material",
-        help="given to all configurations, preset or a calibration's JSON (default: "
+        help="given to all configurations, preset or a material's or calibration's .json (default: "
         "each is calibrated first)",
     )
+    _add_options(verb)
+    _add_options(verb, "--reference-options", "the stand-in")
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
     )
@@ -492,6 +509,12 @@ def _add_generate(verbs):
     verb.add_argument(
         "--workers", type=int, help="processes that compute electrode readings (default: one per core)"
     )
+    verb.add_argument(
+        "--vary",
+        metavar="JSON",
+        help="drawn anew for each interaction, JSON or a file of it: "
+        '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
+    )
     _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
     verb.add_argument("--out", default="out/set", metavar="DIR", help="folder of the set")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -541,6 +564,10 @@ def _add_diagnose(verbs):
     )
     verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
+    verb.add_argument(
+        "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
+    )
+    _add_options(verb)
     verb.add_argument(
         "--in-skin",
         action="store_true",

@@ -1,7 +1,6 @@
 """`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them
 into `mujoco_warp.step`."""
 
-import dataclasses
 import pathlib
 import typing
 import warnings
@@ -12,14 +11,14 @@ import warp as wp
 
 from ..coupling.attachment import _add_slots, _check_place, _model
 from ..coupling.config import Config
-from ..coupling.fem import _choices, _grid, rest_geometry
-from ..coupling.fem import _model as skin_model
+from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
+from ..skin.per_world import make_room
 from ..skin.rubber.material import Material
-from ..skin.rubber.material import material as preset
+from ..skin.settings import Settings, plain, read_material
 from .batch import Batch, Hook
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch
@@ -119,6 +118,7 @@ def attach(
     seed: int = 0,
     readings: bool | dict = True,
     options: dict | None = None,
+    worlds: dict | None = None,
 ) -> Batch:
     """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on
     `mjw.step(m, d)` steps them too.
@@ -128,15 +128,19 @@ def attach(
         room for six constraint rows per touching body that moves: `mjw.put_data(mjm, mjd, nworld)` after
         `mj_forward` does, `mjw.make_data` with `njmax`.
       prefix, skin: as given to `add`.
-      material: name, dict or Material of all worlds, or a sequence of one for each world, all of one law and
-        element.
+      material: name, dict, .json file or Material of all worlds, or a sequence of one for each world, all of
+        one law and element, with as many terms of memory.
       liquid, priority, coupling, geoms, rounding: as for `biotac_mj.attach`.
       friction: of the skin, one number or (nworld,); None takes the material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
         dict of `PhysicsReadings`' settings: noise, sensor, film_every_step, temperature; or what
         `SensorBioTac(...).batch()` gives.
-      options: {"skin": {...}} settings of SkinOptions.
+      options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
+        elements}, as for `biotac_mj.attach`, of all worlds.
+      worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
+        adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
+        a number or (nworld,), and modulus (nworld, nelem). `batch.skin.data` changes them later.
 
     Raises:
       ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or
@@ -153,6 +157,7 @@ def attach(
         geoms=geoms,
         rounding=rounding,
         options=options,
+        worlds=dict(worlds or {}),
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
     slots = {}
@@ -183,6 +188,7 @@ def make(
     seed: int = 0,
     readings: bool | dict = True,
     options: dict | None = None,
+    worlds: dict | None = None,
 ) -> PoseBatch:
     """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step,
     such as mjx.
@@ -191,8 +197,8 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options: as for
-      `attach`.
+      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options, worlds:
+      as for `attach`.
 
     Raises:
       ValueError: see `attach`.
@@ -206,6 +212,7 @@ def make(
         geoms=geoms,
         rounding=rounding,
         options=options,
+        worlds=dict(worlds or {}),
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
     film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, device)
@@ -217,14 +224,12 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     BioTac."""
     material, friction, priority = settings["material"], settings["friction"], int(settings["priority"])
     materials = _materials(material, nworld)
-    single = dataclasses.asdict(materials[0]) if materials else material
-    chosen = Material(**single) if isinstance(single, dict) else preset(single or "default")
-    if isinstance(single, Material):
-        single = dataclasses.asdict(single)
+    chosen = materials[0] if materials else read_material(material)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
+    geometry = skin_reference(skin)[1]
     config = Config(
         skin=skin_reference(skin)[0],
-        material=single,
+        material=plain(chosen),
         liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
         geoms=settings["geoms"],
         rounding=dict(settings["rounding"] or {}),
@@ -241,19 +246,24 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
             f"the model's bodies are {names}"
         )
     touching = Touching(ModelView(mjm._address), core, config)
-    geometry = skin_reference(skin)[1]
-    fem = skin_model(geometry, *_choices(config), device)
-    if fem.options.dynamics != "quasistatic":
-        raise ValueError(
-            "a batch's skins are quasi-static: "
-            "leave options['skin']['dynamics'] out, or use biotac_mj.attach for inertia"
-        )
+    rubber, skin_options, modulus = skin_settings(config)
+    differ = settings["worlds"]
+    room = make_room(skin_options, modulus, differ, len(geometry.elem))
+    fem = shared_model(geometry, Settings(rubber, *room), device)
     grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
     def build(tangents):
         return BatchSkin(
-            fem, nworld, touching.geoms, grids, frictions, materials, tangents, float(mjm.opt.timestep)
+            fem,
+            nworld,
+            touching.geoms,
+            grids,
+            frictions,
+            materials,
+            tangents,
+            float(mjm.opt.timestep),
+            differ,
         )
 
     return touching, build, geometry, config
@@ -262,7 +272,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
 def _materials(material, nworld):
     if material is None or isinstance(material, (str, dict, Material)):
         return None
-    out = [Material(**x) if isinstance(x, dict) else preset(x) for x in material]
+    out = [read_material(x) for x in material]
     if len(out) != nworld:
         raise ValueError(
             f"{len(out)} materials for {nworld} worlds: pass one for each, or a single one for all"

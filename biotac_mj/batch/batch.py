@@ -104,6 +104,24 @@ class Batch(Skins):
                 [self._pos, self._mat],
             )
             pos, mat = self._pos, self._mat
+        if self.skin.inertial:
+            skin, data = self.skin, self.skin.data
+            arrays = [
+                m.body_rootid,
+                m.body_isdofancestor,
+                d.xpos,
+                d.xmat,
+                d.subtree_com,
+                d.cvel,
+                d.cdof,
+                d.qacc,
+            ]
+            self._launch(
+                dynamics.advance_core,
+                self.nworld,
+                [self._core, self.dt, int(accelerated), *arrays],
+                [skin.core_pos, skin.core_mat, data.frame_pos, data.frame_mat],
+            )
         self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
 
 

@@ -9,7 +9,15 @@ import warp as wp
 
 from .kernels import matrix, vector
 
-__all__ = ["add_forces", "advance_groups", "find_rows", "follow", "linear_models", "write_rows"]
+__all__ = [
+    "add_forces",
+    "advance_core",
+    "advance_groups",
+    "find_rows",
+    "follow",
+    "linear_models",
+    "write_rows",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -119,6 +127,45 @@ def advance_groups(
             angular = share * (turn * spin)
             j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
         jacobian_out[g, w, i] = j
+
+
+@wp.kernel
+def advance_core(
+    # In:
+    core: int,
+    h: real,
+    accelerated: int,
+    rootid: wp.array(dtype=int),
+    isdofancestor: wp.array2d(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    com: wp.array2d(dtype=wp.vec3),
+    cvel: wp.array2d(dtype=wp.spatial_vector),
+    cdof: wp.array2d(dtype=wp.spatial_vector),
+    qacc: wp.array2d(dtype=float),
+    # Out:
+    pos_out: wp.array(dtype=vec3),
+    mat_out: wp.array(dtype=mat33),
+    pos_end_out: wp.array(dtype=vec3),
+    mat_end_out: wp.array(dtype=mat33),
+):
+    """Poses of the BioTac frame in the world: now, and after h at present velocities moved by h^2 J a."""
+    w = wp.tid()
+    here = vector(xpos[w, core])
+    arm = here - vector(com[w, rootid[core]])
+    linear = vec3()
+    angular = vec3()
+    if accelerated == 1:
+        for i in range(cdof.shape[1]):
+            if isdofancestor[core, i] != 0:
+                spin = vector(wp.spatial_top(cdof[w, i]))
+                a = h * h * real(qacc[w, i])
+                linear += a * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
+                angular += a * spin
+    pos_out[w] = here
+    mat_out[w] = matrix(xmat[w, core])
+    pos_end_out[w] = _ahead_pos(core, w, h, rootid, xpos, com, cvel) + linear
+    mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, xmat, cvel)
 
 
 @wp.kernel

@@ -13,6 +13,7 @@ from ..skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINI
 __all__ = [
     "accept_models",
     "body_forces",
+    "core_pose",
     "geom_poses",
     "matrix",
     "relative_poses",
@@ -60,6 +61,31 @@ def relative_poses(
     turn = wp.transpose(matrix(xmat[w, core]))
     pos_out[g, w] = turn * (vector(xpos[w, body[g]]) - vector(xpos[w, core]))
     mat_out[g, w] = turn * matrix(xmat[w, body[g]])
+
+
+@wp.kernel
+def core_pose(
+    # In:
+    core: int,
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    fresh: wp.array(dtype=int),
+    # In and out:
+    pos: wp.array(dtype=vec3),
+    mat: wp.array(dtype=mat33),
+    # Out:
+    last_pos_out: wp.array(dtype=vec3),
+    last_mat_out: wp.array(dtype=mat33),
+):
+    """The BioTac frame in the world, and where it was in the last step; in the first it was here."""
+    w = wp.tid()
+    last_pos_out[w] = pos[w]
+    last_mat_out[w] = mat[w]
+    pos[w] = vector(xpos[w, core])
+    mat[w] = matrix(xmat[w, core])
+    if fresh[w] == 1:
+        last_pos_out[w] = pos[w]
+        last_mat_out[w] = mat[w]
 
 
 @wp.kernel

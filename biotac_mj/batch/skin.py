@@ -5,7 +5,8 @@ import numpy as np
 import warp as wp
 
 from ..coupling.stepper import Geom
-from ..skin import GeomSet, SkinData, SkinModel
+from ..skin import GeomSet, SkinModel
+from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
 from ..skin.step import launch_step, prepare_step
 from . import skin_kernels as kernels
@@ -24,12 +25,17 @@ class BatchSkin:
       friction: (nworld, ngeom) Coulomb coefficients.
       materials: one Material for each world, or None for the model's.
       tangents: whether `tangent` is wanted.
-      dt: time step [s], of rubber that relaxes.
+      dt: time step [s], of rubber that relaxes and of implicit dynamics.
+      worlds: in what the worlds differ besides, see `skin.per_world.make_worlds`.
 
     Attributes (wp.arrays on the model's device, double precision where nothing else is said):
       data: the SkinData: positions, materials and liquids.
       pos, mat: (ngeom, nworld) poses of the geoms in the BioTac frame, for the caller to write before
         `solve_skins`.
+      inertial: whether the skins have inertia (implicit dynamics): then the caller also writes where the
+        BioTac frames are, core_pos, core_mat (nworld,) when the step begins and data.frame_pos,
+        data.frame_mat when it ends.
+      fresh: (nworld,) int, 1 where no step was made since the reset: such a skin begins at rest on its core.
       x: (nvert, nworld) nodes [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
@@ -50,9 +56,11 @@ class BatchSkin:
         materials: list | None = None,
         tangents: bool = True,
         dt: float | None = None,
+        worlds: dict | None = None,
     ):
         self.model, self.nworld, self._tangents = model, nworld, tangents
-        self.data = SkinData(model, nworld, materials)
+        self.data = make_worlds(model, nworld, materials, worlds)
+        self.inertial = model.options.dynamics == "implicit"
         if dt is not None:
             self.data.dt.fill_(dt)
         self.geoms = GeomSet(
@@ -76,6 +84,9 @@ class BatchSkin:
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
             self.pressure = wp.zeros(nworld, dtype=wp.float64)
+            self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
+            self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
+            self.fresh = wp.full(nworld, 1, dtype=int)
             self._rest = self.data.rest_vert
 
     @property
@@ -90,6 +101,15 @@ class BatchSkin:
         A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its
         last good state."""
         m, d = self.model, self.data
+        if self.inertial:
+            frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]
+            self._launch(kernels.begin_at_rest, d.x.shape, [self.fresh, *frames, d.dt, d.x], [d.velocity])
+            self._launch(
+                kernels.begin_frames,
+                self.nworld,
+                [self.core_pos, self.core_mat],
+                [self.fresh, d.frame_pos_last, d.frame_mat_last],
+            )
         launch_step(m, d, self.geoms)
         self._launch(
             kernels.read_outputs,
@@ -129,7 +149,7 @@ class BatchSkin:
             kernels.reset_worlds,
             n,
             [mask, m.rest.pressure if m.has_liquid else 0.0],
-            [d.worlds, self.pressure],
+            [d.worlds, self.pressure, self.fresh],
         )
         if d.memory:
             d.memory.forget(d.x, mask)

@@ -5,6 +5,8 @@ import warp as wp
 from ..skin.newton.worlds import Worlds
 
 __all__ = [
+    "begin_at_rest",
+    "begin_frames",
     "read_outputs",
     "reset_faces",
     "reset_geoms",
@@ -17,6 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 real = wp.float64
 vec3 = wp.vec3d
+mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 
 
@@ -109,7 +112,13 @@ def reset_geoms(
 
 @wp.kernel
 def reset_worlds(
-    mask: wp.array(dtype=bool), rest_pressure: real, st: Worlds, pressure_out: wp.array(dtype=real)
+    # In:
+    mask: wp.array(dtype=bool),
+    rest_pressure: real,
+    # Out:
+    st: Worlds,
+    pressure_out: wp.array(dtype=real),
+    fresh_out: wp.array(dtype=int),
 ):
     w = wp.tid()
     if mask[w]:
@@ -123,3 +132,39 @@ def reset_worlds(
         st.iterations[w] = 0
         st.error[w] = real(0.0)
         pressure_out[w] = real(0.0)
+        fresh_out[w] = 1
+
+
+@wp.kernel
+def begin_at_rest(
+    # In:
+    fresh: wp.array(dtype=int),
+    pos: wp.array(dtype=vec3),
+    mat: wp.array(dtype=mat33),
+    pos_end: wp.array(dtype=vec3),
+    mat_end: wp.array(dtype=mat33),
+    dt: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    velocity_out: wp.array2d(dtype=vec3),
+):
+    """Skins whose first step this is move with their core."""
+    i, w = wp.tid()
+    if fresh[w] == 1:
+        velocity_out[i, w] = ((mat_end[w] - mat[w]) * x[i, w] + pos_end[w] - pos[w]) / dt[w]
+
+
+@wp.kernel
+def begin_frames(
+    # In:
+    pos: wp.array(dtype=vec3),
+    mat: wp.array(dtype=mat33),
+    # Out:
+    fresh_out: wp.array(dtype=int),
+    pos_out: wp.array(dtype=vec3),
+    mat_out: wp.array(dtype=mat33),
+):
+    w = wp.tid()
+    fresh_out[w] = 0
+    pos_out[w] = pos[w]
+    mat_out[w] = mat[w]

@@ -192,6 +192,14 @@ class PoseBatch(Skins):
         self._launch(
             kernels.relative_poses, self.groups, [self._core, self._body, xpos, xmat], [self._pos, self._mat]
         )
+        if self.skin.inertial:
+            skin, data = self.skin, self.skin.data
+            self._launch(
+                kernels.core_pose,
+                self.nworld,
+                [self._core, xpos, xmat, skin.fresh],
+                [data.frame_pos, data.frame_mat, skin.core_pos, skin.core_mat],
+            )
         self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
         bodies = [self._core, self._body, self.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])

@@ -128,7 +128,9 @@ def evaluate(
     )
     rows = []
     for case in indentations:
-        answer = simulate(configuration.geometry, options, [material], case, device)
+        answer = simulate(
+            configuration.geometry, options, [material], case, device, modulus=configuration.modulus
+        )
         error = np.linalg.norm(answer.force[0] - case.force, axis=1).mean()
         known = case.peak_norm is not None
         rows.append(

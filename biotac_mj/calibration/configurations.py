@@ -1,6 +1,9 @@
 """The four bodies that Narang et al. (ICRA 2021) compared, as skins with options."""
 
 import dataclasses
+from collections.abc import Callable
+
+import numpy as np
 
 from ..geometry.assets import asset_path
 from ..geometry.skin_geometry import SkinGeometry
@@ -18,11 +21,13 @@ class Configuration:
       name: as in CONFIGURATIONS.
       geometry: the body, in the BioTac frame.
       options: how it is solved; never with liquid, which the paper's model did not have.
+      modulus: factors on Young's modulus of its elements, see `SkinModel`, or None.
     """
 
     name: str
     geometry: SkinGeometry
     options: SkinOptions
+    modulus: np.ndarray | Callable | None = None
 
 
 # The body's mesh (None: the skin asked for) and whether the inner surface can touch the rigid core. All are
@@ -36,12 +41,15 @@ CONFIGURATIONS = {
 }
 
 
-def configuration(name: str, skin: str = "coarse", **options: object) -> Configuration:
+def configuration(
+    name: str, skin: str = "coarse", modulus: np.ndarray | Callable | None = None, **options: object
+) -> Configuration:
     """One of the paper's four configurations.
 
     Args:
       name: of CONFIGURATIONS.
       skin: resolution; shells come as "coarse", "default", "fine" or a file, solids as "coarse" only.
+      modulus: factors on Young's modulus of the body's elements (nelem,), or a function of positions.
       options: further SkinOptions; `liquid=True` is for shells.
 
     Raises:
@@ -52,7 +60,7 @@ def configuration(name: str, skin: str = "coarse", **options: object) -> Configu
     body, core = CONFIGURATIONS[name]
     options = SkinOptions(**{"liquid": False, "core_contact": core, **options})
     if body is None:
-        return Configuration(name, load_skin(skin), options)
+        return Configuration(name, load_skin(skin), options, modulus)
     if options.liquid:
         raise ValueError(
             f"configuration {name!r} has no space for a liquid: take a shell, or leave the liquid out"
@@ -62,4 +70,4 @@ def configuration(name: str, skin: str = "coarse", **options: object) -> Configu
             f"configuration {name!r} comes with the coarse mesh only, not {skin!r}: "
             "make others with scripts/make_solids.py"
         )
-    return Configuration(name, SkinGeometry.load(asset_path(f"skins/{body}_coarse.npz")), options)
+    return Configuration(name, SkinGeometry.load(asset_path(f"skins/{body}_coarse.npz")), options, modulus)

@@ -176,7 +176,12 @@ def forces_and_jacobian(
     for options in dict.fromkeys(options for options, _ in cases):
         members = [i for i, case in enumerate(cases) if case[0] == options]
         response = simulate(
-            configuration.geometry, options, [cases[i][1] for i in members], indentation, device
+            configuration.geometry,
+            options,
+            [cases[i][1] for i in members],
+            indentation,
+            device,
+            modulus=configuration.modulus,
         )
         for i, f in zip(members, response.force):
             force[i] = f
@@ -315,10 +320,16 @@ def calibrate(
         )
 
     found, correction = finish(start + back @ rough.x, 0.0), 0.0
+    modulus = configuration.modulus
+    if finer is not None and modulus is not None and not callable(modulus):
+        modulus = np.repeat(
+            modulus, len(finer.elem) // len(modulus)
+        )  # parts follow each other, see `refined`
     for _ in range(corrections if finer is not None else 0):
         values, force, _, _ = evaluate(found.x)
         case = _case(options, material, parameters, values)
-        correction = simulate(finer, case[0], [case[1]], indentation, device).force[0] - force
+        there = simulate(finer, case[0], [case[1]], indentation, device, modulus=modulus)
+        correction = there.force[0] - force
         found = finish(found.x, correction)
     values, force, jacobian, lost = evaluate(found.x)
     bar.close()

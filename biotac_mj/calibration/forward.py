@@ -43,6 +43,7 @@ def simulate(
     indentation: Indentation,
     device: str = "cpu",
     progress: Callable | None = None,
+    modulus: np.ndarray | Callable | None = None,
 ) -> Response:
     """Walks the indentation once, every material as a world of one batch.
 
@@ -52,25 +53,28 @@ def simulate(
     Args:
       geometry, options: the body; its options count for all.
       materials: k Materials of one law; Young's modulus, Poisson's ratio and friction may differ.
-      indentation: the way; its force is not looked at.
+      indentation: the way and its times; its force is not looked at. Before the first sample the skin has
+        rested as long as the first two are apart.
       progress: called after every sample.
+      modulus: factors on Young's modulus of the body's elements, see `SkinModel`.
 
     Raises:
       ValueError: materials of several laws, or an indenter deep inside the rigid core.
     """
     materials = list(materials)
-    model = SkinModel(geometry, materials[0], options, device)
+    model = SkinModel(geometry, materials[0], options, device, modulus=modulus)
     data = SkinData(model, len(materials), materials)
     geoms, place = _indenter(indentation, materials, device)
     force, norms, steps = [], [], 0
     at = indentation.tip[0]
     geoms.set_pose(*place(at))
     weight, outer = _outer_weights(geometry)
-    for tip in indentation.tip:
+    times = np.diff(indentation.time, prepend=2 * indentation.time[0] - indentation.time[1])
+    for tip, dt in zip(indentation.tip, times):
         count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _STRIDE - 1e-9)))
         for k in range(1, count + 1):
             geoms.set_pose(*place(at + (tip - at) * k / count))
-            step(model, data, geoms)
+            step(model, data, geoms, dt / count)
         steps, at = steps + count, tip
         force.append(data.wrench[:, 0, :3])
         norms.append(displacement_norms(data.vert_xpos[:, outer] - geometry.vert[outer], weight))

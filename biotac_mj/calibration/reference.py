@@ -5,8 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from ..skin.model import SkinOptions
-from ..skin.rubber.material import material as preset
+from ..skin.settings import read_settings
 from .forward import simulate
 from .indentation import Indentation
 from .refinement import skin as named_skin
@@ -25,24 +24,29 @@ def stand_in(
     liquid: bool | None = None,
     element: str | None = None,
     device: str = "cpu",
+    options: dict | None = None,
 ) -> Indentation:
     """The same way with the forces and displacements of a skin that we know.
 
     Args:
       indentation: the way.
-      material: preset or Material; "rubber" is Neo-Hookean with the paper's ANSYS constants, and has liquid.
+      material: preset, dict, .json file or Material; "rubber" is Neo-Hookean with the paper's ANSYS
+        constants, and has liquid.
       skin: mesh, "refined:NAME" for each of its tetrahedra cut into eight.
       noise: standard deviation added to each force component [N].
       seed: of the noise.
       liquid, element: see SkinOptions; None takes the material's choice.
+      options: {"skin": ..., "modulus": ...}, further ones, see `skin.settings.read_settings`.
 
     Raises:
       ValueError: noise that is negative, or a way that the skin cannot follow.
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise is {noise}: pass a standard deviation in newtons, 0 or more")
-    options = SkinOptions(liquid=liquid, element=element, tolerance=1e-4, max_newton=100)
-    answer = simulate(named_skin(skin), options, [preset(material)], indentation, device)
+    rubber, options, modulus = read_settings(
+        material, options, liquid=liquid, element=element, tolerance=1e-4, max_newton=100
+    )
+    answer = simulate(named_skin(skin), options, [rubber], indentation, device, modulus=modulus)
     if answer.nonconverged[0]:
         raise ValueError(
             f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not "

@@ -5,7 +5,8 @@ import pathlib
 
 import tqdm
 
-from ..skin.rubber.material import PRESETS, material
+from ..skin.rubber.material import material
+from ..skin.settings import plain, read_dict, read_material, read_settings
 from .comparison import PAPER, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
 from .fit import calibrate
@@ -13,7 +14,7 @@ from .indentation import plan_shear, read_indentation, write_indentation
 from .kept import Kept
 from .reference import STAND_IN, stand_in
 from .refinement import refined
-from .report import calibration_table, read_material, write_json, write_picture
+from .report import calibration_table, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
 
@@ -26,8 +27,11 @@ _NO_SETTINGS = (
 )  # what finished parts of a comparison do not depend on
 
 
-def _material(text):
-    return material(text) if text in PRESETS or not text.endswith(".json") else read_material(text)
+def _body(name, skin, liquid, options):
+    """A configuration with the options of the command line."""
+    given = read_dict(options, "options")
+    modulus = read_settings(None, given).modulus  # refuses what is unknown
+    return configuration(name, skin, modulus, **{"liquid": liquid, **plain(given.get("skin") or {})})
 
 
 def calibrate_verb(args: argparse.Namespace) -> None:
@@ -35,14 +39,21 @@ def calibrate_verb(args: argparse.Namespace) -> None:
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
     out = pathlib.Path(args.out)
-    body = configuration(args.configuration, args.skin, liquid=args.liquid)
+    body = _body(args.configuration, args.skin, args.liquid, args.options)
     if args.synthetic:
         plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction)
         data = stand_in(
-            plan, args.truth, args.truth_skin, args.noise, args.seed, args.truth_liquid, device=args.device
+            plan,
+            args.truth,
+            args.truth_skin,
+            args.noise,
+            args.seed,
+            args.truth_liquid,
+            device=args.device,
+            options=read_dict(args.truth_options, "truth-options"),
         )
         write_indentation(data, out / "synthetic.csv")
-        truth = material(args.truth)
+        truth = read_material(args.truth)
         print(
             f"data: our own skin, {args.truth} on mesh {args.truth_skin}, E {truth.youngs_modulus:g} Pa, "
             f"nu {truth.poissons_ratio:g}, "
@@ -53,7 +64,7 @@ def calibrate_verb(args: argparse.Namespace) -> None:
     finer = refined(body.geometry) if args.correct else None
     result = calibrate(
         body,
-        _material(args.material),
+        read_material(args.material),
         data,
         args.fit,
         device=args.device,
@@ -74,14 +85,15 @@ def compare_verb(args: argparse.Namespace) -> None:
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
     chosen = [
-        configuration(
+        _body(
             name,
             args.skin if CONFIGURATIONS[name][0] is None else "coarse",
-            liquid=args.liquid and CONFIGURATIONS[name][0] is None,
+            args.liquid and CONFIGURATIONS[name][0] is None,
+            args.options,
         )
         for name in args.configurations
     ]
-    given = args.material and _material(args.material)
+    given = args.material and read_material(args.material)
     out = pathlib.Path(args.out)
     settings = {
         k: v
@@ -91,6 +103,7 @@ def compare_verb(args: argparse.Namespace) -> None:
     if args.data:
         files = [pathlib.Path(text.partition("=")[2]) for text in args.data]
         settings["read"] = [file.stat().st_mtime_ns for file in files if file.is_file()]
+    settings["options"] = [read_dict(text, "options") for text in (args.options, args.reference_options)]
     kept = Kept(out / "compare.kept", settings | {"given": given})
     if kept.names and not args.quiet:
         print(
@@ -106,6 +119,7 @@ def compare_verb(args: argparse.Namespace) -> None:
             skin=args.reference_skin,
             element=args.reference_element,
             device=args.device,
+            options=read_dict(args.reference_options, "reference-options"),
         )
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.resources
 import pathlib
+import typing
 import weakref
 
 import mujoco
@@ -13,6 +14,9 @@ from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
 from .config import PLUGIN_NAME, Config
 from .stepper import check_names
+
+if typing.TYPE_CHECKING:
+    from ..skin import Material
 
 __all__ = ["Handle", "attach"]
 
@@ -81,7 +85,7 @@ def attach(
     quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry = "default",
-    material: str | dict | None = None,
+    material: "str | dict | Material | None" = None,
     liquid: bool | None = None,
     coupling: str = "two-way",
     geoms: list | None = None,
@@ -106,9 +110,12 @@ def attach(
       prefix: of every name it adds, so that a model may hold several.
       skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
+      material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
       liquid, friction: None takes the material's choice.
-      material, liquid, coupling, geoms, rounding, friction, priority, seed, device, stepper, tier, readings,
-      options: see `Config`.
+      options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
+        element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
+        elements' centroids; "readings": of the sensor.
+      coupling, geoms, rounding, priority, seed, device, stepper, tier, readings: see `Config`.
 
     Raises:
       ValueError: unknown site, body, coupling, geom or skin; the prefix is taken; site and body both given.
@@ -116,6 +123,9 @@ def attach(
     """
     _check_place(spec, site, body, prefix)
     text, geometry = skin_reference(skin)
+    from ..skin.settings import plain
+
+    material, options = plain(material), plain(dict(options or {}), geometry)
     if stepper == "fem":
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
@@ -131,7 +141,7 @@ def attach(
         priority=int(priority),
         seed=int(seed),
         device=device,
-        options=dict(options or {}),
+        options=options,
         **({} if friction is None else {"friction": float(friction)}),
     )
     check_names(config)
@@ -161,10 +171,9 @@ def attach(
 
 
 def _material_choices(material, liquid, friction):
-    from ..skin.rubber.material import Material
-    from ..skin.rubber.material import material as preset
+    from ..skin.settings import read_material
 
-    chosen = Material(**material) if isinstance(material, dict) else preset(material or "default")
+    chosen = read_material(material)
     return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction
 
 

@@ -21,7 +21,8 @@ class Config:
       tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/condensed.md); the
         number of its place in TIERS is in the status sensor.
       readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
-      material: name of the skin's material or a dict of its parameters; None is the default one.
+      material: name of the skin's material, a dict of its parameters or a .json file; None is the default
+        one.
       liquid: whether the space between skin and core is filled.
       coupling: "two-way" (the touching bodies and the BioTac feel the skin) or "one-way" (readings only).
       geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own
@@ -32,7 +33,8 @@ class Config:
       priority: contact priority of the skin.
       seed: of the sensor's noise.
       device: Warp device of the skin.
-      options: further settings of the stepper and the readings.
+      options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
+        and "readings".
     """
 
     skin: str = "default"

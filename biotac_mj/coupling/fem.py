@@ -8,15 +8,16 @@ import numpy as np
 import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, material, step
+from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, step
 from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
+from ..skin.settings import Settings, read_settings
 from ..skin.types import vec3
 from .config import Config
 from .stepper import Geom, SkinResult
 
-__all__ = ["FemStepper", "rest_geometry"]
+__all__ = ["FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
@@ -38,7 +39,8 @@ class FemStepper:
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
-        self._material, self._options = _choices(config)
+        self._settings = skin_settings(config)
+        self._material, self._options, _ = self._settings
         solved, element = solved_geometry(geometry, self._material, self._options)
         self._nodes = solved.vert  # maybe with more nodes behind the geometry's
         n, g = len(self._nodes), len(geoms)
@@ -68,7 +70,7 @@ class FemStepper:
 
     @functools.cached_property
     def _model(self):
-        return _model(self._geometry, self._material, self._options, self._config.device)
+        return shared_model(self._geometry, self._settings, self._config.device)
 
     @functools.cached_property
     def _data(self):
@@ -264,20 +266,23 @@ class FemStepper:
 def rest_geometry(config: Config, geometry: SkinGeometry) -> SkinGeometry:
     """The geometry with the nodes where the skin rests on its filling: what the sensor sees when nothing
     touches."""
-    choice, options = _choices(config)
-    if not _filled(options):
+    settings = skin_settings(config)
+    if not _filled(settings.options):
         return geometry
-    rest = _model(geometry, choice, options, config.device).rest
+    rest = shared_model(geometry, settings, config.device).rest
     return dataclasses.replace(geometry, vert=rest.vert[: geometry.nvert])
 
 
-def _choices(config):
+def skin_settings(config: Config) -> Settings:
+    """Material, SkinOptions and modulus of a BioTac.
+
+    Raises:
+      ValueError: a value that cannot be. FileNotFoundError: no such material or modulus.
+    """
     # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
     liquid = {} if config.liquid is None else {"liquid": config.liquid}
-    options = SkinOptions(**({"tolerance": 3e-4} | liquid | config.options.get("skin", {})))
-    return Material(**config.material) if isinstance(config.material, dict) else material(
-        config.material or "default"
-    ), options
+    mine = {name: config.options[name] for name in ("skin", "modulus") if name in config.options}
+    return read_settings(config.material, mine, tolerance=3e-4, **liquid)
 
 
 def _filled(options):
@@ -299,17 +304,13 @@ def _grid(vert, face):
 _models = {}
 
 
-def _model(geometry, material_choice, options, device):
+def shared_model(geometry: SkinGeometry, settings: Settings, device: str) -> SkinModel:
     """One SkinModel per geometry and settings: its factor and compliance are the same for every sensor in the
     process."""
-    key = (
-        geometry.vert.tobytes(),
-        geometry.elem.tobytes(),
-        geometry.fixed.tobytes(),
-        material_choice,
-        options,
-        device,
-    )
+    rubber, options, modulus = settings
+    mesh = (array.tobytes() for array in (geometry.vert, geometry.elem, geometry.fixed))
+    uneven = modulus if modulus is None or callable(modulus) else modulus.tobytes()
+    key = (*mesh, rubber, options, uneven, device)
     if key not in _models:
-        _models[key] = SkinModel(geometry, material_choice, options, device)
+        _models[key] = SkinModel(geometry, rubber, options, device, modulus=modulus)
     return _models[key]

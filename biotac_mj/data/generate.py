@@ -12,9 +12,11 @@ import numpy as np
 from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
+from ..skin.settings import plain, read_dict
 from .objects import OBJECTS
 from .plan import KINDS
 from .store import TactileSet, shard_path
+from .vary import check_vary
 
 __all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate"]
 
@@ -36,7 +38,13 @@ class GenerateOptions:
       seed: of everything.
       objects, kinds: to draw from.
       skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
-        None: the material's.
+        None: the material's. The material may be a dict of Material's fields, or a .json file of them.
+      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus of the elements,
+        or a .npy file}, or a .json file of it.
+      vary: {name: (low, high)}, what is drawn anew for each interaction: youngs_modulus, poissons_ratio,
+        friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
+        can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
+        parameters, under "skin".
       sensor: whose published rest counts the simulated electrodes show.
       batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
         part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
@@ -56,7 +64,7 @@ class GenerateOptions:
     kinds: tuple = KINDS
     skin: str = "default"
     tier: str = "full"
-    material: str = "default"
+    material: str | dict = "default"
     element: str | None = None
     liquid: bool | None = None
     sensor: str = "1"
@@ -65,10 +73,21 @@ class GenerateOptions:
     measured_seed: int = 0
     measured_skin: str = "fine"
     device: str = "cpu"
+    options: str | dict | None = None
+    vary: str | dict | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "objects", tuple(self.objects))
         object.__setattr__(self, "kinds", tuple(self.kinds))
+        object.__setattr__(self, "material", plain(self.material))
+        for name in ("options", "vary"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else plain(read_dict(value, name)))
+        check_vary(self.vary or {})
+        if self.vary and self.tier == "condensed":
+            raise ValueError(
+                "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
+            )
         if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
             raise ValueError(
                 f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: "

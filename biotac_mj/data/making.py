@@ -21,6 +21,7 @@ from .plan import plan_motions
 from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
 from .store import write_shard
+from .vary import draw_worlds
 
 __all__ = ["Maker", "make_shards"]
 
@@ -163,7 +164,9 @@ class Maker:
 
     def __init__(self, out, options, settings, device="cpu", update=lambda n: None, tell=lambda text: None):
         from ..geometry import load_skin
-        from ..skin import SkinModel, SkinOptions
+        from ..skin import SkinModel
+        from ..skin.per_world import NAMES, make_room
+        from ..skin.settings import read_settings
 
         self.out, self.options, self.update, self.tell = out, options, update, tell
         self.seconds = {
@@ -175,8 +178,14 @@ class Maker:
         }
         clock = time.perf_counter()
         self.geometry = load_skin(options.skin)
-        skin = SkinOptions(element=options.element, liquid=options.liquid)
-        model = self.model = SkinModel(self.geometry, options.material, skin, device)
+        chosen = {name: getattr(options, name) for name in ("element", "liquid")}
+        rubber, skin, modulus = read_settings(options.material, options.options, **chosen)
+        self.vary = options.vary or {}
+        between = {name: self.vary[name] for name in NAMES if name in self.vary}
+        skin, modulus = make_room(skin, modulus, between, len(self.geometry.elem))
+        if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
+            rubber = dataclasses.replace(rubber, stiffening=sum(self.vary["stiffening"]) / 2)
+        model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
         self.attributes = {
             "settings": settings,
             "skin": options.skin,
@@ -204,7 +213,9 @@ class Maker:
         from . import readings, synthetic_sensor
 
         o = self.options
-        args = (self.geometry, o.sensor, self.measured and self.measured.meter())
+        filled = self.model.options.fill_volume or self.model.options.rest_pressure
+        rest = self.model.rest.vert[: self.geometry.nvert] if filled else None
+        args = (self.geometry, o.sensor, self.measured and self.measured.meter(), rest)
         with readings.readings_pool(
             self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args
         ) as pool:
@@ -243,7 +254,14 @@ class Maker:
         ]
         if batch.simulated:
             walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
-            fields = running.fields = walk(self.model, batch.names, motions, self.update)
+            skins = None, {}
+            if self.vary:
+                *skins, drawn = draw_worlds(
+                    self.vary, self.model.material, [[o.seed, i, 2] for i in batch.members]
+                )
+                for motion, one in zip(motions, drawn):
+                    motion.parameters["skin"] = one
+            fields = running.fields = walk(self.model, batch.names, motions, self.update, self.time, *skins)
             clock = self._count("skin", clock)
             running.reads = [
                 pool.submit(

@@ -85,15 +85,17 @@ def read_motion(
 _here = {}  # what a worker keeps: the film of the set's skin
 
 
-def prepare_worker(geometry: SkinGeometry, sensor: str) -> None:
-    """Makes the film of a skin in this process."""
-    _here["film"] = FilmConduction(geometry, sensor=sensor)
+def prepare_worker(geometry: SkinGeometry, sensor: str, rest_vert: np.ndarray | None = None) -> None:
+    """Makes the film of a skin in this process; rest_vert (nvert, 3) [m] is where it rests on its filling."""
+    _here["vert"] = geometry.vert
+    rest = geometry if rest_vert is None else dataclasses.replace(geometry, vert=rest_vert)
+    _here["film"] = FilmConduction(rest, sensor=sensor)
 
 
 def read_in_worker(displacement: np.ndarray, time: np.ndarray, pressure: np.ndarray, seed: int) -> Readings:
     """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store."""
     film = _here["film"]
-    return read_motion(film, film.geometry.vert + displacement * DISPLACEMENT_SCALE, time, pressure, seed)
+    return read_motion(film, _here["vert"] + displacement * DISPLACEMENT_SCALE, time, pressure, seed)
 
 
 class _Now:

@@ -7,13 +7,14 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from ..skin import GeomSet, SkinData, SkinModel, step
+from ..skin import GeomSet, SkinModel, step
+from ..skin.per_world import make_worlds
 from ..skin.types import real, vec3
 from .clearance import Placed
 from .objects import grid_of, make_object
 from .schema import DISPLACEMENT_SCALE, nodes_of
 
-__all__ = ["Fields", "Scene", "simulate", "simulate_condensed"]
+__all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +48,13 @@ class Fields:
 
 
 def simulate(
-    model: SkinModel, names: list | tuple, motions: list, progress: Callable | None = None
+    model: SkinModel,
+    names: list | tuple,
+    motions: list,
+    progress: Callable | None = None,
+    time: np.ndarray | list | None = None,
+    materials: list | None = None,
+    worlds: dict | None = None,
 ) -> Fields:
     """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
     batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
@@ -58,35 +65,51 @@ def simulate(
       names: of the object of each motion, or of the one that all share.
       motions: plan.Motions of equal length.
       progress: called with the number of time steps of all motions that a step of the solver has finished.
+      time: (n,) of the motions' rows [s], or one such for each motion; rubber that relaxes and inertia need
+        it. What comes before the first row takes as long as what comes after it.
+      materials: one for each motion, or None for the model's.
+      worlds: name -> (k,) in what motions differ besides, see `skin.per_world.make_worlds`.
 
     Raises:
-      ValueError: an object deep inside the rigid core (plans keep clear of it).
+      ValueError: an object deep inside the rigid core (plans keep clear of it), or no time where it is
+        needed.
     """
     names = [names] * len(motions) if isinstance(names, str) else list(names)
-    if not model.device.is_cuda:
-        ones = [_simulate(model, [name], [motion], progress) for name, motion in zip(names, motions)]
-        return Fields(
-            *(
-                np.concatenate([getattr(one, field.name) for one in ones])
-                for field in dataclasses.fields(Fields)
-            )
-        )
-    return _simulate(model, names, motions, progress)
+    k = len(motions)
+    times = [None] * k if time is None else list(time) if np.ndim(time[0]) else [time] * k
+    worlds = {name: np.asarray(value) for name, value in (worlds or {}).items()}
+    if model.device.is_cuda:
+        return _simulate(model, names, motions, progress, times, materials, worlds)
+    ones = []
+    for i in range(k):
+        mine = None if materials is None else materials[i : i + 1]
+        own = {name: value[i : i + 1] for name, value in worlds.items()}
+        one = slice(i, i + 1)
+        ones.append(_simulate(model, names[one], motions[one], progress, times[one], mine, own))
+    return Fields(
+        *(np.concatenate([getattr(one, field.name) for one in ones]) for field in dataclasses.fields(Fields))
+    )
 
 
-def _simulate(model, names, motions, progress):
+def _simulate(model, names, motions, progress, times=None, materials=None, worlds=None):
     nworld, nstep = len(motions), len(motions[0].pos)
-    data = SkinData(model, nworld)
+    data = make_worlds(model, nworld, materials, worlds)
     scene = Scene(names, model.device, model.material.friction)
+    if materials is not None:
+        scene.geoms.set_friction([[m.friction] * scene.geoms.count for m in materials])
     outer = nodes_of(model.geometry)
     fields = _empty(nworld, nstep, model.nvert, len(outer))
     reader = _Reader(model, outer)
     walks = [_walk(m.pos, m.mat) for m in motions]
+    clocks = None
+    if times is not None and times[0] is not None:
+        clocks = [clock(walk[2], time, time[1] - time[0])[0] for walk, time in zip(walks, times)]
     scene.place([w[0][0] for w in walks], [w[1][0] for w in walks])
     for k in range(max(len(w[0]) for w in walks)):
         at = [min(k, len(w[0]) - 1) for w in walks]  # who has arrived waits there
         scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
-        step(model, data, scene.geoms)
+        dt = None if clocks is None else np.array([c[i] for c, i in zip(clocks, at)])
+        step(model, data, scene.geoms, dt)
         there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
         if not len(there):
             continue
@@ -101,17 +124,40 @@ def _simulate(model, names, motions, progress):
     return fields
 
 
+def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, np.ndarray]:
+    """Time steps (m,) [s] of the poses of a walk, and when they end (m,) [s].
+
+    Args:
+      row: (m,) the row that each pose ends, -1 on the way, see `_walk`. time: (n,) of the rows [s].
+      first: how long what comes before the first row takes [s].
+    """
+    count = np.diff(np.flatnonzero(row >= 0), prepend=-1)  # steps to each row
+    dt = np.repeat(np.diff(time, prepend=time[0] - first) / count, count)
+    return dt, time[0] + np.cumsum(dt) - dt[0]
+
+
 def simulate_condensed(
-    model: SkinModel, names: list | tuple, motions: list, progress: Callable | None = None
+    model: SkinModel,
+    names: list | tuple,
+    motions: list,
+    progress: Callable | None = None,
+    time: np.ndarray | list | None = None,
+    materials: list | None = None,
+    worlds: dict | None = None,
 ) -> Fields:
     """The same with the condensed skin, one interaction after another on one core; it has no contact forces
-    of nodes.
+    of nodes, and nothing in it takes time.
 
     Raises:
-      ValueError: the skin is inflated at rest, or an object deep inside the rigid core.
+      ValueError: what the condensed tier cannot do, materials or worlds that differ, or an object deep inside
+        the rigid core.
     """
     from ..skin.condensed import CondensedSkin, Memory
 
+    if materials is not None or worlds:
+        raise ValueError(
+            "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
+        )
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     nstep = len(motions[0].pos)
     fields = _empty(len(motions), nstep, model.nvert, None)

@@ -26,6 +26,8 @@ def generate_verb(args) -> None:
         measured_seed=args.measured_seed,
         measured_skin=args.measured_skin,
         device=args.device,
+        options=args.options,
+        vary=args.vary,
     )
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")

@@ -36,7 +36,7 @@ def drain(model: SkinModel, data: SkinData, share: float) -> None:
     """Brings an untouched skin to rest on a share of its liquid."""
     from ..skin import GeomSet, step
 
-    nothing = GeomSet([], [])
+    nothing = GeomSet([], [], device=model.device)
     for part in np.linspace(1, share, int(np.ceil((1 - share) / _SHARE)) + 1)[1:]:
         data.set_liquid(fill_volume=(part - 1) * model.liquid_volume)
         step(model, data, nothing, _LONG)

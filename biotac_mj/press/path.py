@@ -27,7 +27,9 @@ class PressOptions:
       depth: travel from first touch [m].
       slide: travel along slide_direction after the press [m].
       slide_direction: (3,), of which the part across `direction` counts.
-      material: name of a preset of the skin.
+      material: of the skin: a preset's name, a dict of Material's fields, or a .json file of them.
+      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus, or a .npy file},
+        or a .json file of it.
       liquid: whether there is liquid under the skin; None takes the material's choice.
       skin: "coarse", "default", "fine" or a file.
       tier: of the skin's solution, "full" or "condensed".
@@ -44,7 +46,7 @@ class PressOptions:
     depth: float = 2.4e-3
     slide: float = 0.0
     slide_direction: tuple = (1.0, 0.0, 0.0)
-    material: str = "default"
+    material: str | dict = "default"
     liquid: bool | None = None
     skin: str = "default"
     tier: str = "full"
@@ -55,6 +57,7 @@ class PressOptions:
     friction: float | None = None
     seed: int = 0
     device: str = "cpu"
+    options: str | dict | None = None
 
     def __post_init__(self):
         for name, least in (("depth", 0), ("timestep", 0), ("speed", 0)):

@@ -46,6 +46,7 @@ def press(
       ValueError, FileNotFoundError: an option is not possible; the text names cause and remedy.
     """
     from ..geometry import load_skin
+    from ..skin.settings import plain
 
     geometry = load_skin(options.skin)
     indenter = make_indenter(options.indenter)
@@ -86,7 +87,7 @@ def press(
     record = PressRecord(
         geometry=geometry,
         parameters={
-            **dataclasses.asdict(options),
+            **plain({f.name: getattr(options, f.name) for f in dataclasses.fields(options)}, geometry),
             "direction": path.direction.tolist(),
             "start": path.start.tolist(),
         },

@@ -29,9 +29,9 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
       ValueError: a two-way press with a plane, which cannot move in MuJoCo.
     """
     from ..coupling import attach
-    from ..skin.rubber.material import material
+    from ..skin.settings import plain, read_dict, read_material
 
-    chosen = material(options.material)
+    chosen = read_material(options.material)
     friction = chosen.friction if options.friction is None else options.friction
     spec = mujoco.MjSpec()
     spec.option.timestep = options.timestep
@@ -64,7 +64,7 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
         prefix=_PREFIX,
         skin=options.skin,
         tier=options.tier,
-        material=options.material,
+        material=plain(options.material),
         liquid=chosen.liquid if options.liquid is None else options.liquid,
         coupling="two-way" if options.two_way else "one-way",
         geoms=["indenter"],
@@ -72,6 +72,7 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
         friction=friction,
         seed=options.seed,
         device=options.device,
+        options=read_dict(options.options, "options"),
     )
     see_through(spec, handle)
     return spec, handle

@@ -40,7 +40,12 @@ _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 
 def step(
-    model: SkinModel, data: SkinData, geoms: GeomSet, dt: float | None = None, core_pos=None, core_mat=None
+    model: SkinModel,
+    data: SkinData,
+    geoms: GeomSet,
+    dt: float | np.ndarray | None = None,
+    core_pos=None,
+    core_mat=None,
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
@@ -50,7 +55,7 @@ def step(
     Args:
       model, data: the skin.
       geoms: touching geoms, poses in the BioTac frame at the end of the step.
-      dt: time step [s]; needed by implicit dynamics and by skin with a Prony series.
+      dt: time step [s], a number or (nworld,); needed by implicit dynamics and by skin with a Prony series.
       core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
         the step, for the inertia of implicit dynamics; None means that it does not move.
 
@@ -101,10 +106,13 @@ def launch_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> None:
 def _set_time(model, data, dt, core_pos, core_mat):
     implicit = model.options.dynamics == "implicit"
     if implicit or model.material.prony:
-        if dt is None or not (np.isfinite(dt) and dt > 0):
+        if dt is None or not (np.isfinite(dt).all() and np.min(dt) > 0):
             what = "implicit dynamics" if implicit else "skin with a Prony series, which relaxes in time,"
             raise ValueError(f"{what} needs the time step: pass dt > 0")
-        data.dt.fill_(dt)
+        if np.ndim(dt) == 0:
+            data.dt.fill_(dt)
+        else:
+            data.dt.assign(np.asarray(dt, float))
     if implicit:
         for array, last, value in (
             (data.frame_pos, data.frame_pos_last, core_pos),
@@ -362,7 +370,7 @@ class SkinStep:
         e.multiply_corners(self._launcher, d.x, k.p, st.running)
         inertia = wp.vec3d(0.0, 0.0, 0.0)
         if self.implicit:
-            inertia = wp.vec3d(m.material.density, m.options.mass_damping, m.options.stiffness_damping)
+            inertia = wp.vec3d(1.0, m.options.mass_damping, m.options.stiffness_damping)
         wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
         if m.has_liquid:
             wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
@@ -462,7 +470,7 @@ class SkinStep:
     def _resist_motion(self, on):
         """Inertia and damping."""
         m, d, k, o, kernels = self.m, self.d, self.k, self.m.options, self._of_nodes
-        mass = [m.material.density, o.mass_damping, k.node_volume, d.dt]
+        mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
         positions = [k.target, d.x_last, d.x]
         self._launch(kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
         e = k.damped

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...effects.in_film import RoughFilm, drain, left
 from ...effects.in_skin import memory_of
+from ...skin.settings import read_settings
 from .simulator import Simulator, _impedance, placed
 
 __all__ = ["InSkinSimulator", "solve_with_memory"]
@@ -24,7 +25,7 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None, loss
     Overstress and slip are forgotten between trajectories, the largest energy of every point is not.
 
     Args:
-      model: SkinModel on the CPU; film: FilmConduction.
+      model: SkinModel; film: FilmConduction.
       poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
       loss: of liquid, as a share of what there was at the session's beginning [1/h].
 
@@ -32,27 +33,25 @@ def solve_with_memory(model, film, trajectories, poses=None, progress=None, loss
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
         converged (n,).
     """
-    from ...data.simulate import Scene, _walk
+    from ...data.simulate import Scene, _walk, clock
     from ...skin import SkinData, step
 
     data, out = SkinData(model), []
     for i, t in enumerate(trajectories):
         tool, pos = (t.tool, t.pos) if poses is None else poses[i]
-        worst = data.memory.worst.copy() if data.memory else None
+        borne = data.memory.borne() if data.memory else None
         data.reset()
         if data.memory:
-            np.maximum(worst, data.memory.worst, out=data.memory.worst)
+            data.memory.bear(borne, data.x)
         scene = Scene([tool], model.device, model.material.friction)
         at, turn, row = _walk(pos, t.mat)
-        ends = np.flatnonzero(row >= 0)
-        count = np.diff(ends, prepend=-1)  # steps to each row
-        dt = np.repeat(np.diff(t.time, prepend=t.time[0] - 1.0) / count, count)
+        dt, clocks = clock(row, t.time, 1.0)
         scene.place(at[:1], turn[:1])
-        clock = t.clock + t.time[0] + np.cumsum(dt) - dt[0]
+        clocks = clocks + t.clock
         if loss:
-            drain(model, data, left(loss, clock[0]))
+            drain(model, data, left(loss, clocks[0]))
         one = {"force": [], "pressure": [], "x": [], "converged": []}
-        for p, R, r, h, now in zip(at, turn, row, dt, clock):
+        for p, R, r, h, now in zip(at, turn, row, dt, clocks):
             scene.place(p[None], R[None])
             if loss:
                 data.set_liquid(fill_volume=(left(loss, now) - 1) * model.liquid_volume)
@@ -132,12 +131,32 @@ class _Remembering(Simulator):
 
     def _model(self, log_friction, bubble):
         from ...skin.model import SkinModel
-        from ...skin.rubber.material import material
 
         if bubble not in self._models:
             super()._model(0.0, bubble)
             plain = self._models[bubble]
-            rubber = dataclasses.replace(material(self.material), **self.inside.material)
-            options = dataclasses.replace(plain.options, **self.inside.contact)
-            self._models[bubble] = SkinModel(plain.geometry, rubber, options, **self.inside.model)
+            of = dict(self.inside.material)
+            for name in ("prony", "hysteresis", "stiffening"):  # beside what the material has of its own
+                if name in of:
+                    of[name] = getattr(plain.material, name) + of[name]
+            rubber = dataclasses.replace(plain.material, **of)
+            changes = dict(self.inside.contact)
+            if (
+                "contact_law" in changes and plain.options.contact_law
+            ):  # what the effects say nothing of stays
+                changes["contact_law"] = dataclasses.replace(
+                    plain.options.contact_law, **changes["contact_law"]
+                )
+            options = dataclasses.replace(plain.options, **changes)
+            modulus = self.inside.model.get("modulus")
+            factors = _product(read_settings(self.material, self.options).modulus, modulus, plain.geometry)
+            self._models[bubble] = SkinModel(plain.geometry, rubber, options, plain.device, modulus=factors)
         return super()._model(log_friction, bubble)
+
+
+def _product(given, other, geometry):
+    """Factors on Young's modulus, a skin's own (numbers, function or None) and those of effects (or None)."""
+    if given is None or other is None:
+        return other if given is None else given
+    at = geometry.vert[geometry.elem[:, :4]].mean(1)
+    return (given(at) if callable(given) else given) * other(at)

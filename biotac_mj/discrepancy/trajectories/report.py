@@ -9,6 +9,7 @@ import numpy as np
 
 from ...effects.effect import STAGES
 from ...files import replacing
+from ...skin.settings import read_dict
 from ..plain_values import plain_values
 from .in_skin import InSkinSimulator
 from .sensor_file import load_simulator
@@ -34,10 +35,12 @@ def diagnose_data(args) -> None:
             "in_skin` into it, or leave --in-skin out"
         )
     sim.device = args.device
-    if args.device != "cpu" and (sim.tier != "full" or args.in_skin):
-        raise ValueError(
-            f"--device {args.device} is for the full tier without --in-skin: add --tier full, or leave it out"
-        )
+    if args.device != "cpu" and sim.tier != "full":
+        raise ValueError(f"--device {args.device} is for the full tier: add --tier full, or leave it out")
+    if args.material:
+        sim.material = args.material
+    if args.options:
+        sim.options = read_dict(args.options, "options")
     sim.cache = str(out / "fields")  # solved fields stay: run again after an interruption
     report = diagnose(sim, data, locked=0.25 if args.locked is None else args.locked, progress=not args.quiet)
     files = write_report(report, sim, out)

@@ -54,7 +54,7 @@ def load_simulator(path, extra=()) -> Simulator:
                     f"{path}: effect {effect.id!r} acts at the stage {STAGES[effect.stage]!r}, not {stage!r}"
                 )
             effects.append((effect, theta))
-    keys = {k: document[k] for k in ("skin", "tier", "material", "sensor") if k in document}
+    keys = {k: document[k] for k in ("skin", "tier", "material", "sensor", "options") if k in document}
     kinds = {"reduced": Simulator, "in_skin": InSkinSimulator}
     kind = document.get("constitutive", "reduced")
     if kind not in kinds:

@@ -16,6 +16,7 @@ import tqdm
 
 from ...effects.effect import STAGES, Run
 from ...files import replacing
+from ...skin.settings import plain, read_material, read_settings
 from .nuisance import KNOWN, OTHER_MESH, widen
 
 __all__ = ["SCHEMA", "Fields", "Simulator", "placed"]
@@ -34,6 +35,8 @@ class Simulator:
     Attributes:
       skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
+      material: may also be a dict of Material's fields or a .json file.
+      options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
@@ -41,13 +44,14 @@ class Simulator:
 
     skin: str = "coarse"
     tier: str = "condensed"
-    material: str = "default"
+    material: str | dict = "default"
     sensor: str = "1"
     effects: list = dataclasses.field(default_factory=list)
     modulus: float = 1.0
     cache: str | None = None
     device: str = "cpu"
     intervals: dict = dataclasses.field(default_factory=dict)
+    options: dict = dataclasses.field(default_factory=dict)
     constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
 
     def with_effects(self, effects, modulus=None) -> "Simulator":
@@ -84,6 +88,7 @@ class Simulator:
                         round(log_friction, 9),
                         round(bubble * 1e12, 6),
                         "v2",
+                        *self._asked(t),
                     )
                 ).encode()
                 + np.round(pos, 9).tobytes()
@@ -96,26 +101,32 @@ class Simulator:
                 if progress:
                     progress()
             else:
-                todo.append((i, tool, pos, t.mat, path))
+                todo.append((i, tool, pos, t.mat, t.time, path))
         for part in range(0, len(todo), _WORLDS):
             self._walk(todo[part : part + _WORLDS], out, log_friction, bubble, progress)
         return out
 
+    def _asked(self, trajectory):
+        """What else decides a solution, for its key; skins without options keep the keys they had."""
+        timed = read_material(self.material).prony or self.options
+        return (repr(plain(self.options)), trajectory.time.tobytes()) if timed else ()
+
     def _walk(self, todo, out, log_friction, bubble, progress):
-        """Solves trajectories (index, tool, pos, mat, path of the cache), each one world, and files what they
-        gave."""
+        """Solves trajectories (index, tool, pos, mat, time, path of the cache), each one world, and files
+        what they gave."""
         from ...data.plan import Motion
         from ...data.simulate import simulate, simulate_condensed
 
         model, film = self._model(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate
-        longest = max(len(pos) for _, _, pos, _, _ in todo)
+        longest = max(len(pos) for _, _, pos, _, _, _ in todo)
         rows = [
-            np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _ in todo
+            np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo
         ]  # who has arrived waits there
-        motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _) in zip(rows, todo)]
-        fields = walk(model, [tool for _, tool, _, _, _ in todo], motions)
-        for w, (i, _, pos, _, path) in enumerate(todo):
+        motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
+        times = [_waiting(time, longest) for *_, time, _ in todo]
+        fields = walk(model, [tool for _, tool, *_ in todo], motions, time=times)
+        for w, (i, _, pos, _, _, path) in enumerate(todo):
             n = len(pos)
             impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
             out[i] = {
@@ -132,23 +143,25 @@ class Simulator:
     def _model(self, log_friction, bubble):
         from ...geometry.skins import load_skin
         from ...sensor.film import FilmConduction
-        from ...skin.model import SkinModel, SkinOptions
-        from ...skin.rubber.material import material
+        from ...skin.model import SkinModel
 
         store = self.__dict__.setdefault("_models", {})
         if bubble not in store:
             geometry = load_skin(self.skin)
-            options = SkinOptions(liquid=True)
+            rubber, options, modulus = read_settings(self.material, self.options, liquid=True)
             if bubble:
                 volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
                 # liquid and air in series: V / K + V0 / p0
                 options = dataclasses.replace(
                     options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume))
                 )
-            store[bubble] = SkinModel(
-                geometry, material(self.material), options, "cpu" if self.tier == "condensed" else self.device
-            )
-            store.setdefault("film", FilmConduction(geometry, sensor=self.sensor))
+            device = "cpu" if self.tier == "condensed" else self.device
+            model = store[bubble] = SkinModel(geometry, rubber, options, device, modulus=modulus)
+            if "film" not in store:
+                filled = options.fill_volume or options.rest_pressure
+                rest = model.rest.vert[: geometry.nvert] if filled else geometry.vert
+                film = FilmConduction(dataclasses.replace(geometry, vert=rest), sensor=self.sensor)
+                store["film"] = film
         model = store[bubble]
         if log_friction:
             model = copy.copy(model)
@@ -333,7 +346,8 @@ class Simulator:
             "schema": SCHEMA,
             "skin": self.skin,
             "tier": self.tier,
-            "material": self.material,
+            "material": plain(self.material),
+            **({"options": plain(self.options)} if self.options else {}),
             "sensor": self.sensor,
             "constitutive": self.constitutive,
             "modulus_factor": float(self.modulus),
@@ -419,3 +433,9 @@ def _sphere_radius(tool):
     if tool.startswith("geom:sphere:"):
         return float(tool.split(":")[2])
     return float(tool.removeprefix("sphere_").removesuffix("mm").replace("-", ".")) * 0.5e-3
+
+
+def _waiting(time, count):
+    """Times (count,) of a trajectory that waits at its end, as often as it came."""
+    more = time[-1] + (time[-1] - time[-2]) * np.arange(1, count - len(time) + 1)
+    return np.concatenate([time, more])

@@ -127,7 +127,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         q_out: wp.array2d(dtype=vec),
     ):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: density,
+        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: whether it counts,
         damping by mass, by stiffness."""
         i, w = wp.tid()
         if st.running[w] == 0:
@@ -140,7 +140,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             q += corner[slot[k], w]
         if inertia[0] > real(0.0):
             h = dt[w]
-            m = inertia[0] * node_volume[i] / (h * h)
+            m = st.density[w] * node_volume[i] / (h * h)
             q = scalar(real(1.0) + inertia[2] / h) * q + scalar((real(1.0) + inertia[1] * h) * m) * p[i, w]
         for k in range(outer_start[i], outer_start[i + 1]):
             s = outer_slot[k]

@@ -165,7 +165,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def add_inertia(
         # In:
-        density: real,
+        density: wp.array(dtype=real),
         damping: real,
         node_volume: wp.array(dtype=real),
         dt: wp.array(dtype=real),
@@ -182,7 +182,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         if on[w] == 0:
             return
         h = dt[w]
-        m = density * node_volume[i] / (h * h)
+        m = density[w] * node_volume[i] / (h * h)
         inertial = -m * (x[i, w] - target[i, w]) - damping * h * m * (x[i, w] - x_last[i, w])
         inertial_out[i, w] = lower(inertial)
         force[i, w] = force[i, w] + inertial

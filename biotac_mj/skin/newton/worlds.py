@@ -44,6 +44,7 @@ class Worlds:
 
     mu: wp.array(dtype=real)
     lam: wp.array(dtype=real)
+    density: wp.array(dtype=real)  # [kg/m^3], of implicit dynamics
     softness: wp.array(dtype=real)  # E of the model over E of the world
     kappa: wp.array(dtype=real)  # K / natural volume [Pa/m^3]
     natural: wp.array(dtype=real)  # volume of the liquid without pressure [m^3]

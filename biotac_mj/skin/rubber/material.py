@@ -29,7 +29,7 @@ class Material:
       hysteresis: ((g, strain), ...) of friction elements in parallel: spring of g times the shear modulus
         that slips at this von Mises strain, see `friction`.
       stiffening: c2 / c1 of a second term in the isochoric first invariant, see `stiffening`. These four:
-        CPU, full tier.
+        full tier.
 
     Raises:
       ValueError: unknown law, or a constant out of its range or not finite.

@@ -236,6 +236,16 @@ class RubberMemory:
         """Makes x [nvert, nworld] the relaxed and virgin state, of the worlds of mask (nworld,) bool."""
         self._launch(self._kernels.forget, [x, self._all if mask is None else mask])
 
+    def borne(self) -> np.ndarray:
+        """[point, world] largest energy densities so far [J/m^3]; empty where nothing is kept of them."""
+        return self.rubber.worst.numpy().copy()
+
+    def bear(self, borne: np.ndarray, x) -> None:
+        """Makes points that are at x after `forget` have borne as much, too."""
+        if borne.size:
+            self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))
+            self._launch(self._kernels.recall, [x])
+
     def at_present(self) -> Rubber:
         """The rubber between steps: what it remembers is a stress, and time stands still."""
         now, rubber = Rubber(), self.rubber

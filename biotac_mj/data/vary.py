@@ -1,0 +1,55 @@
+"""Skins that differ from interaction to interaction: what is drawn for each."""
+
+import dataclasses
+
+import numpy as np
+
+from ..skin.per_world import NAMES
+from ..skin.rubber.material import Material
+
+__all__ = ["check_vary", "draw_worlds"]
+
+_NUMBERS = ("youngs_modulus", "poissons_ratio", "friction", "stiffening")
+_FACTORS = ("prony", "hysteresis")
+_WORLDS = tuple(name for name in NAMES if name != "modulus")
+
+
+def check_vary(vary: dict) -> None:
+    """Refuses unknown names and intervals that are none (ValueError)."""
+    known = (*_NUMBERS, *_FACTORS, *_WORLDS)
+    for name, interval in vary.items():
+        if name not in known:
+            raise ValueError(f"cannot vary {name!r}: choose from {', '.join(known)}")
+        try:
+            low, high = (float(v) for v in interval)
+        except (TypeError, ValueError):
+            low, high = np.nan, np.nan
+        if not (np.isfinite([low, high]).all() and low <= high):
+            raise ValueError(f"{name} varies over {interval!r}: pass (low, high), finite numbers")
+
+
+def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | None, dict, list]:
+    """What the skins of some interactions are.
+
+    Args:
+      vary: {name: (low, high)}, see `GenerateOptions.vary`. material: of all, but for what varies.
+      seeds: of each interaction.
+
+    Returns:
+      materials of each (None where all have the same), {name: (k,)} for `make_worlds`, and [{name: value}].
+    """
+    drawn = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        drawn.append({name: float(rng.uniform(*vary[name])) for name in sorted(vary)})
+    worlds = {name: np.array([one[name] for one in drawn]) for name in vary if name in _WORLDS}
+    if not set(vary) - set(worlds):
+        return None, worlds, drawn
+    materials = []
+    for one in drawn:
+        changes = {name: one[name] for name in _NUMBERS if name in one}
+        for name in _FACTORS:
+            if name in one:
+                changes[name] = tuple((one[name] * g, other) for g, other in getattr(material, name))
+        materials.append(dataclasses.replace(material, **changes))
+    return materials, worlds, drawn

@@ -1,0 +1,69 @@
+"""Numbers in which worlds differ beyond their materials: law of contact, liquid, modulus of the elements."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from .contact.law import ContactLaw
+from .data import SkinData
+from .model import SkinModel, SkinOptions
+
+__all__ = ["NAMES", "make_room", "make_worlds"]
+
+_LAW = ("friction_exponent", "friction_pressure", "adhesion", "adhesion_hysteresis")
+_LIQUID = ("bulk_modulus", "fill_volume")
+NAMES = (*_LAW, *_LIQUID, "modulus")
+
+
+def make_room(
+    options: SkinOptions, modulus: np.ndarray | Callable | None, values: dict, nelem: int
+) -> tuple[SkinOptions, np.ndarray | Callable | None]:
+    """Options and modulus of a model whose worlds can differ in these values.
+
+    Args:
+      options: SkinOptions. modulus: of the model, or None.
+      values: names of NAMES. nelem: elements of the model's geometry.
+
+    Raises:
+      ValueError: unknown names.
+    """
+    unknown = set(values) - set(NAMES)
+    if unknown:
+        raise ValueError(
+            f"worlds cannot differ in {', '.join(map(repr, sorted(unknown)))}: choose from {', '.join(NAMES)}"
+        )
+    if options.contact_law is None and any(name in values for name in _LAW):
+        options = dataclasses.replace(options, contact_law=ContactLaw())
+    return options, np.ones(nelem) if modulus is None and "modulus" in values else modulus
+
+
+def make_worlds(model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None):
+    """SkinData of worlds that differ.
+
+    Args:
+      materials: one for each world, or None.
+      values: name of NAMES -> (nworld,) or a number; modulus: (nworld, nelem) factors for the elements of the
+        model's geometry, in place of the model's own.
+
+    Raises:
+      ValueError: wrong shapes, or values that cannot be.
+    """
+    values = values or {}
+    modulus = values.get("modulus")
+    if modulus is not None:
+        modulus = np.asarray(modulus, float)
+        n = model.nelem if modulus.ndim != 2 or model.nelem % modulus.shape[1] else modulus.shape[1]
+        if modulus.shape != (nworld, n):
+            raise ValueError(
+                f"modulus has shape {modulus.shape}: pass factors of shape ({nworld}, elements of the skin)"
+            )
+        modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node one follow each other
+    data = SkinData(model, nworld, materials, modulus)
+    law = {name: values[name] for name in _LAW if name in values}
+    if law:
+        data.laws.set(**law)
+    liquid = {name: values[name] for name in _LIQUID if name in values}
+    if liquid:
+        data.set_liquid(**liquid)
+    return data

@@ -1,0 +1,144 @@
+"""A skin's material, options and modulus as users and files give them: names, dicts, arrays, files."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from .contact.law import ContactLaw
+from .model import SkinOptions
+from .rubber.material import PRESETS, Material
+
+__all__ = ["Settings", "plain", "read_dict", "read_material", "read_modulus", "read_settings"]
+
+_KEYS = ("skin", "modulus")
+
+
+class Settings(NamedTuple):
+    """What a SkinModel is made with: Material, SkinOptions, factors on Young's modulus (or None)."""
+
+    material: Material
+    options: SkinOptions
+    modulus: np.ndarray | Callable | None
+
+
+def read_settings(material=None, options: dict | None = None, **defaults: object) -> Settings:
+    """Settings of a skin.
+
+    Args:
+      material: see `read_material`.
+      options: {"skin": {...} or SkinOptions, "modulus": see `read_modulus`}, a JSON text of it or a file.
+      defaults: of SkinOptions, where `options` has no word on it.
+
+    Raises:
+      ValueError: unknown keys, or values that cannot be. FileNotFoundError: no such file.
+    """
+    given = read_dict(options, "options")
+    unknown = set(given) - set(_KEYS)
+    if unknown:
+        raise ValueError(
+            f"options has {', '.join(map(repr, sorted(unknown)))}: pass some of {', '.join(_KEYS)}"
+        )
+    skin = given.get("skin") or {}
+    if not isinstance(skin, SkinOptions):
+        skin = SkinOptions(**{**defaults, **_known(skin, SkinOptions, "options['skin']")})
+    return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
+
+
+def read_material(choice) -> Material:
+    """A preset's name, a dict of Material's fields, JSON of one (a text, or a file, maybe one that `biotac
+    calibrate` wrote), a Material or None (the default), as a Material.
+
+    Raises:
+      ValueError: anything else. FileNotFoundError: no such file.
+    """
+    if choice is None or isinstance(choice, Material):
+        return choice or PRESETS["default"]
+    if isinstance(choice, str) and choice in PRESETS:
+        return PRESETS[choice]
+    if isinstance(choice, str) and not choice.endswith(".json") and not choice.lstrip().startswith("{"):
+        raise ValueError(
+            f"unknown material {choice!r}: choose one of {', '.join(PRESETS)}, a .json file or a dict of "
+            "Material's fields"
+        )
+    fields = read_dict(choice, "material")
+    return Material(**_known(fields.get("material", fields), Material, "material"))
+
+
+def read_modulus(choice) -> np.ndarray | Callable | None:
+    """Factors on Young's modulus: (nelem,) numbers, a .npy file of them, a function of positions, or None.
+
+    Raises:
+      ValueError: not numbers. FileNotFoundError: no such file.
+    """
+    if choice is None or callable(choice):
+        return choice
+    if isinstance(choice, (str, pathlib.Path)):
+        if not pathlib.Path(choice).is_file():
+            raise FileNotFoundError(f"no modulus at {choice}: write one factor per element with numpy.save")
+        choice = np.load(choice)
+    try:
+        return np.asarray(choice, float)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"modulus is {type(choice).__name__}: pass a factor for each element, or a .npy file of them"
+        ) from None
+
+
+def read_dict(choice, what: str) -> dict:
+    """A dict, a JSON text of one ("{...}") or a file of it, as a dict; None is empty.
+
+    Raises:
+      ValueError: not JSON, or not a dict. FileNotFoundError: no such file.
+    """
+    if choice is None:
+        return {}
+    if isinstance(choice, (str, pathlib.Path)):
+        text = str(choice)
+        if not text.lstrip().startswith("{"):
+            path = pathlib.Path(text)
+            if not path.is_file():
+                raise FileNotFoundError(f"no {what} at {text}: give a file of JSON, or the JSON itself")
+            text = path.read_text()
+        try:
+            choice = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{what} is no JSON ({error}): write {{...}} with names in quotes") from None
+    if not isinstance(choice, dict):
+        raise ValueError(f"{what} is {type(choice).__name__}: pass a dict, or JSON of one")
+    return dict(choice)
+
+
+def plain(value: object, geometry: SkinGeometry | None = None) -> object:
+    """Settings as what JSON holds: Materials, ContactLaws and SkinOptions become dicts, arrays lists, and a
+    function of positions its values at the centroids of the geometry's elements."""
+    if isinstance(value, SkinOptions):  # what it says, not what it leaves to others
+        given = ((f.name, getattr(value, f.name), f.default) for f in dataclasses.fields(value))
+        value = {name: one for name, one, default in given if one != default}
+    if isinstance(value, (Material, ContactLaw)):
+        value = dataclasses.asdict(value)
+    if isinstance(value, dict):
+        return {key: plain(one, geometry) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one, geometry) for one in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, pathlib.Path):
+        return str(value)
+    if callable(value) and geometry is not None:
+        return np.asarray(value(geometry.vert[geometry.elem[:, :4]].mean(1)), float).tolist()
+    return value
+
+
+def _known(fields, kind, what):
+    names = [f.name for f in dataclasses.fields(kind)]
+    unknown = set(fields) - set(names)
+    if unknown:
+        raise ValueError(
+            f"{what} has {', '.join(map(repr, sorted(unknown)))}: choose from {', '.join(names)}"
+        )
+    return fields
