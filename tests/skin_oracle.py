@@ -385,7 +385,7 @@ CASES = {
         "implicit dynamics with liquid, core and friction in two worlds",
         ball, Material(**RUBBER), sphere(3.5e-3, 0.4),
         np.stack([above(13.3, 12.9, 12.5, 12.7), above(13.3, 12.9, 12.6, 12.8, x=2)], 1), kept=(1, 3),
-        worlds=(Material(**RUBBER), Material("corotational", 1.3e6, 0.35, density=1200.0)), dt=1e-3,
+        worlds=(Material(**RUBBER), Material("corotational", 1.3e6, 0.35)), dt=1e-3,
         options=dict(dynamics="implicit", stiffness_damping=1e-4, liquid=True, bulk_modulus=1e6),
         core_pos=shaken(4, 2)[0], core_mat=shaken(4, 2)[1],
     ),

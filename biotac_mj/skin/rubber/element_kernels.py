@@ -28,7 +28,7 @@ from .law import (
     stress,
     stress_derivative,
 )
-from .points import Mesh, Rubber, deformation, point_functions
+from .points import Mesh, Rubber, deformation_of, point_functions
 
 __all__ = ["ElementForces"]
 
@@ -126,7 +126,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     thin_gradients = wp.types.matrix(shape=(corners, 3), dtype=scalar)
     beyond = [name for name in options if name != "modulus"]
     uneven = "modulus" in options
-    at = point_functions(options)
+    at, deformation = point_functions(options), deformation_of(corners)
     beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
 
     @wp.func
@@ -533,30 +533,30 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
         energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
 
+    @wp.kernel(module=f"{module}.read", enable_backward=False)
+    def flag_inside_out(
+        # In:
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        asked: wp.array(dtype=int),
+        # Out:
+        failed_out: wp.array(dtype=int),
+    ):
+        """Marks worlds with an integration point whose determinant is not positive."""
+        e, q, w = wp.tid()
+        if asked[w] == 1 and not (wp.determinant(deformation(mesh, e, q, x, w)) > real(0.0)):
+            failed_out[w] = 1
+
     found = {
         "force_serial": force_serial,
         "product_serial": product_serial,
         "cauchy": cauchy,
         "energy": energy,
+        "flag_inside_out": flag_inside_out,
     }
     if averaged and is_single:
         found |= {"force": force, "product": product}
     return types.SimpleNamespace(gradients=gradients, **found)
-
-
-@wp.kernel
-def flag_inside_out(
-    # In:
-    mesh: Mesh,
-    x: wp.array2d(dtype=vec3),
-    asked: wp.array(dtype=int),
-    # Out:
-    failed_out: wp.array(dtype=int),
-):
-    """Marks worlds with an integration point whose determinant is not positive."""
-    e, q, w = wp.tid()
-    if asked[w] == 1 and not (wp.determinant(deformation(mesh, e, q, x, w)) > real(0.0)):
-        failed_out[w] = 1
 
 
 class ElementForces:
@@ -607,7 +607,7 @@ class ElementForces:
     def refuse_inverted(self, program: Launcher, x, asked, failed) -> None:
         """Marks worlds with an inverted element at x."""
         dim = (self._count, self._elements.npoint, self._nworld)
-        program.launch(flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
+        program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
 
     def stress(self, x, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""

@@ -10,7 +10,7 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .friction import deviator, held, strain
 from .law import polar
-from .points import Mesh, Rubber, deformation, point_functions
+from .points import Mesh, Rubber, deformation_of, point_functions
 
 __all__ = ["RubberMemory", "rubber_of_worlds"]
 
@@ -70,8 +70,9 @@ def begin_points(rubber: Rubber, dt: wp.array(dtype=real)):
 
 
 @functools.cache
-def _kernels(options) -> types.SimpleNamespace:
-    module = f"{__name__}.{'_'.join(options)}"
+def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
+    module = f"{__name__}.{corners}_{'_'.join(options)}"
+    deformation = deformation_of(corners)
     at = point_functions(options)
     has = {name: name in options for name in ("prony", "mullins", "hysteresis")}
 
@@ -220,7 +221,7 @@ class RubberMemory:
             rubber.last, rubber.worst = wp.zeros(settles, dtype=mat33), wp.zeros(settles, dtype=real)
             rubber.slip = wp.zeros((rubber.branch.shape[0], *points), dtype=mat33)
             self._all = wp.full(nworld, True, dtype=bool)
-        self._kernels = _kernels(options)
+        self._kernels = _kernels(options, model.elements.corners)
 
     def begin_step(self, program, dt, softness):
         """Prepares a step; softness (nworld,) of the preconditioner becomes that of this step."""

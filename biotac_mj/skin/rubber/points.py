@@ -31,7 +31,7 @@ from .friction import deviator, held, push_forward, push_forward_change, strain,
 from .law import energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
-__all__ = ["Mesh", "Rubber", "deformation", "point_functions"]
+__all__ = ["Mesh", "Rubber", "deformation_of", "point_functions"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,14 +68,20 @@ class Rubber:
     slip: wp.array3d(dtype=mat33)  # of friction branches, then [branch, point, world]
 
 
-@wp.func
-def deformation(mesh: Mesh, e: int, q: int, x: wp.array2d(dtype=vec3), w: int):
-    """Deformation gradient of point q."""
-    F = mat33()
-    first = x[mesh.elem[0, e], w]
-    for a in range(1, mesh.elem.shape[0]):
-        F += wp.outer(x[mesh.elem[a, e], w] - first, mesh.shape[q, a])
-    return F * mesh.inverse[e, q]
+@functools.cache
+def deformation_of(corners: int) -> wp.Function:
+    """Function (mesh, element, point, x, world) -> deformation gradient, for elements of so many nodes: a loop of
+    known length is a third faster on CUDA."""
+
+    @wp.func
+    def deformation(mesh: Mesh, e: int, q: int, x: wp.array2d(dtype=vec3), w: int):
+        F = mat33()
+        first = x[mesh.elem[0, e], w]
+        for a in range(1, wp.static(corners)):
+            F += wp.outer(x[mesh.elem[a, e], w] - first, mesh.shape[q, a])
+        return F * mesh.inverse[e, q]
+
+    return deformation
 
 
 @wp.func
