@@ -495,7 +495,7 @@ CASES = {
                          enumerate([(0.5, 13.2), (0.5, 12.5), (0.6, 11.8), (0.9, 11.6), (0.9, 12.2)])]),
         kept=(0, 2, 3, 4),
         worlds=(Material("neo_hookean", 1e6, 0.4, stiffening=0.5, **MEMORY),
-                Material("neo_hookean", 7e5, 0.45, density=1200.0, stiffening=0.5, **MEMORY)),
+                Material("neo_hookean", 7e5, 0.45, stiffening=0.5, **MEMORY)),
         options=dict(element="quadratic", liquid=True, bulk_modulus=2e5, fill_volume=3e-8,
                      dynamics="implicit", mass_damping=100.0, stiffness_damping=1e-4,
                      contact_law=ContactLaw(1 / 3, 1e5, 0.2, 1.5, 3e-4)),

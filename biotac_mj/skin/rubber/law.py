@@ -14,7 +14,7 @@ The four laws take the same two Lame-like constants and differ in the energy W(F
 
 import warp as wp
 
-from ..types import mat33, narrow, real, vec3, widen
+from ..types import double, mat33, narrow, real, single, widen
 
 __all__ = [
     "LAWS",
@@ -80,6 +80,12 @@ def polar_single(F: wp.mat33):
 
 
 @wp.func
+def orthogonal(R: mat33):
+    """A matrix that is a rotation but for rounding in single precision, made orthogonal."""
+    return R * (real(1.5) * wp.identity(n=3, dtype=real) - real(0.5) * wp.transpose(R) * R)
+
+
+@wp.func
 def turn_left(S: mat33):
     """Newton's step of the rotation with the largest trace, at most 0.3, S = R^T F: what is left to turn, in
     the frame of R.
@@ -88,8 +94,7 @@ def turn_left(S: mat33):
     """
     s = narrow(S)
     H = wp.trace(s) * wp.identity(n=3, dtype=float) - 0.5 * (s + wp.transpose(s))
-    a = axial(S)
-    turn = wp.vec3(float(a[0]), float(a[1]), float(a[2]))
+    turn = single(axial(S))
     if H[0, 0] > 0.0 and H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0] and wp.determinant(H) > 0.0:
         turn = wp.inverse(H) * turn
     else:  # far away: as `turn_towards`
@@ -102,13 +107,18 @@ def polar(F: mat33):
     """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal,
     then turned by what is left (error squared)."""
     R = widen(polar_single(narrow(F)))
-    # where the determinant is small, `turn_towards` may have come near only
-    steps = wp.where(wp.determinant(F) < real(1.0e-3), 15, 1)
-    for _ in range(steps):
-        R = R * (real(1.5) * wp.identity(n=3, dtype=real) - real(0.5) * wp.transpose(R) * R)
-        turn = turn_left(wp.transpose(R) * F)
-        R = R + R * wp.skew(vec3(real(turn[0]), real(turn[1]), real(turn[2])))
-    return R
+    if wp.determinant(F) < real(1.0e-3):  # `turn_towards` may have come near only
+        for _ in range(15):
+            R = orthogonal(R)
+            turn = turn_left(wp.transpose(R) * F)
+            R = R + R * wp.skew(double(turn))
+        return R
+    R = orthogonal(R)
+    S = wp.transpose(R) * F
+    # what is left is 1e-7: single precision gives the rest of its digits
+    s = narrow(S)
+    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * single(axial(S))
+    return R + R * wp.skew(double(turn))
 
 
 @wp.func
