@@ -376,7 +376,7 @@ def test_what_cannot_be_is_refused():
     )
     model = bar(prony=SERIES)
     for dt in (None, 0.0, np.nan):
-        with pytest.raises(ValueError, match="relaxes in time: pass the time step"):
+        with pytest.raises(ValueError, match="relaxes in time, needs the time step: pass dt > 0"):
             step(model, SkinData(model), NOTHING, dt)
     with pytest.raises(ValueError, match="has 0 terms of prony and the model's 1: give it as many"):
         SkinData(model, material=[Material("linear", E, 0.0)])
