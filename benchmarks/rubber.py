@@ -27,27 +27,28 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from accuracy import write_json
 from condensed import run
 
-from biotac_mj.skin import PRESETS, SkinData, SkinModel, clearance
+from biotac_mj.skin import PRESETS, SkinModel
+from biotac_mj.skin.contact.limits import rest_gap
 
 __all__ = ["main", "press", "shape"]
 
 LOCATION, STEP = (-12e-3, 0.0), 10e-3  # [m, rad]; [s], at 10 mm/s
 
 
-def shape(model, data, vert_xpos) -> tuple[float, float]:
+def shape(model, vert_xpos) -> tuple[float, float]:
     """Least det F at the integration points of a skin at vert_xpos (nvert, 3), and how deep its inner faces
     are in the core [m]."""
-    data.x.numpy()[:, 0] = vert_xpos
-    model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.force)
-    face = model.core_surface.face
-    depth = wp.zeros((len(face), 1), dtype=wp.float64, device=model.device)
-    wp.launch(
-        clearance.deepest_corner,
-        dim=depth.shape,
-        inputs=[face, model.core(1).struct, data.x],
-        outputs=[depth],
-    )
-    return float(model.elasticity.smallest_jacobian(data.elastic)[0]), float(depth.numpy().max())
+    mesh = model.elements.mesh
+    at = vert_xpos[mesh.elem.numpy().T]
+    edges = np.einsum("eai,qak->eqik", at, mesh.shape.numpy())
+    jacobian = np.linalg.det(edges @ mesh.inverse.numpy())
+    face, core = model.core_surface.face_np, model.core(1).struct
+    corner = wp.array(face.reshape(-1, 1).repeat(3, 1), dtype=wp.vec3i)  # a "face" of one node
+    gap = wp.zeros(len(corner), dtype=wp.float64)
+    sample = wp.array([[1.0, 0.0, 0.0]], dtype=wp.vec3d)
+    x = wp.array(np.asarray(vert_xpos, float)[:, None], dtype=wp.vec3d, ndim=2)
+    wp.launch(rest_gap, (len(corner), 1), [corner, sample, core, x], [gap])
+    return float(jacobian.min()), float(-gap.numpy().min())
 
 
 @functools.cache
@@ -57,8 +58,7 @@ def press(
     """Force [N] and pressure [Pa] by step, what the steps cost, and the worst shape of the skin."""
     record, results, seconds = run("full", skin, indenter, LOCATION, material, depth, timestep)
     model = SkinModel(record.geometry, PRESETS[material])
-    data = SkinData(model)
-    jacobian, inside = zip(*(shape(model, data, r.vert_xpos) for r in results), strict=True)
+    jacobian, inside = zip(*(shape(model, r.vert_xpos) for r in results), strict=True)
     return {
         "skin": skin,
         "indenter": indenter,

@@ -268,8 +268,6 @@ def test_what_cannot_be_solved_is_refused():
     with pytest.raises(ValueError, match="is too short for a work of 0.05 J/m\\^2: .* take a range above"):
         SkinData(pad(contact_law=ContactLaw(adhesion=0.05, adhesion_range=1e-7)))
     model = pad(contact_law=ContactLaw(adhesion=0.05))
-    with pytest.raises(ValueError, match="contact law .* is solved on the CPU's full tier only"):
-        SkinData(model, preconditioner="dense")
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(ValueError, match="knows Coulomb's law alone: leave contact_law out"):

@@ -7,8 +7,8 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from biotac_mj.approach import nearest_point, surface_point
-from biotac_mj.press_record import write_readings, write_skin
+from biotac_mj.press.approach import nearest_point, surface_point
+from biotac_mj.press.record import write_readings, write_skin
 
 import biotac_mj
 from biotac_mj.coupling.condensed import CondensedStepper
@@ -179,7 +179,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
         assert abs(c.volume - model.rest.volume) < 5e-4 * model.rest.volume
 
 
-def test_stiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
+def teststiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
     model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=3e3))
     K = rest_tangent(model)
     rng, eps = np.random.default_rng(0), 1e-8
@@ -393,7 +393,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
         exact = fresh.vector(unit)
         (row,) = fresh.row([coordinate])
         assert np.abs(row - exact).max() < 6e-4 * np.abs(exact).max()
-        stiff = coarse._stiffness @ (exact / coarse.material.youngs_modulus)
+        stiff = coarse.stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
     assert not list(tmp_path.iterdir())
     at = np.arange(5)
