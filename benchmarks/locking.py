@@ -52,9 +52,7 @@ def discretise(geometry, element, material, project=None):
         return geometry, nodal_pressure(geometry, material)
     geometry = with_edge_nodes(geometry, project) if geometry.element == "linear" else geometry
     points = 1.0 if element == "gauss" else CONTRACTION
-    formulation = Tetrahedra(
-        geometry.vert, geometry.elem, LAWS[material.law], "cpu", contraction=points
-    )
+    formulation = Tetrahedra(geometry.vert, geometry.elem, LAWS[material.law], "cpu", contraction=points)
     return geometry, formulation.rest_stiffness(material.mu, material.lame)
 
 

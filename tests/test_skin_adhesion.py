@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from blocks import boundary, box, faces_on, half_space, place, skin
 from scipy.optimize import brentq
-from test_skin_contact import evaluate, pad, plane_at
+from test_skin_contact import pad, plane_at
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import (

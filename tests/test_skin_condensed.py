@@ -7,14 +7,14 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from biotac_mj.press.approach import nearest_point, surface_point
-from biotac_mj.press.record import write_readings, write_skin
 
 import biotac_mj
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
+from biotac_mj.press.approach import nearest_point, surface_point
+from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction

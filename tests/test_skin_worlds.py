@@ -171,10 +171,7 @@ def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, mo
     enough, _ = walk(model, worlds, "dense", DEPTHS)
     monkeypatch.setattr(SkinData, "contact_capacity", 3)
     tight, _ = walk(model, worlds, "dense", DEPTHS)
-    assert (
-        tight.preconditioner.full.numpy()[0] > 3
-        and enough.preconditioner.full.numpy()[0] == 0
-    )
+    assert tight.preconditioner.full.numpy()[0] > 3 and enough.preconditioner.full.numpy()[0] == 0
     np.testing.assert_allclose(tight.wrench, enough.wrench, rtol=0, atol=2e-3 * abs(enough.wrench).max())
 
 
@@ -355,7 +352,9 @@ def test_contact_by_samples_is_that_by_faces(law):
             for s in surfaces
             for a in (s.node_force, s.touching, s.trial_geom, s.bond, s.clearance)
         ])  # fmt: skip
-        found[-1].append(ready.multiply_tangent(np.random.default_rng(0).standard_normal(data.x.shape + (3,))))
+        found[-1].append(
+            ready.multiply_tangent(np.random.default_rng(0).standard_normal(data.x.shape + (3,)))
+        )
     assert found[0][1].any()
     for face, sample in zip(*found, strict=True):
         np.testing.assert_allclose(sample, face, rtol=0, atol=1e-12 * max(abs(face).max(), 1e-9))
