@@ -311,7 +311,8 @@ def time_peer(ours: dict) -> dict:
 
 
 def compare(other: pathlib.Path, cases: list[tuple], turns: int = TURNS) -> list[dict]:
-    """This checkout against another: a row for each case (skin, element, liquid, device, worlds, increments)."""
+    """This checkout against another: a row for each case, (skin, element, liquid, device, worlds,
+    increments)."""
     rows = []
     with contextlib.ExitStack() as stack:
         roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
