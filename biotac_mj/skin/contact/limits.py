@@ -41,8 +41,8 @@ def crushed_on_core(
     # Out:
     failed_out: wp.array(dtype=int),
 ):
-    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through,
-    see `solver._possible`."""
+    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way
+    through."""
     f, w = wp.tid()
     if asked[w] == 0:
         return
