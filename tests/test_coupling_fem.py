@@ -457,7 +457,7 @@ def sagging(model, acceleration):
     acceleration of the core."""
     force = -model.material.density * model.elements.node_volume[model.free, None] * acceleration
     out = np.zeros((model.nvert, 3))
-    out[model.free] = scipy.sparse.linalg.spsolve(model._stiffness, force.ravel()).reshape(-1, 3)
+    out[model.free] = scipy.sparse.linalg.spsolve(model.stiffness, force.ravel()).reshape(-1, 3)
     return out
 
 

@@ -49,7 +49,7 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         st.running[w] = 0
         st.alpha[w] = real(0.0)
         if first:
-            st.alpha[w] = real(1.0)
+            st.alpha[w] = wp.where(st.rz[w] < real(0.0), real(-1.0), real(1.0))
         return
     alpha = st.rz[w] / curvature
     st.alpha[w] = alpha
@@ -69,7 +69,7 @@ def choose_beta(part: wp.array3d(dtype=real), st: Worlds):
     rz = total_of(part, 0, w, t)
     if t > 0:
         return
-    if not (rz > real(0.01) * st.first[w]):
+    if not (rz > real(0.01) * wp.abs(st.first[w])):
         st.running[w] = 0
         return
     st.beta[w] = rz / st.rz[w]
