@@ -10,7 +10,8 @@ from imports import circles, imports, modules
 LAYERS = {
     "files": "biotac_mj",  # the version
     "geometry": "",
-    "skin": "geometry",
+    "skin": "geometry threads",
+    "features": "",
     "sensor": "geometry",
     "effects": "skin sensor geometry",
     "coupling": "skin sensor geometry learning.serve",
