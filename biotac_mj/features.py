@@ -143,7 +143,7 @@ FEATURES = (
     Feature("worlds differ in fill", "`data.set_liquid`, `worlds`, `vary`",
             worlds={"fill_volume": (0.0, 2e-8)}, cells=_of_worlds(calibrate=_FITS)),
     Feature("worlds differ in the liquid's modulus", "`data.set_liquid`, `worlds`, `vary`",
-            worlds={"bulk_modulus": (1e5, 4e6)}, cells=_of_worlds(calibrate=_FITS)),
+            worlds={"bulk_modulus": (1e4, 4e5)}, cells=_of_worlds(calibrate=_FITS)),
     Feature("worlds differ in their elements' modulus", "`SkinData(modulus=)`, `worlds`",
             worlds={"modulus": ()}, cells=_of_worlds(calibrate=_FITS, generate=Refused(
                 "cannot vary 'modulus'", "an interval says nothing of a map; vary youngs_modulus"))),

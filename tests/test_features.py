@@ -227,6 +227,8 @@ def by_generate(material, options, file, worlds=None):
             strength = read_settings(material).material.prony[0][0]
             value = (low[0][0] / strength, high[0][0] / strength) if name == "prony" else (low, high)
         vary[name] = list(value) or [0.5, 2.0]
+        if name == "bulk_modulus":  # two draws of an interval are not its ends
+            vary[name] = [0.0, 5e4]
     chosen = GenerateOptions(
         count=2, labelled=0, steps=len(TIP), rate=1 / DT, skin=file, material=material, options=options,
         vary=vary or None, tier="full",

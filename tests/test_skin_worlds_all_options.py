@@ -19,7 +19,7 @@ OPTIONS = SkinOptions(
     stiffness_damping=1e-4,
     liquid=True,
     contact_stiffness=5e10,
-    tolerance=5e-7,
+    tolerance=1e-6,
     max_newton=100,
     max_cg=200,
 )
@@ -37,7 +37,7 @@ def body():
     return skin(vert, elem, held, inner_face=inner, core=(7e-3 * ball.vertices, ball.faces.astype(np.int32)))
 
 
-def draw(n, seed=0):
+def draw(n, seed=1):
     """What n worlds are: materials, values for `make_worlds`, frictions, time steps, places and motions."""
     rng = np.random.default_rng(seed)
     materials = [
@@ -117,7 +117,7 @@ def alone(n, w, device):
     return walk(model, data, ways, np.array([w]), device)[:, 0]
 
 
-@pytest.mark.parametrize("n", [12, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [64])
 @pytest.mark.parametrize("device, bound", [("cpu", 1e-5), ("cuda:0", 1e-4)])
 def test_worlds_that_differ_in_everything_are_each_alone(n, device, bound):
     if device != "cpu" and not wp.is_cuda_available():

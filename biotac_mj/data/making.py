@@ -187,6 +187,7 @@ class Maker:
         if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
             rubber = dataclasses.replace(rubber, stiffening=sum(self.vary["stiffening"]) / 2)
         model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
+        self.geometry = model.geometry  # with all nodes that are solved
         if options.tier == "condensed":
             refuse(model.rubber_options, skin, model.has_liquid, model.device.is_cuda)
         self.attributes = {
@@ -217,7 +218,7 @@ class Maker:
 
         o = self.options
         filled = self.model.options.fill_volume or self.model.options.rest_pressure
-        rest = self.model.rest.vert[: self.geometry.nvert] if filled else None
+        rest = self.model.rest.vert if filled else None
         args = (self.geometry, o.sensor, self.measured and self.measured.meter(), rest)
         with readings.readings_pool(
             self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args
