@@ -227,8 +227,6 @@ def by_generate(material, options, file, worlds=None):
             strength = read_settings(material).material.prony[0][0]
             value = (low[0][0] / strength, high[0][0] / strength) if name == "prony" else (low, high)
         vary[name] = list(value) or [0.5, 2.0]
-        if name == "bulk_modulus":  # two draws of an interval are not its ends
-            vary[name] = [0.0, 5e4]
     chosen = GenerateOptions(
         count=2, labelled=0, steps=len(TIP), rate=1 / DT, skin=file, material=material, options=options,
         vary=vary or None, tier="full",
@@ -236,7 +234,7 @@ def by_generate(material, options, file, worlds=None):
     maker = Maker("", chosen, {})
     skins = None, {}
     if vary:
-        *skins, drawn = draw_worlds(vary, maker.model.material, [[0, i, 2] for i in range(2)])
+        *skins, drawn = draw_worlds(vary, maker.model.material, [[0, i, 2] for i in (2, 3)])
         assert drawn[0] != drawn[1]
     n = 2 if vary else 1
     motion = Motion("walk", {}, CENTRE, np.tile(np.eye(3), (len(TIP), 1, 1)))
@@ -342,3 +340,25 @@ def test_the_paths_agree(file):
     for path, bound in (("attach", 1e-5), ("calibrate", 1e-2)):  # a fit takes long ways in several steps
         got = WALKS[path](material, options, file)[:, 0]
         np.testing.assert_allclose(got, expected, atol=bound * abs(expected).max(), err_msg=path)
+
+
+def test_a_modulus_travels_as_numbers_a_file_or_a_function(file, tmp_path):
+    """`attach` keeps it in the model, so that the three are one."""
+    x = shell().vert[shell().elem].mean(1)
+
+    def factor(at):
+        return 1 - 30 * (at[:, 0] + 8e-3)
+
+    np.save(tmp_path / "factors.npy", factor(x))
+    material, options = {"friction": FRICTION}, {"skin": BASE_SKIN | {"element": "linear"}}
+    forms = factor(x), factor, str(tmp_path / "factors.npy")
+    forces = [by_attach(material, options | {"modulus": form}, file) for form in forms]
+    even = by_attach(material, options, file)
+    assert abs(forces[0] - even).max() > 0.01 * abs(even).max()
+    assert all((one == forces[0]).all() for one in forces)
+    with pytest.raises(FileNotFoundError, match="write one factor per element with numpy.save"):
+        read_settings(None, {"modulus": "nowhere.npy"})
+    with pytest.raises(ValueError, match="options has 'modlus': pass some of skin, modulus"):
+        read_settings(None, {"modlus": 1})
+    with pytest.raises(ValueError, match="options\\['skin'\\] has 'adhesion': choose from"):
+        read_settings(None, {"skin": {"adhesion": 1}})
