@@ -469,7 +469,7 @@ class SkinStep:
 
     def _resist_motion(self, on):
         """Inertia and damping."""
-        m, d, k, o, kernels = self.m, self.d, self.k, self.m.options, self._of_nodes
+        d, k, o, kernels = self.d, self.k, self.m.options, self._of_nodes
         mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
         positions = [k.target, d.x_last, d.x]
         self._launch(kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
