@@ -12,6 +12,7 @@ LAYERS = {
     "threads": "",
     "geometry": "",
     "skin": "geometry threads",
+    "features": "",
     "sensor": "geometry threads",
     "effects": "skin sensor geometry",
     "coupling": "skin sensor geometry learning.serve",

@@ -127,7 +127,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         q_out: wp.array2d(dtype=vec),
     ):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: whether it counts,
+        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
         damping by mass, by stiffness."""
         i, w = wp.tid()
         if st.running[w] == 0:
