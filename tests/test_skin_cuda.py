@@ -161,39 +161,6 @@ def test_the_step_must_be_ready_before_a_capture():
             launch_step(model, data, geoms)
 
 
-# --- what no body can have  ---
-
-
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element):
-    """The check that ends every step, with nodes put where a sound step never leaves them; the other world
-    passes."""
-    model = SkinModel(load_skin("coarse"), "rubber", SkinOptions(element=element), device="cuda:0")
-    sphere = GeomSet(["sphere"], [(0.0035,)], nworld=2, device="cuda:0")
-    sphere.set_pose([[0.1, 0, 0]])
-    inner = np.unique(model.geometry.inner_face)
-    inner = inner[~np.isin(inner, model.geometry.fixed)]
-    for spoil in ("inverted", "crushed"):
-        data = SkinData(model, 2)
-        ready = prepare_step(model, data, sphere)
-        x = data.x.numpy()
-        if spoil == "inverted":
-            corner = np.setdiff1d(model.geometry.elem[:, 0], model.geometry.fixed)[0]
-            x[corner, 1] += 20 * (x[:, 1].mean(0) - x[corner, 1])
-        else:
-            place = np.abs(x[inner, 1, 0] + 0.012).argmin()
-            x[inner[place], 1] += [
-                0,
-                2e-3,
-                0,
-            ]  # the pad looks along -y, the core lies above its inner surface
-        data.x.assign(x)
-        data.worlds.asked.fill_(1)
-        data.worlds.failed.zero_()
-        ready._refuse_impossible()
-        assert data.worlds.failed.numpy().tolist() == [0, 1]
-
-
 @pytest.mark.parametrize("nworld", [1, 3, 20])
 def test_a_press_done_twice_is_the_same_to_the_bit(nworld):
     model = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True), device="cuda:0")

@@ -11,6 +11,7 @@ from blocks import four_nodes
 from test_skin_step import finger
 
 from biotac_mj.geometry import load_skin
+from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.skin import (
     ContactLaw,
     GeomSet,
@@ -368,3 +369,44 @@ def test_one_dense_world_equals_a_sparse_one(model):
     scale = np.abs(alone.wrench).max()
     np.testing.assert_allclose(together.wrench, alone.wrench, rtol=0, atol=1e-3 * scale)
     np.testing.assert_allclose(together.vert_xpos, alone.vert_xpos, rtol=0, atol=5e-7)
+
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda:0", marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")),
+]
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("device", DEVICES)
+def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, device):
+    """The check that ends every step, with nodes put where a sound step never leaves them; the other worlds
+    pass, one of them with a node a fifth of a millimetre inside the core: pressed, not crushed."""
+    rubber = Material("neo_hookean", 2.8e5, 0.45)
+    law = {"inverted": rubber, "crushed": dataclasses.replace(rubber, law="linear")}  # no element is inverted
+    options, sphere = SkinOptions(element=element), GeomSet(["sphere"], [(0.0035,)], nworld=3, device=device)
+    sphere.set_pose([[0.1, 0, 0]])
+    model = SkinModel(load_skin("coarse"), rubber, options, device=device)
+    inner = np.setdiff1d(model.core_surface.face_np, model.geometry.fixed)
+    at = model.geometry.vert[inner]
+    # the pad looks along -y, the core lies above its inner surface
+    node = inner[(abs(at[:, 0] + 0.012) + abs(at[:, 2]) + 1e3 * (at[:, 1] > 0)).argmin()]
+    surface = CoreSurface(model.geometry.core_vert, model.geometry.core_face)
+    gap = float(surface.closest(model.geometry.vert[node][None])[0][0])
+    assert model.crushed_depth == pytest.approx(2.78e-4, rel=1e-2) and 1e-4 < gap < 2e-3
+    for spoil in ("inverted", "crushed"):
+        model = SkinModel(load_skin("coarse"), law[spoil], options, device=device)
+        data = SkinData(model, 3)
+        ready = prepare_step(model, data, sphere)
+        x = data.x.numpy().copy()
+        if spoil == "inverted":
+            corner = np.setdiff1d(model.geometry.elem[:, 0], model.geometry.fixed)[0]
+            x[corner, 1] += 20 * (x[:, 1].mean(0) - x[corner, 1])
+        else:
+            x[node, 1, 1] += gap + 4e-4
+            x[node, 2, 1] += gap + 2e-4
+        data.x.assign(x)
+        data.worlds.asked.fill_(1)
+        data.worlds.failed.zero_()
+        ready._once(ready._refuse_impossible)
+        assert data.worlds.failed.numpy().tolist() == [0, 1, 0], spoil

@@ -125,7 +125,7 @@ class SkinData:
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
-        self.worlds.density.fill_(model.material.density)  # `per_world.make_worlds` gives each its own
+        self.worlds.density.assign([float(m.density) for m in materials])
         self.laws = WorldLaws(model, nworld)
         self.worlds.pulls = self.laws.pulls
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
