@@ -9,8 +9,9 @@ from imports import circles, imports, modules
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
     "files": "biotac_mj",  # the version
+    "threads": "",
     "geometry": "",
-    "skin": "geometry",
+    "skin": "geometry threads",
     "sensor": "geometry",
     "effects": "skin sensor geometry",
     "coupling": "skin sensor geometry learning.serve",
