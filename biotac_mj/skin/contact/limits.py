@@ -42,7 +42,7 @@ def crushed_on_core(
     failed_out: wp.array(dtype=int),
 ):
     """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through,
-    see `solver._possible`."""
+    see `SkinStep._refuse_impossible`."""
     f, w = wp.tid()
     if asked[w] == 0:
         return

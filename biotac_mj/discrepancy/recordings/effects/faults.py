@@ -280,9 +280,8 @@ class Spikes(RecordedEffect):
         middle = median_filter(x, size=(7, 1), mode="nearest")
         off = np.abs(x - middle)
         before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
-        around = uniform_filter1d(
-            np.minimum(off, 200), 101, axis=0, mode="nearest"
-        )  # lively stretches leave the median by more
+        # lively stretches leave the median by more
+        around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
         return (off > np.maximum(np.maximum(10 * noise_level(x), 25), 10 * around)) & (
             np.abs(before - after) < 0.3 * off
         )
