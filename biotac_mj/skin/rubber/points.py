@@ -71,8 +71,8 @@ class Rubber:
 
 @functools.cache
 def deformation_of(corners: int) -> wp.Function:
-    """Function (mesh, element, point, x, world) -> deformation gradient, for elements of so many nodes: a loop
-    of known length is a third faster on CUDA."""
+    """Function (mesh, element, point, x, world) -> deformation gradient, for elements of so many nodes: a
+    loop of known length is a third faster on CUDA."""
 
     @wp.func
     def deformation(mesh: Mesh, e: int, q: int, x: wp.array2d(dtype=vec3), w: int):
