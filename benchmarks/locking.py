@@ -25,7 +25,6 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "tests"))  
 
 import numpy as np
 import scipy.sparse as sp
-import warp as wp
 from accuracy import write_json
 from blocks import boundary, box, faces_on, nodal_areas, shell, skin
 
@@ -36,7 +35,7 @@ from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, 
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.rubber.tetrahedra import Tetrahedra
+from biotac_mj.skin.rubber.tetrahedra import CONTRACTION, Tetrahedra
 
 __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 
@@ -47,19 +46,14 @@ PATCH_CENTER, PATCH_SIZE, PATCH_MOTION = -10e-3, 1e-3, 1e-4  # [m]
 def discretise(geometry, element, material, project=None):
     """The geometry with all its nodes, and its stiffness at rest (3 nvert, 3 nvert) [N/m]."""
     if element == "linear":
-        formulation = tetrahedra(geometry.vert, geometry.tets, material)
+        formulation = Tetrahedra(geometry.vert, geometry.tets, LAWS[material.law], "cpu")
         return geometry, formulation.rest_stiffness(material.mu, material.lame)
     if element == "nodal":
         return geometry, nodal_pressure(geometry, material)
     geometry = with_edge_nodes(geometry, project) if geometry.element == "linear" else geometry
-    points = {"contraction": 1.0} if element == "gauss" else {}
-    formulation = tetrahedra(geometry.vert, geometry.elem, material, **points)
+    points = 1.0 if element == "gauss" else CONTRACTION
+    formulation = Tetrahedra(geometry.vert, geometry.elem, LAWS[material.law], "cpu", contraction=points)
     return geometry, formulation.rest_stiffness(material.mu, material.lame)
-
-
-def tetrahedra(vert, elem, material, **options):
-    """The package's elements, on the CPU."""
-    return Tetrahedra(vert, elem, LAWS[material.law], wp.get_device("cpu"), **options)
 
 
 def refined(geometry):
@@ -81,7 +75,8 @@ def refined(geometry):
 def nodal_pressure(geometry, material):
     """Stiffness at rest of linear tetrahedra whose dilatation is averaged at the nodes (Bonet and Burton
     1998)."""
-    elem, formulation = geometry.tets, tetrahedra(geometry.vert, geometry.tets, material)
+    elem = geometry.tets
+    formulation = Tetrahedra(geometry.vert, elem, LAWS[material.law], "cpu")
     inverse, volume = formulation.mesh.inverse.numpy()[:, 0], formulation.mesh.volume.numpy()
     gradient = np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
     size, cells = 3 * geometry.nvert, np.arange(len(elem))

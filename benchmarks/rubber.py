@@ -38,14 +38,15 @@ def shape(model, vert_xpos) -> tuple[float, float]:
     """Least det F at the integration points of a skin at vert_xpos (nvert, 3), and how deep its inner faces
     are in the core [m]."""
     mesh = model.elements.mesh
-    gradient = np.einsum("aei,qak->eqik", vert_xpos[mesh.elem.numpy()], mesh.shape.numpy())
-    jacobian = np.linalg.det(gradient @ mesh.inverse.numpy())
-    corner = wp.array(vert_xpos[model.core_surface.face_np.ravel()][:, None], dtype=wp.vec3d)
-    one_corner = wp.array(np.eye(3)[:1], dtype=wp.vec3d)
-    # every corner as a face of its own, sampled there
-    face = wp.array(np.repeat(np.arange(len(corner))[:, None], 3, 1), dtype=wp.vec3i)
+    at = vert_xpos[mesh.elem.numpy().T]
+    edges = np.einsum("eai,qak->eqik", at, mesh.shape.numpy())
+    jacobian = np.linalg.det(edges @ mesh.inverse.numpy())
+    face, core = model.core_surface.face_np, model.core(1).struct
+    corner = wp.array(face.reshape(-1, 1).repeat(3, 1), dtype=wp.vec3i)  # a "face" of one node
     gap = wp.zeros(len(corner), dtype=wp.float64)
-    wp.launch(rest_gap, (len(corner), 1), [face, one_corner, model.core(1).struct, corner], [gap])
+    sample = wp.array([[1.0, 0.0, 0.0]], dtype=wp.vec3d)
+    x = wp.array(np.asarray(vert_xpos, float)[:, None], dtype=wp.vec3d, ndim=2)
+    wp.launch(rest_gap, (len(corner), 1), [corner, sample, core, x], [gap])
     return float(jacobian.min()), float(-gap.numpy().min())
 
 

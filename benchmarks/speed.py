@@ -1,24 +1,27 @@
 """Speed of the standard press, and MuJoCo's own flex on the same mesh and press beside it.
 
     python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine] [--no-peer]
-    python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine --worlds
-    1,16,128,1024,4096
+    python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine
+                               --worlds 1,16,128,1024,4096
+    python benchmarks/speed.py --against DIR --json out/against.json [--device cuda:0 --worlds 1,128]
 
 The standard press: a sphere of 7 mm diameter on the pad's midline at x = -12 mm, along the inward normal of
-  the outer surface
-there, the paper's constants, 60 increments of 0.04 mm from first touch to 2.4 mm, where the skin meets the
-core; with liquid and without. A CPU run is held to one core. Kernels are compiled and the factor is made
-before the clock starts (`setup_s` is the model and its factor); what is timed is the first press of a fresh
-skin, with every cost that a user's press has. `cpu_ms_per_press`
-is the processor time of the same press: where it is well below the wall time, other programs shared the core.
+the outer surface there, the paper's constants, 60 increments of 0.04 mm from first touch to 2.4 mm, where the
+skin meets the core; with liquid and without. A CPU run is held to one core. Kernels are compiled and the
+factor is made before the clock starts (`setup_s` is the model and its factor); what is timed is the first
+press of a fresh skin, with every cost that a user's press has. `cpu_ms_per_press` is the processor time of
+the same press: where it is well below the wall time, other programs shared the core.
 
 force_error_rel: mean over increments of |F - F_tight| over the largest |F_tight|, F_tight from the same press
-  solved on the CPU in double
-precision to a tolerance of 1e-6: what stopping early and, on a GPU, single precision cost, not what the mesh
-costs.
+solved on the CPU in double precision to a tolerance of 1e-6: what stopping early and, on a GPU, single
+precision cost, not what the mesh costs.
 mb_per_world: device memory that a world of the batch takes; what the model takes once is `mb_model`. A row
-  that does not fit says so.
+that does not fit says so.
 For the condensed tier F_tight is the full tier's press of the row above (docs/condensed.md says more).
+
+--against DIR: only the press, in turns with that of another checkout, each in a process of its own: the
+least of the times of 5 presses each, and the ratio of this one's to that one's; processor time on the CPU,
+wall time on CUDA.
 """
 
 import os
@@ -28,8 +31,10 @@ os.environ.update(
 )  # before numpy reads them
 
 import argparse
+import contextlib
 import functools
 import itertools
+import json
 import pathlib
 import platform
 import sys
@@ -40,22 +45,21 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-import peer_flex
-import peer_newton
 from accuracy import write_json
+from checkouts import importable, run_with
+from timed_press import RADIUS, clocks, press
 
 from biotac_mj.geometry import SKINS, SkinGeometry, load_skin
 from biotac_mj.press.approach import nearest_point, surface_point
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.condensed import CondensedSkin, Memory
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions
 
-__all__ = ["main", "press", "standard_path", "time_skin"]
+__all__ = ["compare", "main", "press", "standard_path", "time_skin"]
 
-RADIUS = 3.5e-3  # [m]
 PLACE = -12e-3  # x of the press [m]
 INCREMENT = 4e-5  # [m]
 INCREMENTS = 60
 TIGHT = 1e-6  # tolerance of the press that force errors are measured against
+TURNS = 5  # presses of each checkout that are compared
 PEER_TRAVEL = 1e-3  # [m]; deeper the skin meets the core, which the flex does not have
 NEWTON_ITERATIONS = (1000, 100, 30, 10)  # the first stands for its converged press
 COLUMNS = (
@@ -89,32 +93,6 @@ def standard_path(geometry: SkinGeometry, increments: int = INCREMENTS) -> tuple
         if gap < 1e-9:
             break
     return center - np.outer(np.arange(increments + 1) * INCREMENT, normal), -normal
-
-
-def _clocks() -> np.ndarray:
-    return np.array([time.perf_counter(), time.process_time()])
-
-
-def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarray, np.ndarray, int]:
-    """One press in all worlds.
-
-    Returns:
-      forces (increments, worlds, 3) [N], wall and processor seconds (increments, 2), number of steps that did
-      not converge.
-    """
-    data = SkinData(model, worlds)
-    geoms = GeomSet(
-        ["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device)
-    )
-    geoms.set_pose(path[:1])
-    force, seconds = [], []
-    for center in path[1:]:
-        begin = _clocks()
-        geoms.set_pose(center[None])
-        step(model, data, geoms)
-        force.append(data.wrench[:, 0, :3].copy())  # on the host: nothing is left running
-        seconds.append(_clocks() - begin)
-    return np.array(force), np.array(seconds), int(data.nonconverged.sum())
 
 
 @functools.cache
@@ -177,14 +155,14 @@ def _per_world(model, worlds) -> float:
     """Device memory [bytes] of a world in a batch."""
     if not model.device.is_cuda:
         return 0.0
-    from biotac_mj.skin.device_step import prepare_device
+    from biotac_mj.skin import prepare_step
 
     before = _used(str(model.device))
     data = SkinData(model, worlds)
     geoms = GeomSet(
         ["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device)
     )
-    prepare_device(model, data, geoms)
+    prepare_step(model, data, geoms)
     return (_used(str(model.device)) - before) / worlds
 
 
@@ -246,6 +224,8 @@ def time_skin(
 def time_condensed(ours: dict) -> dict:
     """The condensed tier on the press of one of our rows; its row, with errors against the forces of that
     row."""
+    from biotac_mj.skin.condensed import CondensedSkin, Memory
+
     geometry = load_skin(ours["skin"])
     path, _ = standard_path(geometry, ours["increments"])
     model = SkinModel(geometry, PRESETS["paper"], SkinOptions(element=ours["element"], liquid=ours["liquid"]))
@@ -254,9 +234,9 @@ def time_condensed(ours: dict) -> dict:
     def walk(skin):
         memory, force, seconds, lost = Memory.rest(1), [], [], 0
         for center in path[1:]:
-            begin = _clocks()
+            begin = clocks()
             out = skin.solve(memory, center[None], mat)
-            seconds.append(_clocks() - begin)
+            seconds.append(clocks() - begin)
             memory, lost = out.memory, lost + (not out.converged)
             force.append(out.wrench[0, :3])
         return np.array(force), np.array(seconds), lost
@@ -304,6 +284,8 @@ def time_peer(ours: dict) -> dict:
     geometry = load_skin(ours["skin"])
     increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
     path, direction = standard_path(geometry, increments)
+    import peer_flex
+
     result = peer_flex.press(geometry, PRESETS["paper"], RADIUS, path, direction)
     wanted = np.array(ours["force"][increments - 1])
     return {
@@ -326,6 +308,37 @@ def time_peer(ours: dict) -> dict:
         "force_N": np.linalg.norm(result["force"]),
         "force_ours_N": float(np.linalg.norm(wanted)),
     }
+
+
+def compare(other: pathlib.Path, cases: list[tuple], turns: int = TURNS) -> list[dict]:
+    """This checkout against another: a row for each case, (skin, element, liquid, device, worlds,
+    increments)."""
+    rows = []
+    with contextlib.ExitStack() as stack:
+        roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
+        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+        for case in cases:
+            skin, increments = case[0], case[-1]
+            path = standard_path(load_skin(skin), increments)[0].tolist()
+            worker = [pathlib.Path(__file__).parent / "timed_press.py", json.dumps([*case[:-1], path])]
+            seconds = {name: [] for name in folders}
+            for _ in range(turns):
+                for name, folder in folders.items():
+                    seconds[name].append(json.loads(run_with(folder, worker, 1).splitlines()[-1]))
+            least = {name: min(found) for name, found in seconds.items()}
+            row = dict(
+                zip(("skin", "element", "liquid", "device", "worlds", "increments"), case, strict=True)
+            )
+            row |= {"clock": "processor" if row["device"] == "cpu" else "wall"}
+            row |= {f"{name}_s": found for name, found in least.items()} | {"seconds": seconds}
+            rows.append(row | {"ratio": least["here"] / least["against"]})
+            print(
+                f"{row['skin']:<9}{row['element']:<10}{'liquid' if row['liquid'] else 'dry':<7}"
+                f"{row['worlds']:>6} worlds  here {1e3 * least['here']:.1f} ms  against "
+                f"{1e3 * least['against']:.1f} ms  ratio {rows[-1]['ratio']:.3f}",
+                flush=True,
+            )
+    return rows
 
 
 def _cpu_name() -> str:
@@ -375,12 +388,23 @@ def main(arguments=None) -> int:
         action="store_true",
         help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out",
     )
+    parser.add_argument("--against", type=pathlib.Path, help="the root of another checkout: see above")
     options = parser.parse_args(arguments)
     skins = options.skins.split(",")
     if unknown := [skin for skin in skins if skin not in SKINS]:
         parser.error(f"unknown skin {', '.join(unknown)}: choose from {', '.join(SKINS)}")
     if options.increments < 1:
         parser.error("--increments must be at least 1")
+    if options.against:
+        cases = [
+            (skin, element, liquid, options.device, int(worlds), options.increments)
+            for skin in skins
+            for element in options.elements.split(",")
+            for worlds in options.worlds.split(",")
+            for liquid in (False, True)
+        ]
+        write_json(options.json, {"rows": compare(options.against, cases)})
+        return 0
     wp.config.log_level = wp.LOG_WARNING
     machine = _cpu_name()
     if options.device == "cpu" and hasattr(os, "sched_setaffinity"):
@@ -443,6 +467,8 @@ def main(arguments=None) -> int:
             for row in rows
             if (row["element"], row["liquid"], row["worlds"]) == ("linear", False, 1) and "force" in row
         ]
+        import peer_newton
+
         if peer_newton.VERSION is None:
             print("Newton is not installed: its peer is left out")
             mine = []

@@ -15,13 +15,9 @@ count as processor time."""
 import argparse
 import contextlib
 import json
-import os
 import pathlib
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
@@ -29,7 +25,6 @@ __all__ = ["main", "measure"]
 
 HERE = pathlib.Path(__file__).resolve().parents[1]
 STAGES = ("import", "attach", "step")
-APART = ("plugin", "mjcf", "assets")  # packages that lie beside biotac_mj in a checkout
 RADIUS, PLACE = 3.5e-3, (-12e-3, -11.5e-3, 0.0)  # of the ball, 0.2 mm in the pad [m]
 
 
@@ -63,42 +58,16 @@ def start(tier: str, skin: str, fill: float) -> dict[str, tuple[float, float]]:
     return dict(zip(STAGES, laps, strict=True))
 
 
-@contextlib.contextmanager
-def importable(root: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A folder for PYTHONPATH: the root itself, or of a plain checkout one of symbolic links.
-
-    Raises:
-      FileNotFoundError: there is no biotac_mj.
-    """
-    package = root.resolve() / "biotac_mj"
-    if not (package / "__init__.py").is_file():
-        raise FileNotFoundError(f"{root} has no biotac_mj/__init__.py: give the root of a checkout")
-    if all((package / name).exists() for name in APART):
-        yield package.parent
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        links = pathlib.Path(folder) / "biotac_mj"
-        links.mkdir()
-        for path in (*package.iterdir(), *(package.parent / name for name in APART)):
-            if path.exists() and not (links / path.name).exists():
-                (links / path.name).symlink_to(path)
-        yield pathlib.Path(folder)
-
-
 def measure(folder: pathlib.Path, case: tuple, threads: int | None) -> dict[str, list[float]]:
     """Stage -> processor and wall seconds, of a new process that imports from the folder.
 
     Raises:
       RuntimeError: the process failed.
     """
-    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    env = {name: value for name, value in os.environ.items() if name not in limits}
-    env |= {"PYTHONPATH": str(folder)} | (dict.fromkeys(limits, str(threads)) if threads else {})
-    command = [sys.executable, __file__, "--child", *map(str, case)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"start of {case} from {folder} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+    from checkouts import run_with
+
+    text = run_with(folder, [__file__, "--child", *map(str, case)], threads)
+    return json.loads(text.splitlines()[-1])
 
 
 def _least(runs):
@@ -120,6 +89,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--against", type=pathlib.Path)
     args = parser.parse_args(arguments)
     from accuracy import write_json
+    from checkouts import importable
 
     rows = []
     cases = [

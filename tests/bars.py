@@ -13,12 +13,12 @@ LENGTH, AREA = 20e-3, 25e-6
 NOW = 1e-9  # [s] of a step that is a jump
 
 
-def bar(law="linear", element="linear", nu=0.0, held=True, modulus=None, **material):
+def bar(law="linear", element="linear", nu=0.0, held=True, modulus=None, young=E, **material):
     """20 mm long, 5 mm x 5 mm, held at x = 0 and, if asked, at the other end, which tests then move."""
     vert, elem = box([np.linspace(0, LENGTH, 5), np.linspace(0, 5e-3, 2), np.linspace(0, 5e-3, 2)])
     fixed = np.flatnonzero((vert[:, 0] == 0) | (held & (vert[:, 0] == LENGTH)))
     options = SkinOptions(element=element, tolerance=1e-7, max_newton=60, max_cg=300)
-    return SkinModel(skin(vert, elem, fixed), Material(law, E, nu, **material), options, modulus=modulus)
+    return SkinModel(skin(vert, elem, fixed), Material(law, young, nu, **material), options, modulus=modulus)
 
 
 def pull(model, data, stretch, dt):

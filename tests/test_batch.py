@@ -378,6 +378,102 @@ def test_finger_and_ball_exchange_momentum_and_lose_none():
     np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=2e-3 * np.abs(before[:, 3:]).max())
 
 
+INERTIA = {"dynamics": "implicit", "mass_damping": 50.0, "contact_stiffness": K, "tolerance": 1e-5}
+
+
+def shaken_spec():
+    """A finger on a rail and a hinge that is pushed about, and a ball on its pad."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = DT
+    spec.option.gravity = [0, 0, 0]
+    finger = spec.worldbody.add_body(name="finger")
+    finger.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
+    finger.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+    finger.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.02, contype=0, conaffinity=0
+    )
+    ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.0107, 0.001])
+    ball.add_freejoint()
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.01)
+    return spec
+
+
+@pytest.mark.parametrize("coupling, steps", [("one-way", 12), ("two-way", 9)])
+def test_inertia_of_the_skin_is_that_of_the_engine_plugin(coupling, steps):
+    """Two worlds, pushed with other forces; two-way until they touch, where a batch solves its skins once.
+    The second is reset at last, to begin at rest again."""
+    push, heavy = np.array([[-0.06, 1e-5], [-0.05, -5e-6]]), {"density": 1e5}  # so that inertia shows
+    settings = {
+        "skin": shell(),
+        "options": {"skin": INERTIA},
+        "material": heavy,
+        "coupling": coupling,
+        "geoms": ["ball"],
+    }
+    spec = shaken_spec()
+    batches.add(spec, body="finger", skin=shell(), coupling=coupling, geoms=["ball"])
+    spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+    batch = batches.attach(mjm, m, d, readings=False, **settings)
+    force = np.zeros((2, mjm.nv))
+    force[:, :2] = push
+    d.qfrc_applied.assign(force)
+    rest, got, moved = batch.vert_xpos, [], []
+    for _ in range(steps):
+        mjw.step(m, d)
+        got.append(read(mjm, d, "contact_force")[:, :3].copy()), moved.append(batch.vert_xpos - rest)
+    for w in range(2):
+        spec = shaken_spec()
+        handle = biotac_mj.attach(spec, body="finger", **settings)
+        spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qfrc_applied[:2] = push[w]
+        one, there = [], []
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+            one.append(handle.read(data, "contact_force")[:3]), there.append(handle.vert_xpos(model, data))
+        there = np.array(there) - shell().vert
+        assert np.abs(there).max() > 2e-4 and (np.abs(one).max() > 0.02) == (coupling == "one-way")
+        np.testing.assert_allclose(np.array(moved)[:, w], there, atol=1e-4 * np.abs(there).max())
+        np.testing.assert_allclose(np.array(got)[:, w], one, atol=2e-3)
+    batch.reset(np.array([False, True]))
+    assert (batch.vert_xpos[1] == rest[1]).all() and batch.skin.fresh.numpy().tolist() == [0, 1]
+
+
+def test_memory_laws_and_liquids_of_worlds_are_those_of_single_ones():
+    """Relaxation, friction in the rubber, adhesion, law of friction, fill and a modulus by element: two
+    worlds, the second of which is reset and pressed again as if nothing had been."""
+    rng = np.random.default_rng(5)
+    rubber = [{"prony": [[g, 0.01]], "hysteresis": [[0.4, y]]} for g, y in ((0.2, 0.003), (0.5, 0.006))]
+    modulus = rng.uniform(0.7, 1.4, (2, len(shell().elem)))
+    law = {"friction_exponent": [0.1, 0.4], "adhesion": [0.02, 0.05]}
+    skin = {"contact_stiffness": K, "tolerance": 1e-5, "contact_law": {"adhesion_range": 5e-5}}
+    worlds = {**law, "modulus": modulus, "fill_volume": [0.0, 1e-8]}
+    mjm, m, d, batch = make(
+        press_spec(), 2, material=rubber, options={"skin": skin}, worlds=worlds, readings=False
+    )
+    start, depth = places(2), [1.2e-3, 1.0e-3]
+    first = [read(mjm, d, "contact_force")[:, :3].copy() for _ in press(m, d, start, 6, depth)]
+    batch.reset(np.array([False, True]))
+    again = [read(mjm, d, "contact_force")[:, :3].copy() for _ in press(m, d, start, 6, depth)]
+    got = np.array([np.array(first)[:, 0], np.array(again)[:, 1]])
+    np.testing.assert_allclose(got[1], np.array(first)[:, 1], atol=1e-4 * abs(got).max())
+    assert abs(np.array(again)[:, 0] - got[0]).max() > 2e-3 * abs(got).max()  # it remembers
+    inwards = -start * [0, 1, 1] / np.linalg.norm(start[:, 1:], axis=1, keepdims=True)
+    paths = start + np.arange(1, 7)[:, None, None] / 6 * np.array(depth)[:, None] * inwards
+    mine = {"contact_law": {"adhesion_range": 5e-5} | {k: v[0] for k, v in law.items()}}
+    expected = single(
+        paths[:, 0],
+        shell(),
+        {"material": rubber[0], "options": {"skin": skin | mine, "modulus": modulus[0]}},
+    )[:, :3]
+    np.testing.assert_allclose(got[0], expected, atol=2e-3 * abs(expected).max())
+
+
 def test_a_ball_between_two_biotacs_feels_both():
     spec = ball_spec()
     spec.option.gravity = [0, 0, 0]
@@ -488,8 +584,10 @@ def test_errors_say_what_to_do():
         attach(mjm, 3, material=["default"] * 2)
     with pytest.raises(ValueError, match=r"friction has shape \(2,\)"):
         attach(mjm, 3, friction=[0.1, 0.2])
-    with pytest.raises(ValueError, match="quasi-static"):
-        attach(mjm, options={"skin": {"dynamics": "implicit"}})
+    with pytest.raises(ValueError, match="worlds cannot differ in 'adhesive': choose from"):
+        attach(mjm, 3, worlds={"adhesive": 0.1})
+    with pytest.raises(ValueError, match=r"modulus has shape \(2, 5\)"):
+        attach(mjm, 3, worlds={"modulus": np.ones((2, 5))})
     with pytest.raises(ValueError, match="larger njmax"):
         attach(mjm, njmax=12)
     for flags, text in (

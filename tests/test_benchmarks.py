@@ -226,6 +226,17 @@ def test_speed_writes_rows(repo, tmp_path):
     assert rows[1]["peak_force_N"] > rows[0]["peak_force_N"]  # the liquid carries load
 
 
+def test_speed_against_another_checkout(repo, accuracy, capsys):
+    import speed
+
+    (row,) = speed.compare(repo, [("coarse", "linear", True, "cpu", 1, 1)], turns=1)
+    assert row["clock"] == "processor" and row["here_s"] > 0
+    assert row["ratio"] == pytest.approx(row["here_s"] / row["against_s"]) and 0.1 < row["ratio"] < 10
+    assert "ratio" in capsys.readouterr().out
+    with pytest.raises(FileNotFoundError, match="has no biotac_mj/__init__.py: give the root of a checkout"):
+        speed.compare(repo / "docs", [])
+
+
 def test_standard_path_starts_at_first_touch(repo, accuracy):
     """No point of the skin, sampled in faces by another library, is inside the sphere at the start, and one
     is as soon as it moves."""

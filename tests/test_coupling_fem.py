@@ -453,9 +453,9 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
 def sagging(model, acceleration):
     """(nvert, 3) displacements of the linear skin, of scipy's own, under the inertia of a constant
     acceleration of the core."""
-    force = -model.material.density * model.elasticity.node_volume[model.free, None] * acceleration
+    force = -model.material.density * model.elements.node_volume[model.free, None] * acceleration
     out = np.zeros((model.nvert, 3))
-    out[model.free] = scipy.sparse.linalg.spsolve(model._stiffness, force.ravel()).reshape(-1, 3)
+    out[model.free] = scipy.sparse.linalg.spsolve(model.stiffness, force.ravel()).reshape(-1, 3)
     return out
 
 

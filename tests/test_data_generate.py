@@ -415,3 +415,37 @@ def test_the_command_reports_what_it_made(tmp_path, capsys):
     assert "1 interactions, 8 time steps, 0 of them not converged" in text and "1 shards made" in text
     assert cli.main([*arguments, "--count", "-3"]) == 2
     assert "count is -3" in capsys.readouterr().err
+
+
+def test_skins_that_vary_and_relax(tmp_path):
+    """Every interaction has a skin of its own, kept with it; rubber that relaxes takes the set's time."""
+    rubber = {"prony": [[0.3, 0.1]], "element": "linear"}
+    vary = {
+        "youngs_modulus": [1.0e6, 2.0e6],
+        "prony": [0.5, 2.0],
+        "adhesion": [0.0, 0.05],
+        "fill_volume": [0, 5e-9],
+    }
+    some = dataclasses.replace(
+        SMALL, count=2, labelled=0, objects=("sphere_7mm",), material=rubber, vary=vary
+    )
+    assert generate(tmp_path, some, workers=0, progress=False).interactions == 2
+    with TactileSet(tmp_path) as data:
+        skins = [data.parameters(i)["skin"] for i in range(2)]
+        assert data.attributes["material"]["prony"] == [[0.3, 0.1]]
+    assert all(set(one) == set(vary) for one in skins) and skins[0] != skins[1]
+    assert all(vary[k][0] <= v <= vary[k][1] for one in skins for k, v in one.items())
+
+
+def test_what_cannot_vary_is_refused():
+    with pytest.raises(ValueError, match="cannot vary 'modulus': choose from youngs_modulus"):
+        GenerateOptions(vary={"modulus": [1, 2]})
+    with pytest.raises(ValueError, match="friction varies over .*: pass \\(low, high\\)"):
+        GenerateOptions(vary={"friction": [2, 1]})
+    with pytest.raises(ValueError, match="leave vary out, or choose tier='full'"):
+        GenerateOptions(vary={"friction": [0, 1]}, tier="condensed")
+    options = GenerateOptions(skin="coarse", material={"prony": [[0.3, 0.1]]}, tier="condensed", labelled=0)
+    with pytest.raises(
+        ValueError, match="the condensed tier is elastic, the same everywhere: leave prony out"
+    ):
+        making.Maker("", options, {})

@@ -5,10 +5,9 @@ import copy
 
 import numpy as np
 import pytest
-import warp as wp
 from blocks import boundary, box, faces_on, half_space, place, skin
 from scipy.optimize import brentq
-from test_skin_contact import nodal, pad, plane_at
+from test_skin_contact import pad, plane_at
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import (
@@ -19,8 +18,6 @@ from biotac_mj.skin import (
     SkinModel,
     SkinOptions,
     bake_distance_grid,
-    contact,
-    lawful_contact,
     step,
 )
 
@@ -170,54 +167,6 @@ def test_at_a_given_depth_adhesion_takes_as_much_force_as_jkr_says():
     np.testing.assert_allclose(change, [jkr(d) for d in path[10:]] - hertz, atol=0.15)
 
 
-def evaluate(model, data, geoms, x):
-    """Nodal contact forces at positions x with what the last step left, and the kernel's tangent as a
-    product."""
-    xs, state = wp.array(x[:, None], dtype=wp.vec3d, ndim=2), data.outer
-    surface = state.surface
-    wp.launch(
-        lawful_contact.lawful_contact_force,
-        dim=state.touching.shape,
-        device="cpu",
-        inputs=[
-            surface.face,
-            surface.area,
-            model.sample,
-            model.contact_stiffness,
-            model.options.stick_ratio,
-            geoms.struct,
-            xs,
-            data.x_last,
-            state.anchor_geom,
-            state.anchor,
-            data.laws.struct,
-            data.laws.node_push,
-        ],
-        outputs=[
-            state.corner,
-            state.block,
-            state.touching,
-            state.trial_geom,
-            state.trial_anchor,
-            state.sample_force,
-            state.bond,
-        ],
-    )
-
-    def product(p):
-        ps = wp.array(p[:, None], dtype=wp.vec3d, ndim=2)
-        wp.launch(
-            contact.contact_product,
-            dim=state.touching.shape,
-            inputs=[surface.face, state.touching, state.block, ps],
-            outputs=[state.corner],
-            device="cpu",
-        )
-        return nodal(model, state)
-
-    return nodal(model, state), product
-
-
 def test_action_equals_reaction_while_it_sticks():
     vert, elem = box([np.linspace(0, 1e-2, 9), np.linspace(0, 1e-2, 9), np.linspace(0, 4e-3, 4)])
     top = faces_on(vert, boundary(elem), 2, 4e-3)
@@ -319,8 +268,6 @@ def test_what_cannot_be_solved_is_refused():
     with pytest.raises(ValueError, match="is too short for a work of 0.05 J/m\\^2: .* take a range above"):
         SkinData(pad(contact_law=ContactLaw(adhesion=0.05, adhesion_range=1e-7)))
     model = pad(contact_law=ContactLaw(adhesion=0.05))
-    with pytest.raises(ValueError, match="contact law .* is solved on the CPU's full tier only"):
-        SkinData(model, resident=True)
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(ValueError, match="knows Coulomb's law alone: leave contact_law out"):

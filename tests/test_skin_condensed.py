@@ -7,14 +7,15 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from biotac_mj.approach import nearest_point, surface_point
-from biotac_mj.press_record import write_readings, write_skin
+import warp as wp
 
 import biotac_mj
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
+from biotac_mj.press.approach import nearest_point, surface_point
+from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
@@ -25,6 +26,7 @@ from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact.faces import face_samples
+from biotac_mj.skin.program import Launcher
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -189,8 +191,10 @@ def test_stiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
     def force(x):
         data = SkinData(model)
         data.x.numpy()[:, 0] = x
-        model.elasticity.force(data.elastic, data.mu, data.lam, data.x, data.product)
-        out = data.product.numpy()[:, 0].copy()
+        elements = data.element_forces()
+        elements.push_corners(Launcher("cpu"), data.x, wp.ones(1, dtype=int), wp.zeros(1, dtype=int))
+        out = np.zeros_like(x)
+        np.add.at(out, model.elements.mesh.elem.numpy().T.ravel(), elements.corner_force.numpy()[:, 0])
         a, b, c = (x[model.geometry.inner_face[:, i]] for i in range(3))
         area = -np.cross(b - a, c - a) / 6  # a third of each face, towards the skin
         for i in range(3):
@@ -362,7 +366,7 @@ def test_replay_is_bit_equal(coarse):
         states = [state]
         for pos in path:
             before = states[-1].copy()
-            result = stepper.solve(states[-1], pos[None], EYE, 2e-3)
+            result = stepper.solve_skin(states[-1], pos[None], EYE, 2e-3)
             assert (states[-1] == before).all()
             assert (stepper.vert_xpos(result.state) == result.vert_xpos).all()
             states.append(result.state)
@@ -372,7 +376,7 @@ def test_replay_is_bit_equal(coarse):
     first = run(stepper)
     assert (run(stepper) == first).all()
     fresh = stepper_at()  # other caches, other memory
-    assert (fresh.solve(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
+    assert (fresh.solve_skin(first[4], path[4][None], EYE, 2e-3).state == first[5]).all()
 
 
 def pieces(model):
@@ -393,7 +397,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
         exact = fresh.vector(unit)
         (row,) = fresh.row([coordinate])
         assert np.abs(row - exact).max() < 6e-4 * np.abs(exact).max()
-        stiff = coarse._stiffness @ (exact / coarse.material.youngs_modulus)
+        stiff = coarse.stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
     assert not list(tmp_path.iterdir())
     at = np.arange(5)

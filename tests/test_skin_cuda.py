@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
-from biotac_mj.skin.device_step import prepare_device, step_device
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, launch_step, prepare_step, step
 
 CUDA = wp.is_cuda_available()
 pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
@@ -126,7 +125,7 @@ def test_inside_a_graph_of_the_caller_a_nan_world_disturbs_nobody():
     results = []
     for spoil in (False, True):
         data, geoms = make(model, worlds)
-        prepare_device(model, data, geoms)
+        prepare_step(model, data, geoms)
         path = [
             wp.array(np.swapaxes(centres(worlds, d), 0, 1), dtype=wp.vec3d, ndim=2, device="cuda:0")
             for d in DEPTHS
@@ -134,7 +133,7 @@ def test_inside_a_graph_of_the_caller_a_nan_world_disturbs_nobody():
         pose = wp.clone(path[0])
         with wp.ScopedCapture("cuda:0") as capture:
             wp.copy(geoms.struct.pos, pose)
-            step_device(model, data, geoms)
+            launch_step(model, data, geoms)
         for at in path:
             wp.copy(pose, at)
             if spoil:
@@ -156,10 +155,10 @@ def test_the_step_must_be_ready_before_a_capture():
     model.factor  # noqa: B018
     data, geoms = make(model, random_worlds(1, 0))
     with pytest.raises(
-        ValueError, match=r"call prepare_device\(model, data, geoms\) before the capture begins"
+        ValueError, match=r"call prepare_step\(model, data, geoms\) before the capture begins"
     ):
         with wp.ScopedCapture("cuda:0"):
-            step_device(model, data, geoms)
+            launch_step(model, data, geoms)
 
 
 # --- what no body can have  ---
@@ -176,7 +175,7 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element):
     inner = inner[~np.isin(inner, model.geometry.fixed)]
     for spoil in ("inverted", "crushed"):
         data = SkinData(model, 2)
-        ready = prepare_device(model, data, sphere)
+        ready = prepare_step(model, data, sphere)
         x = data.x.numpy()
         if spoil == "inverted":
             corner = np.setdiff1d(model.geometry.elem[:, 0], model.geometry.fixed)[0]

@@ -2,18 +2,20 @@
 work, speed, replay."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
-import warp as wp
-from bars import LENGTH, NOTHING, E, bar, cube, deform
+from bars import LENGTH, NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import nodal_areas
+from forces import Elements, begin, commit, gradients
 
 from biotac_mj.skin import Material, SkinData, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.types import SINGLE
 
 BRANCHES = ((0.6, 0.02), (0.3, 0.08))
+PATH = (1.05, 1.1, 1.07, 1.12)  # stretches of a bar
 
 
 def clipped(path, limit):
@@ -68,10 +70,7 @@ def test_a_pulled_bar_with_free_sides():
         assert data.converged[0]
         # the cube of elements at the free end: the held one may not narrow
         cells = (vert[model._elem][:, :, 0] > 0.74 * LENGTH).all(1)
-        edges = np.moveaxis(
-            data.vert_xpos[0][model._elem[cells][:, 1:]] - data.vert_xpos[0][model._elem[cells][:, :1]], 1, 2
-        )
-        strain = (edges @ model.elasticity._inverse_edges[cells])[:, 0, 0].mean() - 1
+        strain = gradients(model.elements, data.vert_xpos[0])[0][cells, 0, 0].mean() - 1
         assert strain == pytest.approx(expected, rel=0.01)
 
 
@@ -142,32 +141,35 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     """Among points that slip and points that hold; symmetric."""
     model = cube(law, element, hysteresis=((0.7, 0.05), (0.2, 1.0)))
     data, rng = SkinData(model), np.random.default_rng(4)
-    memory, rest = data.memory, model.geometry.vert
+    rest = model.geometry.vert
     data.x.numpy()[:, 0] = rest @ (np.eye(3) + 0.2 * rng.standard_normal((3, 3))).T
-    memory.begin(None)
-    memory.commit(data.x, np.array([True]))
-    data.x.numpy()[:, 0] = rest @ (
-        np.eye(3) + 0.03 * rng.standard_normal((3, 3))
-    ).T + 1e-4 * rng.standard_normal(rest.shape)
-    x, p = data.x.numpy().copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
+    begin(data)
+    commit(data)
+    x = rest @ (np.eye(3) + 0.03 * rng.standard_normal((3, 3))).T + 1e-4 * rng.standard_normal(rest.shape)
+    data.x.numpy()[:, 0] = x
+    p = 1e-4 * rng.standard_normal(rest.shape)
+    all_of_it, law_alone = Elements(data), Elements(SkinData(cube(law, element)))
 
     def force(shift):
-        out = wp.zeros_like(data.force)
-        memory.add_force(wp.array(x + shift * p, dtype=vec3, ndim=2), out)
-        return out.numpy()
+        return all_of_it.force(x + shift * p) - law_alone.force(x + shift * p)
+
+    def product(p):
+        return all_of_it.product(p) - law_alone.product(p)
 
     h = 1e-4
     expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
     force(0.0)
-    product, other = wp.zeros_like(data.force), wp.zeros_like(data.force)
-    memory.add_product(wp.array(p, dtype=vec3, ndim=2), product)
-    np.testing.assert_allclose(product.numpy(), expected, atol=1e-6 * abs(expected).max())
+    got = product(p)
+    np.testing.assert_allclose(got, expected, atol=1e-6 * abs(expected).max())
     q = rng.standard_normal(p.shape)
-    memory.add_product(wp.array(q, dtype=vec3, ndim=2), other)
-    assert np.vdot(q, product.numpy()) == pytest.approx(np.vdot(p, other.numpy()), rel=1e-9)
-    before = memory.friction.slip.copy()
-    memory.commit(data.x, np.array([True]))
-    slipped = abs(memory.friction.slip - before).max((-1, -2, -3)) > 0
+    assert np.vdot(q, got) == pytest.approx(np.vdot(p, product(q)), rel=1e-9)
+    single = Elements(data, SINGLE)
+    single.force(x)
+    whole = all_of_it.product(p)
+    np.testing.assert_allclose(single.product(p), whole, rtol=0, atol=1e-5 * abs(whole).max())
+    before = data.rubber.slip.numpy().copy()
+    commit(data)
+    slipped = abs(data.rubber.slip.numpy() - before).max((-1, -2, -3)) > 0
     assert slipped[0].any() and not slipped[1].any()
 
 
@@ -227,7 +229,7 @@ def test_slip_is_saved_replayed_and_forgotten():
     path = np.eye(3) + 0.1 * rng.standard_normal((4, 3, 3))
     once = [deform(model, data, F, None) for F in path[:3]]
     saved = data.memory.state()
-    assert len(saved) == data.memory.size(model.material, len(data.memory.worst)) == 13 * 4 * model.nelem
+    assert len(saved) == data.memory.size(model.material, data.memory.npoint) == 13 * 4 * model.nelem
     went_on = deform(model, data, path[3], None)
     again = SkinData(model)
     again.memory.load(saved, again.x)
@@ -239,17 +241,40 @@ def test_slip_is_saved_replayed_and_forgotten():
 def test_a_step_that_fails_slips_nowhere():
     model = bar("corotational", "linear", hysteresis=BRANCHES)
     data = SkinData(model, 2)
-    before = data.memory.friction.slip.copy()
+    before = data.rubber.slip.numpy().copy()
     data.x.numpy()[:, 1] = model.geometry.vert * [1.2, 1, 1]
-    data.memory.commit(data.x, np.array([True, False]))
-    np.testing.assert_array_equal(data.memory.friction.slip, before)
-    data.memory.commit(data.x, np.array([True, True]))
-    assert (
-        abs(data.memory.friction.slip[:, :, 0]).max()
-        < 1e-12
-        < 1e-3
-        < abs(data.memory.friction.slip[:, :, 1]).max()
-    )
+    commit(data, [True, False])
+    np.testing.assert_array_equal(data.rubber.slip.numpy(), before)
+    commit(data, [True, True])
+    slip = abs(data.rubber.slip.numpy())  # [branch, point, world]
+    assert slip[:, :, 0].max() < 1e-12 < 1e-3 < slip[:, :, 1].max()
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["neo_hookean", "linear"])
+def test_materials_of_worlds_differ(law, element):
+    """Each world has friction of its own, also none."""
+    values = (((0.0, 0.02), (0.0, 0.08)), BRANCHES, ((1.5, 0.05), (0.4, 0.01)))
+    model = bar(law, element, nu=0.4, hysteresis=BRANCHES)
+    materials = [dataclasses.replace(model.material, hysteresis=value) for value in values]
+    together, alone, own = batch(model, materials, lambda m, data: [pull_worlds(m, data, s) for s in PATH])
+    peak = abs(together).max()
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * peak)
+    np.testing.assert_allclose(together, own, rtol=0, atol=1e-6 * peak)  # of models: the solver's tolerance
+    assert abs(np.diff(together, axis=1)).max() > 0.05 * peak
+    plain = bar(law, element, nu=0.4)
+    data = SkinData(plain)
+    elastic = [pull(plain, data, s, None) for s in PATH]
+    np.testing.assert_allclose(together[:, 0], elastic, rtol=0, atol=1e-6 * peak)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_directions_in_single_precision(element):
+    """The same answer with those of CUDA."""
+    model = bar("neo_hookean", element, nu=0.4, hysteresis=BRANCHES)
+    data = [SkinData(model, preconditioner=p) for p in ("sparse", "dense")]
+    force = np.array([[pull(model, d, s, None) for s in PATH] for d in data])
+    np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
 
 
 def test_slip_is_in_the_plugins_state():
@@ -317,8 +342,10 @@ def test_what_cannot_be_is_refused():
         and Material(hysteresis=((0.1, 2.0),)).remembers
     )
     model = cube("corotational", "linear", hysteresis=BRANCHES)
-    with pytest.raises(ValueError, match="skin with hysteresis is solved on the CPU's full tier only"):
-        SkinData(model, resident=True)
+    other = [dataclasses.replace(model.material, hysteresis=BRANCHES[:1])]
+    for materials in (other, [model.material] + other):
+        with pytest.raises(ValueError, match="has 1 terms of hysteresis and the model's 2: give it as many"):
+            SkinData(model, len(materials), material=materials)
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(ValueError, match="leave hysteresis out"):

@@ -2,17 +2,18 @@
 homogeneous deformations."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
-import warp as wp
-from bars import AREA, LENGTH, NOTHING, NOW, E, bar, cube, deform, pull
+from bars import AREA, LENGTH, NOTHING, NOW, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import nodal_areas, place, shell, skin
+from forces import Elements, begin, commit
 from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.types import SINGLE
 
 G, TAU = 0.4, 0.7
 SERIES = ((G, TAU),)
@@ -114,32 +115,33 @@ def test_two_jumps_and_a_turn(law, element):
 def test_the_tangent_is_the_forces_derivative(law, element, beside):
     model = cube(law, element, prony=((G, TAU), (0.1, 3.0)), mullins=(1.6, 2e3, 0.1), **beside)
     data, rng = SkinData(model), np.random.default_rng(4)
-    memory, rest = data.memory, model.geometry.vert
+    rest = model.geometry.vert
     data.x.numpy()[:, 0] = rest @ (np.eye(3) + 0.25 * rng.standard_normal((3, 3))).T
-    memory.begin(0.3)
-    memory.commit(data.x, np.array([True]))  # a past, and a largest energy to be below of
-    data.x.numpy()[:, 0] = rest @ (
-        np.eye(3) + 0.1 * rng.standard_normal((3, 3))
-    ).T + 2e-4 * rng.standard_normal(rest.shape)
-    memory.begin(0.2)
-    x, p = data.x.numpy().copy(), 1e-4 * rng.standard_normal((model.nvert, 1, 3))
+    begin(data, 0.3)
+    commit(data)  # a past, and a largest energy to be below of
+    x = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
+    begin(data, 0.2)
+    p = 1e-4 * rng.standard_normal(rest.shape)
+    all_of_it, law_alone = Elements(data), Elements(SkinData(cube(law, element)))
 
     def force(shift):
-        out = wp.zeros_like(data.force)
-        memory.add_force(wp.array(x + shift * p, dtype=vec3, ndim=2), out)
-        return out.numpy()
+        return all_of_it.force(x + shift * p) - law_alone.force(x + shift * p)
+
+    def product(p):
+        return all_of_it.product(p) - law_alone.product(p)
 
     h = 1e-3
     expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
-    force(0.0)
-    product = wp.zeros_like(data.force)
-    memory.add_product(wp.array(p, dtype=vec3, ndim=2), product)
-    assert (memory.softening.numpy() < 0.999).any()
-    np.testing.assert_allclose(product.numpy(), expected, atol=2e-7 * abs(expected).max())
+    soft, got = force(0.0), product(p)
+    np.testing.assert_allclose(got, expected, atol=2e-7 * abs(expected).max())
     q = rng.standard_normal(p.shape)
-    other = wp.zeros_like(data.force)
-    memory.add_product(wp.array(q, dtype=vec3, ndim=2), other)
-    assert np.vdot(q, product.numpy()) == pytest.approx(np.vdot(p, other.numpy()), rel=1e-9)
+    assert np.vdot(q, got) == pytest.approx(np.vdot(p, product(q)), rel=1e-9)
+    single = Elements(data, SINGLE)
+    single.force(x)
+    whole = all_of_it.product(p)
+    np.testing.assert_allclose(single.product(p), whole, rtol=0, atol=1e-5 * abs(whole).max())
+    data.rubber.worst.zero_()
+    assert abs(force(0.0) - soft).max() > 1e-3 * abs(soft).max()  # it was softened
 
 
 @pytest.mark.parametrize("law", ["corotational", "neo_hookean", "svk"])
@@ -213,7 +215,7 @@ def test_memory_is_saved_replayed_and_forgotten():
     path = [(1.2, 0.1), (1.25, 0.3), (1.1, 0.2)]
     once = [pull(model, data, *p) for p in path]
     saved, x = data.memory.state(), data.vert_xpos[0]
-    assert len(saved) == data.memory.size(model.material, len(data.memory.worst))
+    assert len(saved) == data.memory.size(model.material, data.memory.npoint)
     went_on = pull(model, data, 1.15, 0.5)
     again = SkinData(model)
     for array in (again.x, again.x_last):
@@ -237,6 +239,46 @@ def test_worlds_remember_each_their_own():
         force = pull(model, alone, stretch, dt)
     reactions = -data.force.numpy()[end, :, 0].sum(0)
     assert abs(reactions[0]) < 1e-9 and reactions[1] == pytest.approx(force, rel=1e-9)
+
+
+PATH = ((1.05, 0.1), (1.1, 0.05), (1.1, 0.4), (1.07, 0.1))  # stretches of a bar, and when
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+@pytest.mark.parametrize("name", ["prony", "mullins"])
+def test_materials_of_worlds_differ(law, element, name):
+    """Each world relaxes and softens by its own numbers, also by none."""
+    values = {
+        "prony": (((0.0, 1.0), (0.0, 1.0)), ((G, TAU), (0.1, 3.0)), ((1.2, 0.05), (0.3, 20.0))),
+        "mullins": (None, (1.8, 5e2, 0.2), (1.2, 2e3, 0.0)),
+    }[name]
+    model = bar(law, element, nu=0.4, **{name: values[1]})
+    materials = [dataclasses.replace(model.material, **{name: value}) for value in values]
+    together, alone, own = batch(
+        model, materials, lambda m, data: [pull_worlds(m, data, *where) for where in PATH]
+    )
+    peak = abs(together).max()
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * peak)
+    np.testing.assert_allclose(together, own, rtol=0, atol=1e-6 * peak)  # of models: the solver's tolerance
+    assert abs(np.diff(together, axis=1)).max() > 0.02 * peak
+    plain = bar(law, element, nu=0.4)
+    data = SkinData(plain)
+    elastic = [pull(plain, data, *where) for where in PATH]
+    np.testing.assert_allclose(together[:, 0], elastic, rtol=0, atol=1e-6 * peak)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", LAWS)
+def test_directions_in_single_precision(law, element):
+    """The same answer with those of CUDA, with all that a material can have."""
+    more = {"prony": ((G, TAU), (0.2, 0.1)), "mullins": (2.0, 2e3, 0.1), "hysteresis": ((0.5, 0.03),)}
+    model = bar(law, element, nu=0.4, stiffening=0.5, **more)
+    data = [SkinData(model, preconditioner=p) for p in ("sparse", "dense")]
+    force = np.array([[pull(model, d, *where) for where in PATH] for d in data])
+    np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
+    states = [d.memory.state() for d in data]
+    assert abs(states[1] - states[0]).max() < 1e-3 * abs(states[0]).max()
 
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
@@ -334,12 +376,12 @@ def test_what_cannot_be_is_refused():
     )
     model = bar(prony=SERIES)
     for dt in (None, 0.0, np.nan):
-        with pytest.raises(ValueError, match="relaxes in time: pass the time step"):
+        with pytest.raises(ValueError, match="relaxes in time, needs the time step: pass dt > 0"):
             step(model, SkinData(model), NOTHING, dt)
-    with pytest.raises(ValueError, match="CPU's full tier only"):
-        SkinData(model, resident=True)
-    with pytest.raises(ValueError, match="give the worlds' materials the same"):
+    with pytest.raises(ValueError, match="has 0 terms of prony and the model's 1: give it as many"):
         SkinData(model, material=[Material("linear", E, 0.0)])
+    with pytest.raises(ValueError, match="a world's material has mullins and the model's has not"):
+        SkinData(model, material=[dataclasses.replace(model.material, mullins=(2.0, 1e3, 0.0))])
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(ValueError, match="condensed tier is elastic"):

@@ -1,17 +1,15 @@
 """Rubber that is not the same everywhere: a factor on Young's modulus for every element."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-import warp as wp
-from bars import AREA, LENGTH, NOTHING, E, bar, cube, deform, pull
+from bars import AREA, LENGTH, NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import box, skin
+from forces import Elements
 
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.types import vec3
+from biotac_mj.skin.types import SINGLE
 
 
 def halves(p):
@@ -77,25 +75,24 @@ def test_the_tangent_is_the_forces_derivative(law, element):
     x = rest @ (np.eye(3) + 0.1 * rng.standard_normal((3, 3))).T + 2e-4 * rng.standard_normal(rest.shape)
     p = 1e-4 * rng.standard_normal(rest.shape)
 
+    elements = Elements(data)
+
     def force(h):
-        model.elasticity.force(
-            data.elastic, data.mu, data.lam, wp.array((x + h * p)[:, None], dtype=vec3, ndim=2), data.force
-        )
-        return data.force.numpy()[:, 0].copy()
+        return elements.force(x + h * p)
 
     h = 1e-3
     expected = -(8 * (force(h) - force(-h)) - (force(2 * h) - force(-2 * h))) / (12 * h)
-    at, along = (wp.array(a[:, None], dtype=vec3, ndim=2) for a in (x, p))
     force(0.0)
-    model.elasticity.product(data.elastic, data.mu, data.lam, at, along, data.product)
-    np.testing.assert_allclose(data.product.numpy()[:, 0], expected, atol=2e-7 * abs(expected).max())
+    product = elements.product(p)
+    np.testing.assert_allclose(product, expected, atol=2e-7 * abs(expected).max())
+    single = Elements(data, SINGLE)
+    single.force(x)
+    np.testing.assert_allclose(single.product(p), product, rtol=0, atol=1e-5 * abs(product).max())
     # the factor that preconditions is that of the same rubber
-    force_at_rest = wp.array(rest[:, None], dtype=vec3, ndim=2)
-    model.elasticity.force(data.elastic, data.mu, data.lam, force_at_rest, data.force)
-    model.elasticity.product(data.elastic, data.mu, data.lam, force_at_rest, along, data.product)
-    K = model.elasticity.rest_stiffness(model.material.mu, model.material.lame)
+    elements.force(rest)
+    K = model.elements.rest_stiffness(model.material.mu, model.material.lame)
     np.testing.assert_allclose(
-        data.product.numpy()[:, 0], (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max()
+        elements.product(p), (K @ p.ravel()).reshape(-1, 3), atol=1e-9 * abs(K @ p.ravel()).max()
     )
 
 
@@ -130,9 +127,45 @@ def test_a_ball_feels_the_modulus_below_it():
         assert count <= few + 2
 
 
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+def test_worlds_have_each_their_own(law, element):
+    """Beside materials of their own, in all their numbers."""
+    more = [
+        dict(prony=((0.3, 0.5),), mullins=(2.0, 2e3, 0.2), hysteresis=((0.5, 0.03),), stiffening=0.6),
+        dict(prony=((0.9, 0.1),), mullins=(1.3, 5e2, 0.0), hysteresis=((0.1, 0.01),), stiffening=-0.3),
+        dict(prony=((0.0, 1.0),), mullins=None, hysteresis=((0.0, 1.0),), stiffening=0.0),
+    ]
+    model = bar(law, element, nu=0.4, modulus=lambda p: np.ones(len(p)), **more[0])
+    materials = [
+        Material(law, young, nu, **m) for young, nu, m in zip((E, 2 * E, 0.7 * E), (0.4, 0.3, 0.45), more)
+    ]
+    modulus = np.random.default_rng(4).uniform(0.8, 1.25, (3, model.nelem))
+    path = ((1.05, 0.1), (1.1, 0.05), (1.1, 0.4), (1.07, 0.1))
+    together, alone, own = batch(
+        model, materials, lambda m, data: [pull_worlds(m, data, *where) for where in path], modulus
+    )
+    peak = abs(together).max()
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * peak)
+    np.testing.assert_allclose(together, own, rtol=0, atol=1e-6 * peak)  # of models: the solver's tolerance
+    plain = bar(law, element, nu=0.45, young=0.7 * E, modulus=modulus[2])
+    data = SkinData(plain)
+    elastic = [pull(plain, data, *where) for where in path]
+    np.testing.assert_allclose(together[:, 2], elastic, rtol=0, atol=1e-6 * peak)
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+def test_directions_in_single_precision(law):
+    """The same answer with those of CUDA."""
+    model = bar(law, "quadratic", nu=0.4, modulus=halves)
+    data = [SkinData(model, preconditioner=p) for p in ("sparse", "dense")]
+    force = np.array([[pull(model, d, s, None) for s in (1.05, 1.1, 1.07)] for d in data])
+    np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
+
+
 def test_inertia_is_not_scaled():
     one, two = slab(), slab(modulus=lambda p: np.full(len(p), 2.0))
-    np.testing.assert_array_equal(one.elasticity.node_volume, two.elasticity.node_volume)
+    np.testing.assert_array_equal(one.elements.node_volume, two.elements.node_volume)
 
 
 @pytest.mark.parametrize("element, parts", [("quadratic", 1), ("linear", 8)])
@@ -166,12 +199,12 @@ def test_what_cannot_be_is_refused():
             ValueError, match="1 of the 48 factors of modulus are not positive finite numbers"
         ):
             cube("linear", "linear", modulus=np.r_[bad, np.ones(47)])
-    on_a_gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True))
-    with pytest.raises(ValueError, match="solved on the CPU's full tier only: choose device='cpu'"):
-        SkinModel._moduli(on_a_gpu, np.ones(48), None)
     model = cube("corotational", "linear", modulus=np.full(48, 2.0))
-    with pytest.raises(ValueError, match="skin with modulus is solved on the CPU's full tier only"):
-        SkinData(model, resident=True)
+    with pytest.raises(ValueError, match="modulus of their own and the model has none: make it with modulus"):
+        SkinData(cube("corotational", "linear"), modulus=np.ones((1, 48)))
+    for bad in (np.ones(48), np.ones((2, 48)), np.full((1, 48), np.nan), np.zeros((1, 48))):
+        with pytest.raises(ValueError, match=r"pass positive factors of shape \(1, 48\)"):
+            SkinData(model, modulus=bad)
     from biotac_mj.skin.condensed import CondensedSkin
 
     with pytest.raises(ValueError, match="the same everywhere: leave modulus out"):

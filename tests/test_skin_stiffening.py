@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
 
-
 PATH = (1.05, 1.1, 1.15, 1.12)  # stretches of a bar, whose elements at the end bear each jump first
 
 
@@ -142,9 +141,7 @@ def test_worlds_stiffen_each_its_own_way(law, element):
     """Without, Yeoh's and Knowles's rubber in one batch."""
     model = bar(law, element, nu=0.4, stiffening=0.7)
     materials = [dataclasses.replace(model.material, stiffening=s) for s in (0.0, 0.7, -0.4)]
-    together, alone, own = batch(
-        model, materials, lambda m, data: [pull_worlds(m, data, s) for s in PATH]
-    )
+    together, alone, own = batch(model, materials, lambda m, data: [pull_worlds(m, data, s) for s in PATH])
     peak = abs(together).max()
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-9 * peak)
     np.testing.assert_allclose(together, own, rtol=0, atol=1e-6 * peak)  # of models: the solver's tolerance

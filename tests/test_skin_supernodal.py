@@ -17,7 +17,7 @@ def model(request):
 
 
 def test_solves_agree_with_lu(model):
-    K, free = model._stiffness, model.free
+    K, free = model.stiffness, model.free
     factor = SupernodalFactor(K, Elimination(K, model.geometry.vert[free]), free)
     rng = np.random.default_rng(0)
     rhs = rng.standard_normal((model.nvert, 3, 3))  # fixed nodes too: not looked at
@@ -50,7 +50,7 @@ def test_operator_is_symmetric(model):
 
 
 def test_another_matrix_of_the_same_pattern(model):
-    K, free = model._stiffness, model.free
+    K, free = model.stiffness, model.free
     elimination = Elimination(K, model.geometry.vert[free])
     scale = sp.diags(np.linspace(1, 2, K.shape[0]))
     other = (scale @ K @ scale).tocsc()
@@ -62,7 +62,7 @@ def test_another_matrix_of_the_same_pattern(model):
 
 def test_dissection_separates(model):
     n = len(model.free)
-    coo = model._stiffness.tocoo()
+    coo = model.stiffness.tocoo()
     near = sp.coo_matrix((np.ones(len(coo.row)), (coo.row // 3, coo.col // 3)), shape=(n, n)).tocsr()
     groups = dissect(near, model.geometry.vert[model.free])
     np.testing.assert_array_equal(np.sort(np.concatenate(groups)), np.arange(n))
@@ -70,13 +70,13 @@ def test_dissection_separates(model):
     rest = np.setdiff1d(np.arange(n), middle)
     parts, label = sp.csgraph.connected_components(near[rest][:, rest])
     assert parts >= 2 and np.bincount(label).max() < 0.65 * n and len(middle) < 0.05 * n
-    elimination = Elimination(model._stiffness, model.geometry.vert[model.free])
+    elimination = Elimination(model.stiffness, model.geometry.vert[model.free])
     entries = sum(
         (end - begin) * (end - begin + 1) / 2 + (end - begin) * len(later)
         for begin, end, later, _ in elimination.fronts
     )
     lu = sp.linalg.splu(
-        model._stiffness.tocsc(),
+        model.stiffness.tocsc(),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0,
         options={"SymmetricMode": True},

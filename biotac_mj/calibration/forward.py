@@ -9,7 +9,8 @@ import numpy as np
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..press.indenter import make_indenter
-from ..skin import GeomSet, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
+from ..skin import GeomSet, SkinModel, SkinOptions, bake_distance_grid, step
+from ..skin.per_world import make_worlds
 from .indentation import Indentation
 
 __all__ = ["Response", "displacement_norms", "simulate"]
@@ -63,7 +64,7 @@ def simulate(
     """
     materials = list(materials)
     model = SkinModel(geometry, materials[0], options, device, modulus=modulus)
-    data = SkinData(model, len(materials), materials)
+    data = make_worlds(model, len(materials), materials)
     geoms, place = _indenter(indentation, materials, device)
     force, norms, steps = [], [], 0
     at = indentation.tip[0]

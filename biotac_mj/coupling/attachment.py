@@ -145,6 +145,8 @@ def attach(
         **({} if friction is None else {"friction": float(friction)}),
     )
     check_names(config)
+    if stepper == "fem" and tier == "condensed":
+        _refuse_condensed(config)
     names = [g.name for g in spec.geoms]
     for name in (*(config.geoms or ()), *config.rounding):
         if name not in names:
@@ -175,6 +177,16 @@ def _material_choices(material, liquid, friction):
 
     chosen = read_material(material)
     return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction
+
+
+def _refuse_condensed(config):
+    from ..skin.condensed.refusals import refuse
+    from .fem import skin_settings
+
+    material, options, modulus = skin_settings(config)
+    rubber = (*([] if modulus is None else ["modulus"]), *material.extensions)
+    liquid = config.liquid if options.liquid is None else options.liquid
+    refuse(rubber, options, liquid, config.device.startswith("cuda"))
 
 
 def _check_place(spec, site, body, prefix):

@@ -165,6 +165,7 @@ class Maker:
     def __init__(self, out, options, settings, device="cpu", update=lambda n: None, tell=lambda text: None):
         from ..geometry import load_skin
         from ..skin import SkinModel
+        from ..skin.condensed.refusals import refuse
         from ..skin.per_world import NAMES, make_room
         from ..skin.settings import read_settings
 
@@ -186,6 +187,9 @@ class Maker:
         if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
             rubber = dataclasses.replace(rubber, stiffening=sum(self.vary["stiffening"]) / 2)
         model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
+        self.geometry = model.geometry  # with all nodes that are solved
+        if options.tier == "condensed":
+            refuse(model.rubber_options, skin, model.has_liquid, model.device.is_cuda)
         self.attributes = {
             "settings": settings,
             "skin": options.skin,
@@ -214,7 +218,7 @@ class Maker:
 
         o = self.options
         filled = self.model.options.fill_volume or self.model.options.rest_pressure
-        rest = self.model.rest.vert[: self.geometry.nvert] if filled else None
+        rest = self.model.rest.vert if filled else None
         args = (self.geometry, o.sensor, self.measured and self.measured.meter(), rest)
         with readings.readings_pool(
             self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args

@@ -101,7 +101,7 @@ class SkinData:
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
         self.options = model.rubber_options
-        _refuse_other_kinds(materials, self.options)
+        _refuse_other_kinds(materials, model.material, self.options)
         self.nworld, self.model = nworld, model
         self.rubber = rubber_of_worlds(model, materials, _modulus_of_worlds(model, modulus, nworld))
         nsample, lawful = len(model.sample), model.options.contact_law is not None
@@ -125,7 +125,7 @@ class SkinData:
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
-        self.worlds.density.assign([m.density for m in materials])
+        self.worlds.density.fill_(model.material.density)  # `per_world.make_worlds` gives each its own
         self.laws = WorldLaws(model, nworld)
         self.worlds.pulls = self.laws.pulls
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
@@ -369,23 +369,22 @@ class SkinData:
         return np.column_stack([sample, geom[sample], self.outer.anchor.numpy()[sample, 0]])
 
 
-def _refuse_other_kinds(materials, options):
+def _refuse_other_kinds(materials, own, options):
     """Worlds share the code that is compiled: what they have beyond the law differs in numbers alone."""
     for m in materials:
         missing = [name for name in m.extensions if name not in options]
         if missing:
             raise ValueError(
                 f"a world's material has {' and '.join(missing)} and the model's has not: give the model's "
-                "material one as well, with a strength of zero if need be"
+                "material one as well, next to nothing if need be"
             )
-    for name in ("prony", "hysteresis"):
-        counts = {len(getattr(m, name)) for m in materials}
-        if len(counts) > 1:
-            raise ValueError(
-                f"the worlds' materials have {min(counts)} to {max(counts)} terms of {name}: give all the "
-                "same "
-                "number, with a strength of zero if need be"
-            )
+        for name in ("prony", "hysteresis"):
+            count, wanted = len(getattr(m, name)), len(getattr(own, name))
+            if count != wanted:
+                raise ValueError(
+                    f"a world's material has {count} terms of {name} and the model's {wanted}: give it as "
+                    "many, with a strength of zero if need be"
+                )
 
 
 def _modulus_of_worlds(model, modulus, nworld):

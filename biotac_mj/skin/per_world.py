@@ -39,7 +39,7 @@ def make_room(
 
 
 def make_worlds(model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None):
-    """SkinData of worlds that differ.
+    """SkinData of worlds that differ, in their materials' density, too.
 
     Args:
       materials: one for each world, or None.
@@ -60,6 +60,8 @@ def make_worlds(model: SkinModel, nworld: int, materials: list | None = None, va
             )
         modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node one follow each other
     data = SkinData(model, nworld, materials, modulus)
+    if materials is not None:
+        data.worlds.density.assign([float(m.density) for m in materials])
     law = {name: values[name] for name in _LAW if name in values}
     if law:
         data.laws.set(**law)

@@ -158,9 +158,9 @@ class Simulator:
             model = store[bubble] = SkinModel(geometry, rubber, options, device, modulus=modulus)
             if "film" not in store:
                 filled = options.fill_volume or options.rest_pressure
-                rest = model.rest.vert[: geometry.nvert] if filled else geometry.vert
-                film = FilmConduction(dataclasses.replace(geometry, vert=rest), sensor=self.sensor)
-                store["film"] = film
+                solved = model.geometry  # with all nodes that are solved
+                rest = dataclasses.replace(solved, vert=model.rest.vert) if filled else solved
+                store["film"] = FilmConduction(rest, sensor=self.sensor)
         model = store[bubble]
         if log_friction:
             model = copy.copy(model)

@@ -7,13 +7,14 @@ import scipy.sparse as sp
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..step import prepare_step
+from ..types import vec3
 
 __all__ = ["rest_tangent"]
 
 
 def rest_tangent(model) -> sp.csc_matrix:
     """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates
-    [N/m].
+    [N/m]; as if all of the skin were off its core, whose contact is not in it.
 
     Columns come from products with the tangent; nodes without a common neighbour are probed together.
 
@@ -24,6 +25,9 @@ def rest_tangent(model) -> sp.csc_matrix:
     at_rest = prepare_step(model, data, GeomSet([], []))
     at_rest.evaluate_forces()
     data.worlds.pressure.fill_(model.rest.pressure)
+    at_rest.k.wet.fill_(vec3(1 / 3, 1 / 3, 1 / 3))
+    if data.core:
+        data.core.touching.zero_()
     pattern = _neighbours(model.nvert, model._elem)
     color = _colors(pattern)
     row, column, value = [], [], []

@@ -27,6 +27,7 @@ from .compliance import SurfaceCompliance
 from .core_contact import CoreContact
 from .correction import correction
 from .faces import CandidateFaces
+from .refusals import refuse
 from .search import NearSearch
 from .step import Memory, Outcome, Step
 
@@ -105,35 +106,11 @@ class CondensedSkin:
       cache: whether to keep the compliance on disk (see `compliance`).
 
     Raises:
-      ValueError: a model on another device, with implicit dynamics, or filled with less liquid than the
-        unstressed skin holds.
+      ValueError: what the tier cannot do, see `refusals`.
     """
 
     def __init__(self, model, geoms: GeomSet, cache: bool = True):
-        if model.device.is_cuda:
-            raise ValueError(
-                "the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA"
-            )
-        if model.options.dynamics != "quasistatic":
-            raise ValueError(
-                "the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier"
-            )
-        if model.rubber_options:
-            raise ValueError(
-                "the condensed tier is elastic, the same everywhere: leave "
-                f"{' and '.join(model.rubber_options)} out, or choose the full tier"
-            )
-        if model.options.contact_law is not None:
-            raise ValueError(
-                "the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, or "
-                "choose the full tier"
-            )
-        filled = model.has_liquid and (model.options.fill_volume or model.options.rest_pressure)
-        if filled and (model.options.fill_volume < 0 or model.options.rest_pressure < 0):
-            raise ValueError(
-                "the condensed tier needs a skin clear of its core at rest: take fill_volume and "
-                "rest_pressure >= 0, or the full tier"
-            )
+        refuse(model.rubber_options, model.options, model.has_liquid, model.device.is_cuda)
         self.model, self.geoms = model, geoms
         self.correction = correction(model.material.law)
         g = model.geometry

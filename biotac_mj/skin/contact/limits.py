@@ -41,16 +41,19 @@ def crushed_on_core(
     # Out:
     failed_out: wp.array(dtype=int),
 ):
-    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way through,
-    see `SkinStep._refuse_impossible`."""
+    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way
+    through."""
     f, w = wp.tid()
     if asked[w] == 0:
         return
     R = wp.transpose(core.mat[0, w])
     for c in range(3):
         y = R * (x[face[f][c], w] - core.pos[0, w])
-        if distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y) < -limit:
-            failed_out[w] = 1
+        bound = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
+        if bound < -limit:  # half a cell too deep, perhaps
+            dn = distance(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
+            if dn[3] < -limit:
+                failed_out[w] = 1
 
 
 @wp.kernel

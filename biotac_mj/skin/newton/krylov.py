@@ -49,7 +49,7 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         st.running[w] = 0
         st.alpha[w] = real(0.0)
         if first:
-            st.alpha[w] = real(1.0)
+            st.alpha[w] = wp.where(st.rz[w] < real(0.0), real(-1.0), real(1.0))
         return
     alpha = st.rz[w] / curvature
     st.alpha[w] = alpha
@@ -69,7 +69,7 @@ def choose_beta(part: wp.array3d(dtype=real), st: Worlds):
     rz = total_of(part, 0, w, t)
     if t > 0:
         return
-    if not (rz > real(0.01) * st.first[w]):
+    if not (rz > real(0.01) * wp.abs(st.first[w])):
         st.running[w] = 0
         return
     st.beta[w] = rz / st.rz[w]
@@ -127,7 +127,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # Out:
         q_out: wp.array2d(dtype=vec),
     ):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: whether it counts,
+        """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
         damping by mass, by stiffness."""
         i, w = wp.tid()
         if st.running[w] == 0:

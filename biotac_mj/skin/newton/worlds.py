@@ -201,7 +201,7 @@ def judge_balance(
     go_on: wp.array(dtype=int),
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
-    `device_nodes.residuals`."""
+    `nodes.residuals`."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
@@ -253,8 +253,7 @@ def retry_worlds(st: Worlds, again: wp.array(dtype=int)):
 
 @wp.kernel
 def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
-    """Looks for the length where the residual has (nearly) no component along the step, by regula falsi; see
-    `solver._line_search`.
+    """Looks for the length where the residual has (nearly) no component along the step, by regula falsi.
 
     part: force . direction after the step, and before it where this is the first try.
     """

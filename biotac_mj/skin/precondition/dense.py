@@ -19,6 +19,7 @@ __all__ = ["FEW", "THREADS_FEW", "DenseInverse", "DensePreconditioner"]
 _LISTED = 512
 # rows of whole nodes (3) that fill the tensor cores' tiles (64): ragged sizes run at a third of the speed
 _ALIGN = 192
+_SOUND = 0.1  # of the inverse that rounding leaves at least, in every direction
 FEW = 16  # worlds that do not fill the device: work is split finer there
 THREADS_FEW = 64  # of a block there, so that more multiprocessors take part
 
@@ -401,12 +402,13 @@ class DenseInverse:
     halves, 22 bits in all.
 
     Nearly incompressible rubber gives way to changes of volume lambda / mu times less than to others: rounded
-    to half precision the inverse no longer knows how much less. A second matrix then has what rounding took.
-    By torch on CUDA, by numpy on the CPU.
+    to half precision the inverse no longer knows how much less. Of a skin that hangs from little it is not
+    even positive: what it gives way as a whole is far more than what single nodes do. A second matrix then
+    has what rounding took. By torch on CUDA, by numpy on the CPU.
 
     Args:
       stiffness: scipy sparse matrix, positive definite. device: Warp device.
-      two: whether there is a second matrix.
+      two: there is a second matrix; False: where the rounded one alone is not (soundly) positive definite.
 
     Attributes:
       half, rest: Warp arrays (padded, padded) of the inverse over `scale`, and of what rounding took times
@@ -425,6 +427,10 @@ class DenseInverse:
             self._matrix = made.new_zeros((self.padded, self.padded), dtype=torch.float16)
             self._matrix[inside] = made / self.scale
             self._rest = self._matrix[:0]
+            if not two:
+                kept = self._matrix[inside] - (_SOUND / self.scale) * made
+                two = bool(torch.linalg.cholesky_ex(kept).info)
+                del kept
             if two:
                 self._rest = torch.zeros_like(self._matrix)
                 self._rest[inside] = (made / self.scale - self._matrix[inside]) * sides.LOW
@@ -434,6 +440,11 @@ class DenseInverse:
             self.scale, self.padded = float(np.abs(inverse).max()), len(inverse)
             inverse /= self.scale
             half = inverse.astype(np.float16)
+            if not two:
+                try:
+                    np.linalg.cholesky(half - _SOUND * inverse)
+                except np.linalg.LinAlgError:
+                    two = True
             rest = ((inverse - half) * sides.LOW).astype(np.float16)[: None if two else 0]
             self.half, self.rest = (wp.array(a, dtype=wp.float16, ndim=2, device="cpu") for a in (half, rest))
             self._matrix, self._rest = half.astype(np.float32), rest.astype(np.float32)

@@ -38,11 +38,13 @@ _EXCHANGE = """
     if (c == 0)
         #pragma unroll
         for (int i = 0; i < NR; ++i) columns[0][r + %(rows)d * i] = a[i][0];
-    unsigned taken = 0;  // of the rows c, c + 32, ...; every warp finds the pivots for itself, which saves a barrier
+    // of the rows c, c + 32, ...; every warp finds the pivots for itself, which saves a barrier
+    unsigned taken = 0;
     for (int k = 0; k < n; ++k) {
         const float* column = columns[k & 1];
         __syncthreads();
-        unsigned best = 0, at = 0xffffffffu;  // bits of a number that is not negative are ordered as the number is
+        // bits of a number that is not negative are ordered as the number is
+        unsigned best = 0, at = 0xffffffffu;
         for (int m = 0; c + 32 * m < n; ++m) {
             if (taken >> m & 1) continue;
             const unsigned bits = __float_as_uint(fabsf(column[c + 32 * m]));

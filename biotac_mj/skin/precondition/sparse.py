@@ -76,9 +76,6 @@ class SparseFactor:
         return (3 * self._index[nodes][:, None] + np.arange(3)).ravel()
 
 
-# rows of whole nodes (3) that fill the tensor cores' tiles (64): ragged sizes run at a third of the speed
-
-
 def _bisection_order(points: np.ndarray) -> np.ndarray:
     """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and
     again."""
@@ -100,8 +97,7 @@ class SparsePreconditioner:
 
     Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
     solve takes many products gets the factor of its present shape, for this step alone, so that a step
-    remains a
-    function of the state it starts from. Worlds share a factor: not where there are many.
+    remains a function of the state it starts from. Worlds share a factor: not where there are many.
     """
 
     precision = DOUBLE

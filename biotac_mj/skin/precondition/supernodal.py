@@ -46,7 +46,8 @@ _SWEEPS = """
             for (; j + 4 <= a; j += 4) {
                 const narrow *c0 = p + j * n, *c1 = c0 + n, *c2 = c1 + n, *c3 = c2 + n;
                 const double s0 = w[at + j], s1 = w[at + j + 1], s2 = w[at + j + 2], s3 = w[at + j + 3];
-                for (int i = 0; i < m; ++i) t[i] += (s0 * WIDE(c0[i]) + s1 * WIDE(c1[i])) + (s2 * WIDE(c2[i]) + s3 * WIDE(c3[i]));
+                for (int i = 0; i < m; ++i)
+                    t[i] += (s0 * WIDE(c0[i]) + s1 * WIDE(c1[i])) + (s2 * WIDE(c2[i]) + s3 * WIDE(c3[i]));
             }
             for (; j < a; ++j) {
                 const narrow* c = p + j * n;
@@ -73,7 +74,8 @@ _SWEEPS = """
             for (int j = 0; j < a; j += 4) {
                 const int some = a - j < 4 ? a - j : 4;
                 const narrow* c0 = p + j * n;
-                const narrow *c1 = some > 1 ? c0 + n : c0, *c2 = some > 2 ? c0 + 2 * n : c0, *c3 = some > 3 ? c0 + 3 * n : c0;
+                const narrow* c1 = some > 1 ? c0 + n : c0;
+                const narrow *c2 = some > 2 ? c0 + 2 * n : c0, *c3 = some > 3 ? c0 + 3 * n : c0;
                 lanes s0 = {}, s1 = {}, s2 = {}, s3 = {};
                 for (int i = 0; i < n; ++i) {
                     const lanes v = t[i];

@@ -54,7 +54,8 @@ _TILE_PRODUCT = """
             const unsigned lows[4] = {low.x, low.y, low.z, low.w};
             #pragma unroll
             for (int k = 0; k < 8; ++k) {
-                const unsigned short bits = (unsigned short)(k & 1 ? lows[k / 2] >> 16 : lows[k / 2] & 0xffffu);
+                const unsigned both = lows[k / 2];
+                const unsigned short bits = (unsigned short)(k & 1 ? both >> 16 : both & 0xffffu);
                 float value;
                 asm("cvt.f32.f16 %0, %1;" : "=f"(value) : "h"(bits));
                 f[k] += value * (1.0f / 2048.0f);

@@ -533,7 +533,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
         energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
 
-    @wp.kernel(module=f"{module}.read", enable_backward=False)
+    @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
     def flag_inside_out(
         # In:
         mesh: Mesh,

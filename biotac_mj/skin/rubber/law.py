@@ -104,7 +104,8 @@ def polar(F: mat33):
     then turned by what is left (error squared)."""
     R = widen(polar_single(narrow(F)))
     if wp.determinant(F) < real(1.0e-3):  # `turn_towards` may have come near only
-        for _ in range(15):
+        steps = int(15)  # a variable: unrolled, the loop would double the time to compile
+        for _ in range(steps):
             R = orthogonal(R)
             turn = turn_left(wp.transpose(R) * F)
             R = R + R * wp.skew(double(turn))

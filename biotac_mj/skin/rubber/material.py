@@ -81,15 +81,15 @@ class Material:
                 object.__setattr__(self, "mullins", (r, m, beta))
         except (TypeError, ValueError):
             raise ValueError(
-                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and (r, m, "
-                "beta) or None"
-            ) from None  # noqa: E501
+                f"prony is {self.prony!r} and mullins {self.mullins!r}: pass ((g, tau), ...) and "
+                "(r, m, beta) or None"
+            ) from None
         for g, tau in self.prony:
             if not (math.isfinite(g) and g >= 0 and math.isfinite(tau) and tau > 0):
                 raise ValueError(
                     f"a Prony term of g {g} and tau {tau} s: g must be >= 0 and tau positive, else energy "
                     "would come from nothing"
-                )  # noqa: E501
+                )
         if self.mullins is not None and not (r > 1 and m > 0 and beta >= 0 and math.isfinite(r + m + beta)):
             raise ValueError(
                 f"Mullins softening (r, m, beta) is {self.mullins}: r must be above 1, m positive, beta >= 0"

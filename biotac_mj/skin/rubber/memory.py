@@ -7,9 +7,11 @@ import types
 import numpy as np
 import warp as wp
 
+from ..program import Launcher
 from ..types import mat33, real, vec3
 from .friction import deviator, held, strain
 from .law import polar
+from .material import Material
 from .points import Mesh, Rubber, deformation_of, point_functions
 
 __all__ = ["RubberMemory", "rubber_of_worlds"]
@@ -159,14 +161,13 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         F = deformation(mesh, e, q, x, w)
         mu = rubber.mu[w]
         lam = wp.min(rubber.lam[w], cap * mu)
-        rubber.last[i, w] = settled(
-            rubber, e, w, mu, lam, F, borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
-        )
+        worst = borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
+        rubber.last[i, w] = settled(rubber, e, w, mu, lam, F, worst)
 
     return types.SimpleNamespace(commit=commit, forget=forget, recall=recall)
 
 
-def rubber_of_worlds(model, materials, modulus) -> Rubber:
+def rubber_of_worlds(model, materials: list[Material], modulus: np.ndarray | None) -> Rubber:
     """The constants of `materials`, one for each world, as `Rubber` on the model's device, without memory.
 
     Args:
@@ -204,7 +205,9 @@ class RubberMemory:
     Made by `SkinData` where the model's material has `prony`, `mullins` or `hysteresis`.
 
     Args:
-      model: SkinModel; rubber: its constants, to which the arrays of memory are added.
+      model: SkinModel.
+      rubber: constants of the worlds, to which the arrays of memory are added.
+      options: what the rubber has beyond its law, see `points.point_functions`.
     """
 
     def __init__(self, model, rubber: Rubber, options: tuple[str, ...]):
@@ -223,17 +226,17 @@ class RubberMemory:
             self._all = wp.full(nworld, True, dtype=bool)
         self._kernels = _kernels(options, model.elements.corners)
 
-    def begin_step(self, program, dt, softness):
+    def begin_step(self, program: Launcher, dt: wp.array, softness: wp.array) -> None:
         """Prepares a step; softness (nworld,) of the preconditioner becomes that of this step."""
         program.launch(begin_worlds, len(softness), [self.rubber, dt], [softness])
         if self.rubber.prony.shape[0]:
             program.launch(begin_points, self.rubber.past.shape, [self.rubber, dt])
 
-    def commit_step(self, program, x, dt, failed):
+    def commit_step(self, program: Launcher, x: wp.array, dt: wp.array, failed: wp.array) -> None:
         """Takes over the step that has ended at x in the worlds that did not fail."""
         program.launch(self._kernels.commit, self._dim, [*self._constants, x, dt, failed])
 
-    def forget(self, x, mask=None):
+    def forget(self, x: wp.array, mask: wp.array | None = None) -> None:
         """Makes x [nvert, nworld] the relaxed and virgin state, of the worlds of mask (nworld,) bool."""
         self._launch(self._kernels.forget, [x, self._all if mask is None else mask])
 
@@ -259,7 +262,7 @@ class RubberMemory:
         return now
 
     @staticmethod
-    def size(material, npoint: int) -> int:
+    def size(material: Material, npoint: int) -> int:
         """Doubles of one world's memory."""
         return (6 * len(material.prony) + 6 * len(material.hysteresis) + 1) * npoint
 
@@ -271,7 +274,7 @@ class RubberMemory:
         worst = self.rubber.worst.numpy()[:, 0] if len(self.rubber.worst) else np.zeros(self.npoint)
         return np.concatenate([*parts, worst])
 
-    def load(self, state, x):
+    def load(self, state: np.ndarray, x: wp.array) -> None:
         """Sets the memory of a single world that is at x (Warp, [nvert, 1]); the inverse of `state`."""
         n, rubber = self.npoint, self.rubber
         parts = np.asarray(state[:-n]).reshape(-1, n, 6)[..., _WHOLE].reshape(-1, n, 1, 3, 3)

@@ -183,10 +183,8 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             dP = soft[0] * dP + (soft[1] * wp.ddot(P, dF)) * P
         dP = factor * dP - own
         if wp.static(has["prony"]):
-            H = rubber.past[i, w]
-            if rubber.law != 3:
-                H = dF * H
-            dP += H
+            if rubber.law != 3:  # there the past is a constant stress
+                dP += dF * rubber.past[i, w]
         if wp.static(has["hysteresis"]):
             A = strain(rubber.law, F)
             dA = deviator(strain_change(rubber.law, F, dF))

@@ -1,17 +1,30 @@
-"""The device step, kernel by kernel on the CPU: many worlds at once against each of them alone in the host's
-solver."""
+"""Many worlds at once against each of them alone, and CUDA's dense preconditioner of single precision, on the
+CPU, against the sparse one."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from biotac_mj.skin.device_step import prepare_device, step_device
+import warp as wp
 from blocks import four_nodes
-from test_skin_solver import finger
+from test_skin_step import finger
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import (
+    ContactLaw,
+    GeomSet,
+    Material,
+    SkinData,
+    SkinModel,
+    SkinOptions,
+    launch_step,
+    prepare_step,
+    step,
+)
 from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
 START = 13.5e-3  # z of the sphere's centre where it touches the ball [m]
@@ -50,12 +63,12 @@ def random_worlds(n, seed):
     ]
 
 
-def walk(model, worlds, resident, depths):
+def walk(model, worlds, preconditioner, depths):
     rubber = [
         dataclasses.replace(model.material, youngs_modulus=w["modulus"] * model.material.youngs_modulus)
         for w in worlds
     ]
-    data, geoms = SkinData(model, len(worlds), rubber, resident=resident), geom_set(len(worlds))
+    data, geoms = SkinData(model, len(worlds), rubber, preconditioner=preconditioner), geom_set(len(worlds))
     geoms.set_friction([[w["friction"], 0.2] for w in worlds])
     data.set_liquid([w["bulk"] for w in worlds], [w["fill"] if w["bulk"] else 0.0 for w in worlds])
     for depth in depths:
@@ -68,16 +81,17 @@ def walk(model, worlds, resident, depths):
 DEPTHS = (1e-4, 2e-4, 3e-4, 4e-4)
 
 
-def test_random_worlds_together_are_each_alone_on_the_host(model):
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_random_worlds_together_are_each_alone(model, kind):
     """Pose, friction, modulus, bulk modulus (none, soft, water, infinite) and fill differ. Both stop at an
     energy error of 1e-5."""
     worlds = random_worlds(6, seed=3)
-    together, geoms = walk(model, worlds, True, DEPTHS)
+    together, geoms = walk(model, worlds, kind, DEPTHS)
     tangent = together.tangent(geoms)
     peak = abs(together.wrench[..., :3]).max()
     assert peak > 0.1 and np.ptp(together.pressure) > 100
     for i, world in enumerate(worlds):
-        alone, one = walk(model, [world], False, DEPTHS)
+        alone, one = walk(model, [world], "sparse", DEPTHS)
         np.testing.assert_allclose(
             together.wrench[i, 0, :3], alone.wrench[0, 0, :3], rtol=0, atol=1e-3 * peak
         )
@@ -93,8 +107,8 @@ def test_more_worlds_than_are_solved_finely(model):
     """Few and many worlds take other kernels (rows of the inverse or a product, samples or faces): the same
     answers."""
     worlds = random_worlds(3, seed=5)
-    few, _ = walk(model, worlds, True, DEPTHS[:2])
-    many, _ = walk(model, worlds * 6, True, DEPTHS[:2])
+    few, _ = walk(model, worlds, "dense", DEPTHS[:2])
+    many, _ = walk(model, worlds * 6, "dense", DEPTHS[:2])
     for i in range(18):
         np.testing.assert_allclose(
             many.wrench[i], few.wrench[i % 3], rtol=0, atol=1e-4 * abs(few.wrench).max()
@@ -106,8 +120,8 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     """NaN pose, NaN modulus, a geom inside the core: last good state, a reason each, and bit for bit the same
     in the sound worlds."""
     worlds = random_worlds(5, seed=7)
-    data, geoms = walk(model, worlds, True, DEPTHS[:2])
-    sound, others = walk(model, worlds, True, DEPTHS[:2])
+    data, geoms = walk(model, worlds, "dense", DEPTHS[:2])
+    sound, others = walk(model, worlds, "dense", DEPTHS[:2])
     good = data.vert_xpos, data.wrench
     bad = poses(worlds, DEPTHS[2])
     others.set_pose(bad)
@@ -118,7 +132,7 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     geoms.struct.pos.assign(at)
     stiff = data.mu.numpy().copy()
     data.mu.assign(np.where(np.arange(5) == 4, np.nan, stiff))
-    step_device(model, data, geoms)
+    launch_step(model, data, geoms)
     step(model, sound, others)
     assert data.worlds.reason.numpy().tolist() == [NOT_FINITE, CONVERGED, INSIDE_CORE, CONVERGED, NOT_FINITE]
     assert data.nonconverged.tolist() == [1, 0, 1, 0, 1] and data.converged.tolist() == [
@@ -145,7 +159,7 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
 
 def test_a_step_that_does_not_converge():
     hasty = finger(max_newton=1)
-    data, geoms = SkinData(hasty, 2, resident=True), geom_set(2)
+    data, geoms = SkinData(hasty, 2, preconditioner="dense"), geom_set(2)
     geoms.set_pose([poses([dict(place=1, depth=1, side=0)], d)[0] for d in (1.4e-3, -5e-3)])
     step(hasty, data, geoms)
     assert data.worlds.reason.numpy().tolist() == [NOT_CONVERGED, CONVERGED]
@@ -154,29 +168,24 @@ def test_a_step_that_does_not_converge():
 
 def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, monkeypatch):
     worlds = random_worlds(1, seed=9)
-    enough, _ = walk(model, worlds, True, DEPTHS)
+    enough, _ = walk(model, worlds, "dense", DEPTHS)
     monkeypatch.setattr(SkinData, "contact_capacity", 3)
-    tight, _ = walk(model, worlds, True, DEPTHS)
-    assert (
-        tight.device_memory.preconditioner.full.numpy()[0] > 3
-        and enough.device_memory.preconditioner.full.numpy()[0] == 0
-    )
+    tight, _ = walk(model, worlds, "dense", DEPTHS)
+    assert tight.preconditioner.full.numpy()[0] > 3 and enough.preconditioner.full.numpy()[0] == 0
     np.testing.assert_allclose(tight.wrench, enough.wrench, rtol=0, atol=2e-3 * abs(enough.wrench).max())
 
 
 @pytest.mark.parametrize("law, poisson", [("neo_hookean", 0.45), ("svk", 0.3), ("neo_hookean", 0.49)])
 def test_other_laws_and_elements(law, poisson):
     """Laws with inverted tetrahedra to refuse; above 0.45 the inverse is kept as two halves."""
-    from biotac_mj.skin import Material
-
     model = SkinModel(
         finger().geometry,
         Material(law, 2.8e5, poisson, 0.2, element="linear"),
         SkinOptions(tolerance=1e-5, max_newton=60),
     )
     results = []
-    for resident in (False, True):
-        data, geoms = SkinData(model, resident=resident), geom_set(1)
+    for kind in ("sparse", "dense"):
+        data, geoms = SkinData(model, preconditioner=kind), geom_set(1)
         for depth in DEPTHS:
             geoms.set_pose(poses([dict(place=1, depth=1, side=0)], depth)[0])
             step(model, data, geoms)
@@ -188,7 +197,7 @@ def test_other_laws_and_elements(law, poisson):
 
 
 def test_dynamics():
-    """Backward Euler with both dampings, on a core that is shaken: positions and velocities of the host."""
+    """Backward Euler with both dampings, on a core that is shaken: the same positions and velocities."""
     options = SkinOptions(
         liquid=False,
         dynamics="implicit",
@@ -199,8 +208,8 @@ def test_dynamics():
     )
     model = SkinModel(finger().geometry, "default", options)
     results = []
-    for resident in (False, True):
-        data, geoms = SkinData(model, 2, resident=resident), geom_set(2)
+    for kind in ("sparse", "dense"):
+        data, geoms = SkinData(model, 2, preconditioner=kind), geom_set(2)
         geoms.set_pose([[0.1, 0.1, 0.1]] * 2)
         for k in range(1, 5):
             step(
@@ -219,7 +228,7 @@ def test_dynamics():
 
 
 def test_loads_reset_and_reading_a_state(model):
-    data, geoms = SkinData(model, resident=True), geom_set(1)
+    data, geoms = SkinData(model, preconditioner="dense"), geom_set(1)
     load = np.zeros((1, model.nvert, 3))
     load[0, model.geometry.vert[:, 2].argmax(), 2] = -5e-2
     data.set_external(load)
@@ -234,8 +243,8 @@ def test_loads_reset_and_reading_a_state(model):
     for depth in DEPTHS[:2]:
         geoms.set_pose(poses([world], depth)[0])
         step(model, data, geoms)
-    again, other = SkinData(model, resident=True), geom_set(1)
-    prepare_device(model, again, other)
+    again, other = SkinData(model, preconditioner="dense"), geom_set(1)
+    prepare_step(model, again, other)
     again.load(
         data.vert_xpos[0],
         data.increment.numpy()[:, 0],
@@ -251,15 +260,12 @@ def test_loads_reset_and_reading_a_state(model):
 
 
 def test_what_is_refused(model):
-    with pytest.raises(
-        ValueError,
-        match=r"this data is stepped from the host: make it with SkinData\(model, nworld, resident=True\)",
-    ):
-        prepare_device(model, SkinData(model), geom_set(1))
+    with pytest.raises(ValueError, match="unknown preconditioner 'lu': choose one of sparse, dense"):
+        SkinData(model, preconditioner="lu")
     with pytest.raises(
         ValueError, match="geoms are for 2 worlds and the data for 1: make both for the same number"
     ):
-        step_device(model, SkinData(model, resident=True), geom_set(2))
+        launch_step(model, SkinData(model), geom_set(2))
     data = SkinData(model, 2)
     with pytest.raises(ValueError, match="bulk moduli must be numbers >= 0"):
         data.set_liquid(bulk_modulus=[-1.0, 1e6])
@@ -277,8 +283,8 @@ def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
     """Each in its own world: rest, a tetrahedron turned inside out, an inner surface inside the core."""
     geometry = load_skin("coarse") if element == "quadratic" else four_nodes("coarse")
     model = SkinModel(geometry, "default", SkinOptions(element=element))
-    data, geoms = SkinData(model, 3, resident=True), GeomSet(["sphere"], [(3.5e-3,)], nworld=3)
-    ready = prepare_device(model, data, geoms)
+    data, geoms = SkinData(model, 3), GeomSet(["sphere"], [(3.5e-3,)], nworld=3)
+    ready = prepare_step(model, data, geoms)
     x = np.repeat(geometry.vert[:, None], 3, 1)
     corner = geometry.elem[np.isin(geometry.elem, model.fixed).sum(1) == 0][0][:4]
     x[corner[0], 1] += 1.2 * (geometry.vert[corner[1:]].mean(0) - geometry.vert[corner[0]])
@@ -288,57 +294,77 @@ def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
     data.x.assign(x)
     data.worlds.asked.fill_(1)
     data.worlds.failed.zero_()
-    ready._evaluate(data.worlds.asked)
+    ready.evaluate_forces()
     ready._refuse_impossible()
     assert data.worlds.failed.numpy().tolist() == [0, 1, 1]
-    monkeypatch.setattr(
-        type(data.device_memory.elements), "refuse_inverted", lambda *_: None
-    )  # the core alone
+    monkeypatch.setattr(type(ready.k.elements), "refuse_inverted", lambda *_: None)  # the core alone
     data.worlds.failed.zero_()
     ready._refuse_impossible()
     assert data.worlds.failed.numpy().tolist() == [0, 0, 1]
 
 
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("law", ["corotational", "svk", "neo_hookean", "linear"])
-def test_ten_node_elements_of_the_device_are_those_of_the_host(law):
-    """Corner forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean
+def test_elements_of_single_precision_are_those_of_double(law, element):
+    """Forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean
     dilatation."""
-    import warp as wp
-    from biotac_mj.skin.device_quadratic import Quadratic
-
-    from biotac_mj.skin.rubber.material import Material
-
-    rubber = Material(law, 1e6, 0.49)
-    model = SkinModel(load_skin("coarse"), rubber, SkinOptions(element="quadratic"))
-    element, rng = model.elasticity, np.random.default_rng(0)
+    geometry = load_skin("coarse")
+    model = SkinModel(geometry, Material(law, 1e6, 0.49), SkinOptions(element=element))
+    data, rng = SkinData(model, 2), np.random.default_rng(0)
     turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
-    vert = np.repeat(load_skin("coarse").vert[:, None], 2, axis=1) @ turn.T * 1.03
-    x = wp.array(vert + 1e-5 * rng.standard_normal(vert.shape), dtype=wp.vec3d, ndim=2)
-    p = rng.standard_normal(vert.shape).astype(np.float32)
-    mu = wp.array([rubber.mu] * 2, dtype=wp.float64)
-    lam = wp.array([rubber.bulk if law == "neo_hookean" else rubber.lame] * 2, dtype=wp.float64)
-    on, inverted, unused = (
-        wp.ones(2, dtype=int),
-        wp.zeros(2, dtype=int),
-        wp.zeros(vert.shape[:2], dtype=wp.vec3d),
-    )
-    scratch, device = element.allocate(2), Quadratic(element, 2)
-    element.force(scratch, mu, lam, x, unused)
-    device.force(mu, lam, x, on, inverted)
-    force = scratch.corner.numpy()
-    np.testing.assert_allclose(device.corner_force.numpy(), force, rtol=0, atol=3e-7 * np.abs(force).max())
-    element.product(scratch, mu, lam, x, wp.array(p.astype(float), dtype=wp.vec3d, ndim=2), unused)
-    device.product(mu, lam, x, wp.array(p, dtype=wp.vec3, ndim=2), on)
-    product = scratch.corner.numpy()
-    np.testing.assert_allclose(device.corner.numpy(), product, rtol=0, atol=2e-6 * np.abs(product).max())
+    vert = np.repeat(model.geometry.vert[:, None], 2, axis=1) @ turn.T * 1.03
+    data.x.assign(vert + 1e-5 * rng.standard_normal(vert.shape))
+    p, program, found = rng.standard_normal(vert.shape).astype(np.float32), Launcher("cpu"), []
+    on, inverted = wp.ones(2, dtype=int), wp.zeros(2, dtype=int)
+    for precision in (DOUBLE, SINGLE):
+        data._chosen = SimpleNamespace(precision=precision)
+        elements = data.element_forces()
+        elements.push_corners(program, data.x, on, inverted)
+        elements.multiply_corners(program, data.x, wp.array(p, dtype=precision.vec, ndim=2), on)
+        found.append((elements.corner_force.numpy(), elements.corner.numpy()))
+    (force, product), (other, rough) = found
+    np.testing.assert_allclose(other, force, rtol=0, atol=3e-7 * np.abs(force).max())
+    np.testing.assert_allclose(rough, product, rtol=0, atol=2e-6 * np.abs(product).max())
     assert (inverted.numpy() == 0).all()
 
 
-def test_one_world_alone_equals_the_host(model):
-    """Its inverse is applied in one pass, see `device_product`."""
+@pytest.mark.parametrize("law", [None, ContactLaw(adhesion=0.05, friction_exponent=0.3)])
+def test_contact_by_samples_is_that_by_faces(law):
+    """Few worlds on CUDA are evaluated sample by sample."""
+    model = finger(contact_law=law)
+    data, geoms = SkinData(model, 2), geom_set(2)
+    for depth in (3e-4, 6e-4):
+        geoms.set_pose(poses(random_worlds(2, seed=1), depth))
+        step(model, data, geoms)
+    geoms.set_pose(poses(random_worlds(2, seed=1), 8e-4))
+    ready, surfaces, found = prepare_step(model, data, geoms), (data.outer, data.core), []
+    for by_sample in (False, True):
+        if by_sample:
+            shapes = [s.trial_geom.shape for s in surfaces]
+            ready.k.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
+        for s in surfaces:
+            s.clearance.fill_(-1.0)
+            s.touching.zero_()
+            s.corner.zero_()
+        ready.evaluate_forces()
+        found.append([
+            a.numpy().copy()
+            for s in surfaces
+            for a in (s.node_force, s.touching, s.trial_geom, s.bond, s.clearance)
+        ])  # fmt: skip
+        found[-1].append(
+            ready.multiply_tangent(np.random.default_rng(0).standard_normal(data.x.shape + (3,)))
+        )
+    assert found[0][1].any()
+    for face, sample in zip(*found, strict=True):
+        np.testing.assert_allclose(sample, face, rtol=0, atol=1e-12 * max(abs(face).max(), 1e-9))
+
+
+def test_one_dense_world_equals_a_sparse_one(model):
+    """Its inverse is applied in one pass, see `symmetric_product`."""
     worlds = random_worlds(1, seed=5)
-    together, _ = walk(model, worlds, True, DEPTHS)
-    alone, _ = walk(model, worlds, False, DEPTHS)
+    together, _ = walk(model, worlds, "dense", DEPTHS)
+    alone, _ = walk(model, worlds, "sparse", DEPTHS)
     scale = np.abs(alone.wrench).max()
     np.testing.assert_allclose(together.wrench, alone.wrench, rtol=0, atol=1e-3 * scale)
     np.testing.assert_allclose(together.vert_xpos, alone.vert_xpos, rtol=0, atol=5e-7)

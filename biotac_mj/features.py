@@ -1,0 +1,220 @@
+"""What the skin can do, and by which path: one table, of which `docs/features.md` is made and which
+`tests/test_features.py` walks.
+
+    python -m biotac_mj.features > docs/features.md
+"""
+
+import dataclasses
+
+__all__ = ["FEATURES", "PATHS", "Absent", "Feature", "Refused", "markdown"]
+
+# name of a path -> what it is
+PATHS = {
+    "CPU": "`skin.step`, one world on the CPU",
+    "CUDA": "`skin.step`, one world on CUDA",
+    "worlds": "`skin.step`, many worlds, on either device",
+    "batch": "`batch.attach` inside `mujoco_warp.step`, and `batch.make`",
+    "attach": '`biotac_mj.attach`, tier "full" (`biotac press`, tasks)',
+    "condensed": '`biotac_mj.attach`, tier "condensed"',
+    "calibrate": "`calibration.calibrate`, `biotac calibrate`",
+    "compare": "`calibration.comparison.evaluate`, `biotac compare`",
+    "generate": '`biotac generate`, tier "full"',
+    "diagnose": '`discrepancy`\'s Simulator, `biotac diagnose`, tier "full"',
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Refused:
+    """A path that refuses a feature: ValueError whose text matches `match` (a regular expression)."""
+
+    match: str
+    why: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Absent:
+    """A path on which there is nothing to ask for."""
+
+    why: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Feature:
+    """A row of the table: a skin with the feature, and one without, whose forces differ.
+
+    Attributes:
+      name: in the table; where: what sets it.
+      material, skin: changes of Material and SkinOptions with the feature.
+      modulus: whether the elements' modulus varies with place.
+      worlds: in what worlds differ: "material", or names of `skin.per_world.NAMES`. Such a row compares two
+        worlds of one batch.
+      base_material, base_skin: both with and without the feature.
+      without: changes of both without it.
+      cells: path -> Refused or Absent; all others do it.
+    """
+
+    name: str
+    where: str
+    material: dict = dataclasses.field(default_factory=dict)
+    skin: dict = dataclasses.field(default_factory=dict)
+    modulus: bool = False
+    worlds: dict = dataclasses.field(default_factory=dict)
+    base_material: dict = dataclasses.field(default_factory=dict)
+    base_skin: dict = dataclasses.field(default_factory=dict)
+    without: dict = dataclasses.field(default_factory=dict)
+    cells: dict = dataclasses.field(default_factory=dict)
+
+    def cell(self, path: str) -> Refused | Absent | None:
+        """What a path has of it; None: it does it."""
+        return self.cells.get(path)
+
+
+_DRY = {"liquid": False}
+
+
+def _elastic(name):
+    return {"condensed": Refused(rf"the condensed tier is elastic.*{name}", "its compliance is made once")}
+
+
+_COULOMB = {"condensed": Refused("the condensed tier knows Coulomb's law alone", "its contact has no other")}
+_STILL = {"condensed": Refused("the condensed tier has no inertia", "its compliance has no mass")}
+_LAW = "`options.skin.contact_law`"
+_ONE = "one skin at a time"
+
+
+def _of_worlds(**cells):
+    """Cells of what differs by world: paths that have one world."""
+    out = {path: Absent(_ONE) for path in ("CPU", "CUDA", "attach", "compare", "diagnose")}
+    out["condensed"] = Absent(_ONE)
+    return out | cells
+
+
+_FITS = Absent("a fit's worlds differ in their materials; options that are fitted take a batch each")
+
+FEATURES = (
+    Feature("four-node tetrahedra", "`options.skin.element`", skin={"element": "linear"}, base_skin=_DRY,
+            without={"skin": {"element": "quadratic"}}),
+    Feature("ten-node tetrahedra", "`options.skin.element`", skin={"element": "quadratic"},
+            without={"skin": {"element": "linear"}}),
+    Feature("law corotational", "`material.law`", {"law": "corotational"},
+            without={"material": {"law": "neo_hookean"}}),
+    Feature("law svk", "`material.law`", {"law": "svk"}, without={"material": {"law": "linear"}}),
+    Feature("law neo_hookean", "`material.law`", {"law": "neo_hookean"}),
+    Feature("law linear", "`material.law`", {"law": "linear"}),
+    Feature("liquid", "`options.skin.liquid`", skin={"liquid": True}, without={"skin": _DRY}),
+    Feature("incompressible liquid", "`options.skin.bulk_modulus`", skin={"bulk_modulus": float("inf")},
+            without={"skin": {"bulk_modulus": 1e6}}),
+    Feature("filled skin", "`options.skin.fill_volume`", skin={"fill_volume": 2e-8}),
+    Feature("filled to a pressure", "`options.skin.rest_pressure`", skin={"rest_pressure": 2e3}),
+    Feature("less liquid than at rest", "`options.skin.fill_volume` < 0", skin={"fill_volume": -1e-8},
+            cells={"condensed": Refused("needs a skin clear of its core at rest",
+                                        "contact with the core begins from none")}),
+    Feature("contact with the core", "`options.skin.core_contact`", skin={"core_contact": True},
+            base_skin=_DRY, without={"skin": {"core_contact": False}}),
+    Feature("friction", "`material.friction`, or a path's own", {"friction": 0.7},
+            without={"material": {"friction": 0.0}}),
+    Feature("implicit dynamics", "`options.skin.dynamics`", {"density": 1e4}, {"dynamics": "implicit"},
+            without={"skin": {"dynamics": "quasistatic"}}, cells=_STILL),
+    Feature("damping", "`options.skin.mass_damping, .stiffness_damping`",
+            skin={"mass_damping": 400.0, "stiffness_damping": 2e-3}, base_skin={"dynamics": "implicit"},
+            cells=_STILL),
+    Feature("stress relaxation", "`material.prony`", {"prony": ((0.4, 0.02),)}, cells=_elastic("prony")),
+    Feature("softening", "`material.mullins`", {"mullins": (2.0, 100.0, 0.3)}, cells=_elastic("mullins")),
+    Feature("hysteresis", "`material.hysteresis`", {"hysteresis": ((0.5, 0.003),)},
+            cells=_elastic("hysteresis")),
+    Feature("stiffening", "`material.stiffening`", {"stiffening": 40.0}, cells=_elastic("stiffening")),
+    Feature("modulus by element", "`options.modulus`", modulus=True, cells=_elastic("modulus")),
+    Feature("adhesion", _LAW, skin={"contact_law": {"adhesion": 0.3}}, cells=_COULOMB),
+    Feature("adhesion with hysteresis", _LAW,
+            skin={"contact_law": {"adhesion": 0.1, "adhesion_hysteresis": 4.0, "adhesion_range": 8e-5}},
+            without={"skin": {"contact_law": {"adhesion": 0.1, "adhesion_range": 8e-5}}}, cells=_COULOMB),
+    Feature("friction that depends on pressure", _LAW,
+            skin={"contact_law": {"friction_exponent": 0.6, "friction_pressure": 3e4}}, cells=_COULOMB),
+    Feature("worlds differ in material", "a Material for each world; `vary`",
+            base_material={"prony": ((0.4, 0.02),)},
+            worlds={"material": ({"youngs_modulus": 1.2e6}, {"youngs_modulus": 1.8e6})}, cells=_of_worlds()),
+    Feature("worlds differ in relaxation", "a Material for each world; `vary`",
+            base_material={"prony": ((0.4, 0.02),)},
+            worlds={"material": ({"prony": ((0.1, 0.02),)}, {"prony": ((0.6, 0.02),)})}, cells=_of_worlds()),
+    Feature("worlds differ in adhesion", "`data.laws.set`, `worlds`, `vary`", worlds={"adhesion": (0.0, 0.3)},
+            cells=_of_worlds(calibrate=_FITS)),
+    Feature("worlds differ in the law of friction", "`data.laws.set`, `worlds`, `vary`",
+            worlds={"friction_exponent": (0.0, 0.6)}, cells=_of_worlds(calibrate=_FITS)),
+    Feature("worlds differ in fill", "`data.set_liquid`, `worlds`, `vary`",
+            worlds={"fill_volume": (0.0, 2e-8)}, cells=_of_worlds(calibrate=_FITS)),
+    Feature("worlds differ in the liquid's modulus", "`data.set_liquid`, `worlds`, `vary`",
+            worlds={"bulk_modulus": (1e4, 4e5)}, cells=_of_worlds(calibrate=_FITS)),
+    Feature("worlds differ in their elements' modulus", "`SkinData(modulus=)`, `worlds`",
+            worlds={"modulus": ()}, cells=_of_worlds(calibrate=_FITS, generate=Refused(
+                "cannot vary 'modulus'", "an interval says nothing of a map; vary youngs_modulus"))),
+)  # fmt: skip
+
+_READINGS = (
+    ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, generate"),
+    ("PAC", "22 values a frame", "attach, condensed, batch; `generate` keeps the latest of them"),
+    ("impedance of the electrodes", "yes", "generate, diagnose"),
+    ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
+    ("status (tier, steps lost)", "yes", "attach, condensed, batch; `converged` in generate"),
+    ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
+     "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
+     "materials, contact laws and fill"),
+)  # fmt: skip
+
+
+_TRAVEL = """\
+`material` is a preset's name, a dict of Material's fields, a `.json` file of them or a Material; `options` is
+`{"skin": {...}, "modulus": [...]}`, in Python a dict (with SkinOptions, a ContactLaw or arrays in it, if you
+like), on the command line `--options`, JSON or a file of it. `modulus` is a factor for each element, a `.npy`
+file of them or, in Python, a function of positions. `attach` writes all of it into the model as JSON.
+
+Rubber that relaxes, and inertia, take their time step from: `mj_step`'s timestep (attach, batch, press),
+`time_s` of an indentation (calibrate, compare; planned ones have 20 ms a sample), 1 / rate (generate), `time`
+of a trajectory (diagnose), shared among the steps between two rows. `skin.step` takes dt, a number or one for
+each world. What comes before the first row takes as long as what comes after it.
+
+`batch.attach(worlds={...})` and `skin.per_world.make_worlds` take (nworld,) numbers by name; `biotac generate
+--vary` draws them, and numbers of the material, anew for each interaction and keeps what was drawn in its
+parameters."""
+
+
+def markdown() -> str:
+    """`docs/features.md`."""
+    lines = [
+        "# What the skin can do, by path",
+        "",
+        "Made by `python -m biotac_mj.features > docs/features.md` from the table in "
+        "`biotac_mj/features.py`. "
+        "`tests/test_features.py`",
+        "walks it: every yes runs a small press whose force must change, every no must raise what is said "
+        "here.",
+        "",
+    ]
+    lines += [f"- **{path}**: {text}" for path, text in PATHS.items()]
+    lines += ["", f"| feature | set by | {' | '.join(PATHS)} |", f"|---|---|{'---|' * len(PATHS)}"]
+    notes, absent = [], []
+    for feature in FEATURES:
+        cells = []
+        for path in PATHS:
+            cell = feature.cell(path)
+            if cell is None:
+                cells.append("yes")
+                continue
+            kept = notes if isinstance(cell, Refused) else absent
+            if cell not in kept:
+                kept.append(cell)
+            number = kept.index(cell) + 1
+            cells.append(f"no ({number})" if kept is notes else f"- ({'abcdefgh'[number - 1]})")
+        lines.append(f"| {feature.name} | {feature.where} | {' | '.join(cells)} |")
+    lines += ["", "Refused, a ValueError that says what to do instead:"]
+    lines += [f"{i + 1}. `{one.match}`: {one.why}." for i, one in enumerate(notes)]
+    lines += ["", "Nothing to ask for:"]
+    lines += [f"- ({'abcdefgh'[i]}) {one.why}." for i, one in enumerate(absent)]
+    lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
+    lines += [f"| {' | '.join(row)} |" for row in _READINGS]
+    lines += ["", "## How options travel", ""]
+    lines.append(_TRAVEL)
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(markdown(), end="")
