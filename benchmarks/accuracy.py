@@ -5,15 +5,13 @@ mesh.
     [--picture out/accuracy.png]
 
 Every .npz of the folder is one case: held nodes, material, indenter, path, contact stiffness, stick slope and
-  friction are read from it
-(docs/benchmarks.md says what the fields are). The same path is walked with one step per stored increment;
-nothing is fitted.
+friction are read from it (docs/benchmarks.md says what the fields are). The same path is walked with one step
+per stored increment; nothing is fitted.
 
 force_error_rel: mean over increments of |F - F_ref|, over the largest |F_ref|.
-displacement_error_rel: mean over increments of the root mean square over all nodes of |u - u_ref|, over the
-  largest |u_ref|;
-displacement_pooled_rel takes the root mean square over nodes and increments together, which gives late
-increments more weight."""
+displacement_error_rel: mean over increments of the root mean square over all nodes of |u - u_ref|, over
+the largest |u_ref|; displacement_pooled_rel takes the root mean square over nodes and increments together,
+which gives late increments more weight."""
 
 import argparse
 import json
@@ -97,9 +95,8 @@ def _ring(inner, outer, edge, height=6e-3):
     up = np.stack([outer - edge + edge * np.cos(angle), edge * np.sin(angle) - edge], 1)
     down = np.stack([inner + edge - edge * np.sin(angle), edge * np.cos(angle) - edge], 1)
     profile = np.concatenate([[[outer, -height]], up, down, [[inner, -height], [outer, -height]]])
-    mesh = trimesh.creation.revolve(
-        1e3 * profile, sections=256
-    )  # in millimetres: trimesh drops triangles that are small in metres
+    # in millimetres: trimesh drops triangles that are small in metres
+    mesh = trimesh.creation.revolve(1e3 * profile, sections=256)
     if mesh.volume < 0:
         mesh.invert()
     return 1e-3 * mesh.vertices[:, [1, 2, 0]], mesh.faces  # its axis z to y, a rotation

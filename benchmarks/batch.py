@@ -7,9 +7,8 @@ The press of `speed.py` (its sphere, path and increments) with the default mater
 coupling, films, acquisition and all sensors, at MuJoCo's 2 ms. Everything between two steps is on the device;
 `ms_per_step` is the mean over the press between synchronisations.
 mb_per_world: device memory that grows with the number of worlds (skins and sensors); mb_used: all that the
-  process holds on the device
-beyond what it held before, mujoco_warp, torch and the model's inverse included. largest_nworld: what fits
-into 80 GB."""
+process holds on the device beyond what it held before, mujoco_warp, torch and the model's inverse
+included. largest_nworld: what fits into 80 GB."""
 
 import argparse
 import gc

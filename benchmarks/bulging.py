@@ -76,9 +76,8 @@ def main():
     print(
         f"all: Z lower in {lower.mean():.1%} of the samples, in the far half {lower[everywhere].mean():.1%}"
     )
-    pull = np.abs(change) > 3 / 3000 / (
-        1 - 3000 / 4095
-    )  # three counts of noise at 3000: dE / E = -(1 - E / 4095) d ln Z
+    # three counts of noise at 3000: dE / E = -(1 - E / 4095) d ln Z
+    pull = np.abs(change) > 3 / 3000 / (1 - 3000 / 4095)
     print(f"beyond the noise: lower {(lower & pull).mean():.1%}, higher {(~lower & pull).mean():.1%}")
 
 

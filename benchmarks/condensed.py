@@ -7,14 +7,11 @@
     python benchmarks/condensed.py --json out/condensed_fit.json --fit [--materials default]
 
 The same press is made with both tiers: along the inward normal at the location, to 2.4 mm, without noise of
-  its own in the comparison
-(both tiers draw the same). force: size of the force on the indenter. film: distance from the inner surface to
-the core at the node
-where the press thins the film most. counts: root mean square over the 19 electrodes of the tiers' difference,
-  beside
-the largest change of any electrode in the full FEM. "beyond": from this depth on the tier says itself that
-its error was not measured.
-ms: median of the processor time of a step of the skin alone (no readings).
+its own in the comparison (both tiers draw the same). force: size of the force on the indenter. film: distance
+from the inner surface to the core at the node where the press thins the film most. counts: root mean square
+over the 19 electrodes of the tiers' difference, beside the largest change of any electrode in the full FEM.
+"beyond": from this depth on the tier says itself that its error was not measured. ms: median of the processor
+time of a step of the skin alone (no readings).
 
 --fit finds the constants of `skin/condensed/correction.py` for the law of the material: least squares of the
 logarithms of force and (weight 0.3) pressure against the full FEM over all presses, small errors squared and
@@ -22,9 +19,8 @@ large ones nearly linear."""
 
 import os
 
-os.environ.update(
-    OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1"
-)  # before numpy reads them
+# before numpy reads them
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import argparse
 import dataclasses

@@ -9,9 +9,8 @@ Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed 
 its record); run again, it goes on where it stopped. Beside the verdicts stand two baselines: least RMS in
 sample, and BIC with samples taken as independent.
 Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the
-  catalogue, for calibration.
-Counts are for each effect with single and left-out, else for the kind. Kernels are compiled and fields of the
-plans solved before the work is shared out."""
+catalogue, for calibration. Counts are for each effect with single and left-out, else for the kind. Kernels
+are compiled and fields of the plans solved before the work is shared out."""
 
 import argparse
 import hashlib

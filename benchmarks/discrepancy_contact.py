@@ -4,9 +4,8 @@ after the skin and inside it.
     python benchmarks/discrepancy_contact.py --json out/contact.json
 
 Printed are: how the pressure of the nodes under a sphere of 7 mm grows with its load (the map from
-  fric_load's exponent to the contact's);
-how hard the sphere sticks when it is drawn off, against Johnson, Kendall and Roberts; the comparisons. Forces
-are signed: positive pushes."""
+fric_load's exponent to the contact's); how hard the sphere sticks when it is drawn off, against Johnson,
+Kendall and Roberts; the comparisons. Forces are signed: positive pushes."""
 
 import argparse
 import json

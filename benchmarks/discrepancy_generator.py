@@ -180,9 +180,8 @@ class Generator:
                 - s.compliance * np.outer(np.maximum(-s.force @ s.one["heading"], 0), s.one["heading"])
                 for s in states
             ]
-            poses = [
-                0.8 * new + 0.2 * old for new, old in zip(wanted, poses)
-            ]  # the mount gives way: most of the way to balance each time
+            # the mount gives way: most of the way to balance each time
+            poses = [0.8 * new + 0.2 * old for new, old in zip(wanted, poses)]
         for s in states:
             s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
             s.rest = s.impedance[0]

@@ -4,10 +4,9 @@ elements.
 
     python benchmarks/discrepancy_in_skin_proof.py --json out/in_skin_proof.json
 
-The measurement is synthetic: the full tier's skin with these constants in its elements, 10 % stiffer than the
-  simulator's, slips of the
-pose of 20 um, noise and 12 bits; presses of two spheres. The share closed is that of the trajectories kept
-aside."""
+The measurement is synthetic: the full tier's skin with these constants in its elements, 10 % stiffer than
+the simulator's, slips of the pose of 20 um, noise and 12 bits; presses of two spheres. The share closed is
+that of the trajectories kept aside."""
 
 import argparse
 import json

@@ -53,10 +53,10 @@ def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0
     holds it.
 
     Returns:
-      ms_per_step: wall time of a step while the spheres move, of all worlds; steps: how many moved; setup_s:
-        with compilation;
-      forces (n, worlds, 3) of the skin on the sphere in each step [N]; force: (3,) of the first world at the
-      end [N].
+      ms_per_step: wall time of a step while the spheres move, of all worlds; steps: how many moved;
+      setup_s: with compilation;
+      forces (n, worlds, 3) of the skin on the sphere in each step [N];
+      force: (3,) of the first world at the end [N].
     """
     begin = time.perf_counter()
     size = 1e-9  # of a node [m]

@@ -130,9 +130,8 @@ class Grasp:
         m = self.model
         self.data = mujoco.MjData(m)
         self.core = np.array([m.body(h.body).id for h in self.handles.values()])
-        self.link = m.body_parentid[
-            m.body_parentid[self.core]
-        ]  # the link before the one that carries the BioTac
+        # the link before the one that carries the BioTac
+        self.link = m.body_parentid[m.body_parentid[self.core]]
         self.joint = np.array(
             [j for j in range(m.njnt) if m.joint(j).name.startswith("hand_") and "WRJ" not in m.joint(j).name]
         )
@@ -211,7 +210,7 @@ class Grasp:
         kept.
 
         Inwards the thumb bends its last joint: what it presses against then pushes its other links away from
-          the object.
+        the object.
         """
         point, out = self._place(near)
         thumb = np.array([f == "th" for f in self.handles])

@@ -100,9 +100,8 @@ def _keep(error):
 
 def _guarded(on_error):
     def decorate(function):
-        finalizing = (
-            sys.is_finalizing
-        )  # what is left when MuJoCo frees the last mjData: this module's names are gone by then
+        # what is left when MuJoCo frees the last mjData: this module's names are gone by then
+        finalizing = sys.is_finalizing
 
         @functools.wraps(function)
         def call(*args):
@@ -250,7 +249,7 @@ def check():
     none.
 
     Call it in long loops: a KeyboardInterrupt that came while a skin was solved is among the errors, for it
-      cannot pass through C either.
+    cannot pass through C either.
     """
     with _lock:
         errors = list(_errors)

@@ -2,12 +2,11 @@
 biotac_mj/sensor/film.py.
 
 Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric
-about z = 0, whose film
-impedances at rest come nearest to the published rest counts: least RMS of ln(published / film) after its
-  mean, over the mean pattern of
-the three published sensors. Four numbers are fitted to 19 that symmetry makes about 12, so this is an
-estimate, not a measurement; the list of local optima shows how flat it is. EXCITATION is the best on the
-paper's mesh (import it, then pass --skin); takes a minute.
+about z = 0, whose film impedances at rest come nearest to the published rest counts: least RMS of
+ln(published / film) after its mean, over the mean pattern of the three published sensors. Four numbers are
+fitted to 19 that symmetry makes about 12, so this is an estimate, not a measurement; the list of local optima
+shows how flat it is. EXCITATION is the best on the paper's mesh (import it, then pass --skin); takes a
+minute.
 
     python scripts/fit_excitation.py [--skin default]
 """
@@ -21,9 +20,8 @@ from scipy.optimize import minimize
 from biotac_mj.sensor.channels import REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.film import CONDUCTIVITY, FilmConduction
 
-CLEARANCE = (
-    1.7e-3  # [m] between the centres of any two discs, so that their footprints in the sheet do not overlap
-)
+# [m] between the centres of any two discs, so that their footprints in the sheet do not overlap
+CLEARANCE = 1.7e-3
 
 
 def target():

@@ -5,8 +5,7 @@ parts and the indenters.
     python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
 
 fTetWild repeats itself only roughly, even on one thread: node counts differ by about 1 % from run to run; the
-  surfaces and the quality
-stay the same.
+surfaces and the quality stay the same.
 """
 
 import argparse

@@ -70,9 +70,8 @@ def _depth(geom, point):
         normal = np.zeros_like(point)
         normal[np.arange(len(point)), axis] = np.sign(point[np.arange(len(point)), axis])
         return -gap.max(axis=1), normal
-    return np.full(len(point), -1.0), np.tile(
-        [0.0, 0.0, 1.0], (len(point), 1)
-    )  # the springs do not feel other shapes
+    # the springs do not feel other shapes
+    return np.full(len(point), -1.0), np.tile([0.0, 0.0, 1.0], (len(point), 1))
 
 
 class SpringSkin:

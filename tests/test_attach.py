@@ -281,9 +281,8 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
     add(1050.0, geometry.vert[geometry.tets])
     for part in ("core", "nail", "clamp"):
         add(1200.0, cone(getattr(geometry, f"{part}_vert"), getattr(geometry, f"{part}_face")))
-    add(
-        1000.0, cone(geometry.vert, geometry.inner_face), -1.0
-    )  # liquid: the cavity, whose face normals point inwards,
+    # liquid: the cavity, whose face normals point inwards,
+    add(1000.0, cone(geometry.vert, geometry.inner_face), -1.0)
     add(1000.0, cone(geometry.core_vert, geometry.core_face), -1.0)  # without the core
     center = first / mass
     inertia = (

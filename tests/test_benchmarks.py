@@ -132,11 +132,8 @@ def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
     from biotac_mj.skin.contact.limits import rest_gap
 
     geoms, pos, mat = accuracy.case_geoms(shape, 0.0)
-    point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [
-        0,
-        5e-4,
-        0,
-    ]  # around the front
+    # around the front
+    point = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * [8e-3, 1e-3, 8e-3] - [0, 5e-4, 0]
     if shape["shape"].startswith("cylinder"):
         point *= [2, 1, 0.5]
     local = (point - pos[0]) @ mat[0]

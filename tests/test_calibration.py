@@ -164,9 +164,8 @@ def test_four_configurations_order_of_stiffness():
 def test_solids_fill_what_they_should(name):
     skin = configuration(name).geometry
     shell = configuration("deformable_shell").geometry
-    outside = (
-        1e9 * (TetMesh(shell.vert, shell.tets).volumes.sum()) + 1751.130
-    )  # the coarse skin and the cavity of its card [mm^3]
+    # the coarse skin and the cavity of its card [mm^3]
+    outside = 1e9 * (TetMesh(shell.vert, shell.tets).volumes.sum()) + 1751.130
     wanted = outside - (1395.597 if name == "solid_with_core" else 0.0)
     mesh = TetMesh(skin.vert, skin.elem).check()
     assert 1e9 * mesh.volumes.sum() == pytest.approx(wanted, rel=0.02)
@@ -182,9 +181,8 @@ def test_robust_covariance_of_autocorrelated_noise():
         noise[t] = a * noise[t - 1] + shock
     white, robust, lags = covariance(np.ones((n, 1, 1)), noise[:, None])
     assert white[0, 0] == pytest.approx(1 / (1 - a**2) / n, rel=0.05)
-    weights = 1 + 2 * sum(
-        (1 - k / (lags + 1)) * a**k for k in range(1, lags + 1)
-    )  # Bartlett's share of (1 + a) / (1 - a)
+    # Bartlett's share of (1 + a) / (1 - a)
+    weights = 1 + 2 * sum((1 - k / (lags + 1)) * a**k for k in range(1, lags + 1))
     assert robust[0, 0] / white[0, 0] == pytest.approx(weights, rel=0.1)
 
 

@@ -73,9 +73,8 @@ def test_a_ball_reads_its_weight(mass, timestep):
         mujoco.mj_step(model, data)
         forces.append(handle.read(data, "contact_force")[:3])
     weight = mass * G
-    np.testing.assert_allclose(
-        forces, np.tile([0.0, weight, 0.0], (20, 1)), atol=0.01 * weight
-    )  # no chatter: every step, not the mean
+    # no chatter: every step, not the mean
+    np.testing.assert_allclose(forces, np.tile([0.0, weight, 0.0], (20, 1)), atol=0.01 * weight)
     assert np.ptp(np.array(forces)[:, 1]) < 0.005 * weight
     # MuJoCo's balance without constraints: the passive force carries the weight
     np.testing.assert_allclose(data.qfrc_passive[2], data.qfrc_bias[2], rtol=0.01)

@@ -73,9 +73,8 @@ def check_weight(mass, timestep, **settings):
     stiffness = STIFFNESS[mass]
     critical = 2 * np.sqrt(stiffness * mass)
     damping = min(0.7 * critical, 0.2 * mass / timestep)
-    rate = damping / (2 * mass) + min(
-        0.5 * stiffness / mass * timestep, 0.5 / timestep
-    )  # the damper's, and backward Euler's own
+    # the damper's, and backward Euler's own
+    rate = damping / (2 * mass) + min(0.5 * stiffness / mass * timestep, 0.5 / timestep)
     model, data, handle = scene(ball(mass, UPRIGHT.format(damping)), timestep, **settings)
     mujoco.mj_step(model, data, int(12 / rate / timestep) + 20)
     weight, force, balance, clamp, speed = mass * G, [], [], [], []
@@ -148,9 +147,8 @@ def test_a_ball_sticks_and_slips_at_mu(timestep):
     """Pressed by 0.3 N and pushed along the finger, where the pad is flat to 2 degrees."""
     mass, load, mu = 0.03, 0.3, 0.4
     joints = UPRIGHT.format(3) + '<joint name="x" type="slide" axis="1 0 0" damping="1"/>'
-    model, data, handle = scene(
-        ball(mass, joints), timestep, friction=mu
-    )  # MuJoCo's rule: the larger friction counts
+    # MuJoCo's rule: the larger friction counts
+    model, data, handle = scene(ball(mass, joints), timestep, friction=mu)
     data.qfrc_applied[0] = mass * G - load
     mujoco.mj_step(model, data, int(0.1 / timestep))
     for share in np.linspace(0, 0.85, int(0.05 / timestep)):
@@ -478,10 +476,8 @@ def test_an_accelerating_finger_leaves_its_skin_behind(coupling):
     acceleration = 100.0
     data.qfrc_applied[0] = acceleration * model.body_subtreemass[1]
     mujoco.mj_step(model, data, 60)
-    moved, expected = (
-        skin.vert_xpos[0] - rest,
-        sagging(skin.model, [0, -acceleration, 0]),
-    )  # up is the BioTac's -y
+    # up is the BioTac's -y
+    moved, expected = (skin.vert_xpos[0] - rest, sagging(skin.model, [0, -acceleration, 0]))
     assert abs(expected).max() > 2e-5
     assert abs(moved - expected).max() < 0.03 * abs(expected).max()
 

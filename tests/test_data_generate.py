@@ -174,9 +174,8 @@ def test_a_small_set_is_physics(small, skin):
             k = int(np.abs(force).sum(1).argmax())
             np.testing.assert_allclose(film.impedance(x[k]), one.impedance[k], rtol=1e-4)
             still = counts_from_impedance(one.impedance)
-            moved = 0.2 * np.abs(
-                np.diff(still, axis=0, prepend=still[:1])
-            )  # in a frame of 10 ms, a fifth of a time step
+            # in a frame of 10 ms, a fifth of a time step
+            moved = 0.2 * np.abs(np.diff(still, axis=0, prepend=still[:1]))
             assert (np.abs(one.counts[:, :19] - still) < moved + 33).all()  # five times the noise
             assert np.abs(one.counts[:, 19] - counts_from_pressure(one.pressure)).max() < 8
             assert (one.counts == np.rint(one.counts)).all()

@@ -29,9 +29,8 @@ needs_paper = pytest.mark.skipif(
     reason="needs NVlabs/biotac_sim's mesh in ../shared/data, which is not part of the project",
 )
 
-REGULAR = np.array(
-    [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]
-)  # edge 2 sqrt 2, positive in this order
+# edge 2 sqrt 2, positive in this order
+REGULAR = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 
 
 @pytest.fixture(scope="module", params=SKINS)
@@ -45,9 +44,8 @@ def test_regular_tetrahedron():
     ).check()
     np.testing.assert_allclose(mesh.volumes, 8 / 3)  # edge^3 / (6 sqrt 2)
     np.testing.assert_allclose(mesh.dihedral_angles, np.arccos(1 / 3))
-    np.testing.assert_allclose(
-        enclosed_volume(mesh.vert, mesh.boundary), 8 / 3
-    )  # so the faces point outwards
+    # so the faces point outwards
+    np.testing.assert_allclose(enclosed_volume(mesh.vert, mesh.boundary), 8 / 3)
 
 
 def cube_mesh(n=2):
@@ -217,9 +215,8 @@ def test_electrodes(skin):
     assert distance.max() < 0.02
     np.testing.assert_allclose(np.linalg.norm(skin.electrode_normal, axis=1), 1.0, atol=1e-12)
     assert np.min(np.sum(core.face_normals[face] * skin.electrode_normal, axis=1)) > np.cos(np.radians(10))
-    np.testing.assert_allclose(
-        skin.electrode_normal[6:10], [[-0.5, -np.sqrt(0.75), 0.0]] * 4, atol=1e-6
-    )  # E7-E10 on the facet
+    # E7-E10 on the facet
+    np.testing.assert_allclose(skin.electrode_normal[6:10], [[-0.5, -np.sqrt(0.75), 0.0]] * 4, atol=1e-6)
     # E11..E16 mirror E1..E6
     np.testing.assert_allclose(skin.electrode_pos[10:16], skin.electrode_pos[:6] * [1, 1, -1], atol=1e-9)
     # Lin's table lies 0.245 mm below the surface of the cylinder; E1, E6 and their mirror images sit at its
@@ -319,9 +316,8 @@ def rounded_cylinder(radius, length, edge=1.0):
     """A fillet cuts (1 - pi/4) edge^2 off the rim's section; that piece's centroid (square less quarter disc)
     gives its volume (Pappus)."""
     area = (1 - np.pi / 4) * edge**2
-    centroid = (
-        0.5 * edge**3 - (np.pi / 4) * edge**2 * (edge - 4 * edge / (3 * np.pi))
-    ) / area  # from the corner's side, by first moments
+    # from the corner's side, by first moments
+    centroid = (0.5 * edge**3 - (np.pi / 4) * edge**2 * (edge - 4 * edge / (3 * np.pi))) / area
     return np.pi * radius**2 * length - 2 * area * 2 * np.pi * (radius - centroid)
 
 
@@ -357,11 +353,12 @@ def test_ring_is_a_ring():
     assert radius.min() == pytest.approx(0.0035) and radius.max() == pytest.approx(0.007)
     assert len(vert) - len(face) / 2 == 0  # Euler number of a torus
     top = vert[vert[:, 1] > -1e-9]
+    # flat between 1 mm rims
     np.testing.assert_allclose(
         [np.hypot(top[:, 0], top[:, 2]).min(), np.hypot(top[:, 0], top[:, 2]).max()],
         [0.0045, 0.006],
         rtol=1e-6,
-    )  # flat between 1 mm rims
+    )
 
 
 def test_indenters_in_mujoco():

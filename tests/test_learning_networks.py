@@ -93,9 +93,8 @@ def test_hierarchy_reproduces_linear_fields_and_keeps_the_walls_apart(skin, leve
     here = skin.vert
     for level in levels[:-1]:
         np.testing.assert_allclose(level.up @ np.ones(len(level.keep)), 1, atol=1e-12)
-        np.testing.assert_allclose(
-            level.up @ here[level.keep], here, atol=2e-6
-        )  # [m], from a small ridge where neighbours lie in a plane
+        # [m], from a small ridge where neighbours lie in a plane
+        np.testing.assert_allclose(level.up @ here[level.keep], here, atol=2e-6)
         here = here[level.keep]
     for level in levels:
         eigenvalue = np.linalg.eigvalsh(level.laplacian.toarray()) if level.laplacian.shape[0] < 800 else None

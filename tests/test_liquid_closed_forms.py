@@ -159,9 +159,8 @@ def test_no_pressure_where_the_skin_lies_on_the_core(on_core):
     dry = np.minimum(traction / (2 * data.worlds.reference.numpy()[0]), 1)
     assert (dry == 1).sum() > 5 and ((dry > 0) & (dry < 1)).sum() > 5
     mesh = trimesh.Trimesh(data.vert_xpos[0], face, process=False)
-    missing = (mesh.face_normals * (mesh.area_faces * dry.mean(1))[:, None]).sum(
-        0
-    )  # out of the skin: the liquid would push the other way
+    # out of the skin: the liquid would push the other way
+    missing = (mesh.face_normals * (mesh.area_faces * dry.mean(1))[:, None]).sum(0)
     np.testing.assert_allclose(data.liquid_force[0].sum(0), p * missing, rtol=1e-9)
     assert p * np.linalg.norm(missing) > 1e-3 * abs(data.wrench[0, 0, 1])
     total = data.contact_force[0] + data.core_force[0] + data.liquid_force[0]
@@ -294,9 +293,8 @@ def test_filled_sensor_in_the_coupling(coarse):
     rest = readings.rest
     result = stepper.solve_skin(state, np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.01)
     counts = readings.advance(memory, 0.0, 0.01, result.vert_xpos, result.pressure)
-    np.testing.assert_array_equal(
-        counts["electrodes"], rest["electrodes"]
-    )  # the published counts are the filled sensor's
+    # the published counts are the filled sensor's
+    np.testing.assert_array_equal(counts["electrodes"], rest["electrodes"])
     assert counts["pdc"] == rest["pdc"] == 2000
 
 

@@ -269,9 +269,8 @@ def test_core_distance_against_all_triangles():
     for body in (mesh, box):
         point = trimesh.sample.sample_surface(body, 300, seed=1)[0] + rng.normal(scale=0.7e-3, size=(300, 3))
         distance, foot, _ = CoreSurface(body.vertices, body.faces).closest(point)
-        scaled = trimesh.Trimesh(
-            body.vertices * 1e3, body.faces, process=False
-        )  # closest_point drops small triangles in metres
+        # closest_point drops small triangles in metres
+        scaled = trimesh.Trimesh(body.vertices * 1e3, body.faces, process=False)
         expected = scaled.nearest.signed_distance(point * 1e3) * -1e-3
         np.testing.assert_allclose(distance, expected, atol=2e-6)
         np.testing.assert_allclose(np.linalg.norm(point - foot, axis=1), np.abs(distance), atol=1e-12)

@@ -56,14 +56,8 @@ def test_pressing_raises_under_the_contact_and_the_bulge_lowers_elsewhere(film):
     rest = film.impedance(film.geometry.vert)
     change = np.log(film.impedance(indented(film, 1.4e-3, conserve=1.0)) / rest)
     assert np.argmax(change) == E17 and change[E17] > 0.15
-    away = [
-        0,
-        3,
-        5,
-        10,
-        13,
-        15,
-    ]  # E1 E4 E6 and their mirror images: thin film on the flanks, far from the dent
+    # E1 E4 E6 and their mirror images: thin film on the flanks, far from the dent
+    away = [0, 3, 5, 10, 13, 15]
     assert np.all(change[away] < -0.02)
     dry = np.log(film.impedance(indented(film, 1.4e-3, conserve=0.0)) / rest)
     assert np.all(change < dry)
@@ -77,9 +71,8 @@ def test_readings_follow_a_press(geometry, film):
     assert rows["electrodes"].shape == (11, 19) and rows["pac"].shape == (11, 22)
     assert np.array_equal(rows["electrodes"][0], channels.REST_COUNTS["1"])
     assert np.all(np.diff(rows["electrodes"][1:, E17]) < 0)
-    last = (
-        0.09 + 39 / SLOT_RATE - 1 / (2 * np.pi * 1040)
-    )  # PDC's last slot, less the low-pass filter's delay on a ramp
+    # PDC's last slot, less the low-pass filter's delay on a ramp
+    last = 0.09 + 39 / SLOT_RATE - 1 / (2 * np.pi * 1040)
     assert channels.pressure_from_counts(rows["pdc"][-1]) == pytest.approx(5e3 * last / 0.1, abs=20)
     assert np.all(rows["tdc"] == rows["tdc"][0])
 

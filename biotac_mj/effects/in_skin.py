@@ -10,15 +10,8 @@ import numpy as np
 
 __all__ = ["Inside", "memory_of", "modulus_of"]
 
-_TAUS = (
-    0.03,
-    0.1,
-    0.3,
-    1.0,
-    3.0,
-    10.0,
-    30.0,
-)  # [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
+# [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
+_TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 
 # what benchmarks/discrepancy_in_skin_maps.py measured on presses of the coarse skin (docs/memory.md):
@@ -62,10 +55,8 @@ _PARTING = 3.0  # work of parting over that of joining, as in `skin_and_setup.Ad
 _PRESSURE = 0.70, 1.65e5
 
 
-_ENERGY, _SHARE = (
-    1.0,
-    0.6,
-)  # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
+# m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
+_ENERGY, _SHARE = (1.0, 0.6)
 
 
 class Inside(typing.NamedTuple):
@@ -164,6 +155,7 @@ def _asper(inside, theta):
         inside.film["power"] = inside.film.get("power", 1.0) * float(np.exp(theta["log_p"]))
 
 
+# effect id -> function that writes it into an Inside
 _BECOMES = {
     "relax": _relax,
     "creep": _creep,
@@ -175,4 +167,4 @@ _BECOMES = {
     "fric_load": _fric_load,
     "fluidloss": _fluidloss,
     "asper": _asper,
-}  # effect id -> function that writes it into an Inside
+}

@@ -100,9 +100,8 @@ class Gain(Effect):
 
     def doubt(self, theta: dict) -> str | None:
         g = np.array(list(theta.values()))
-        return (
-            "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
-        )  # scatter of manufacturing has no mean
+        # scatter of manufacturing has no mean
+        return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
     def apply(self, run: Run, theta: dict) -> None:
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)

@@ -9,9 +9,8 @@ from biotac_mj.geometry.skin_geometry import PARTS, SkinGeometry
 
 __all__ = ["EDGES", "with_edge_nodes"]
 
-EDGES = np.array(
-    [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
-)  # of the nodes 4..9, in the order of CalculiX's C3D10
+# of the nodes 4..9, in the order of CalculiX's C3D10
+EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 
 # least share of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in each
 # of its parts

@@ -20,10 +20,9 @@ def import_mesh(path: pathlib.Path | str, name: str | None = None) -> SkinGeomet
     """A skin from a folder, or from a mesh file whose folder also holds the rigid bodies.
 
     The mesh is a tetrahedral shell in metres in the BioTac frame (`.tet`, `.msh`, `.vtu`). Every `.obj` of
-    the same folder is read;
-    together they must hold three closed bodies: the core (the largest), the nail plate, and the clamp plate
-      (further to +x than the nail).
-    Nodes within 1e-5 m of them are held; electrodes are Lin et al. 2013's, projected onto this core.
+    the same folder is read; together they must hold three closed bodies: the core (the largest), the nail
+    plate, and the clamp plate (further to +x than the nail). Nodes within 1e-5 m of them are held; electrodes
+    are Lin et al. 2013's, projected onto this core.
 
     Raises:
       FileNotFoundError: no such path, or no mesh in the folder.
@@ -81,9 +80,8 @@ def read_tet_mesh(path: pathlib.Path | str) -> TetMesh:
         )
     if (elem >= len(mesh.points)).any() or (elem < 0).any():
         return TetMesh(mesh.points, elem)  # check() explains
-    used, elem = np.unique(
-        elem, return_inverse=True
-    )  # such files also hold the points of curves and surfaces
+    # such files also hold the points of curves and surfaces
+    used, elem = np.unique(elem, return_inverse=True)
     return TetMesh(mesh.points[used], elem.reshape(-1, 4))
 
 

@@ -6,9 +6,8 @@ package sees, is in metres.
 Sources of the numbers:
   [lin]  the 19 electrode coordinates and the 30 degree facet of Lin et al. 2013.
   [nv]   dimensions measured on the mesh of Narang et al., ICRA 2021 (NVlabs/biotac_sim, MIT): least-squares
-  fits of the section family
-         below to its surface vertices, rounded to 0.01 mm; its vertices lie within 0.06 mm RMS of these
-         surfaces, most of it at the clamp.
+         fits of the section family below to its surface vertices, rounded to 0.01 mm; its vertices lie within
+         0.06 mm RMS of these surfaces, most of it at the clamp.
 """
 
 import dataclasses
@@ -89,9 +88,8 @@ class BioTacDimensions:
     makes the spherical tip."""
 
     outer: tuple = _OUTER  # outer skin [nv]
-    outer_tip: float = (
-        -14.34
-    )  # centre of the tip sphere [nv]: the outermost point of the mesh is at x = -21.31
+    # centre of the tip sphere [nv]: the outermost point of the mesh is at x = -21.31
+    outer_tip: float = -14.34
     outer_end: float = 6.65  # end face on the clamp plate [nv]
     outer_end_edge: float = 1.80  # its rounded edge [nv]
     cavity: tuple = _CAVITY  # inner skin [nv]
@@ -105,11 +103,8 @@ class BioTacDimensions:
     core_end: float = 5.08
     # [nv] has 0.5; wider, so that chords of the skin across its own edge of 0.42 do not cut into the core
     core_end_edge: float = 0.90
-    facet_normal: tuple = (
-        -0.5,
-        -0.8660254037844386,
-        0.0,
-    )  # flat of electrodes E7-E10, 30 degrees to the axis [lin]
+    # flat of electrodes E7-E10, 30 degrees to the axis [lin]
+    facet_normal: tuple = (-0.5, -0.8660254037844386, 0.0)
     facet_offset: float = 10.795  # its distance from the origin [nv]
     facet_edge: float = 0.30  # [nv]
     nail_thickness: float = 1.0  # [nv]
@@ -118,9 +113,8 @@ class BioTacDimensions:
     clamp_thickness: float = 1.0  # [nv]
     clamp_centre_y: float = -0.8125  # [nv]
     clamp_radius: float = 4.1245  # [nv]
-    electrode_origin_x: float = (
-        -12.30
-    )  # x' = -x - 12.30, y' = z, z' = y turns Lin's frame into the BioTac frame (a proper rotation)
+    # x' = -x - 12.30, y' = z, z' = y turns Lin's frame into the BioTac frame (a proper rotation)
+    electrode_origin_x: float = -12.30
 
 
 def _cut_disc(y, w, radius, top):
@@ -150,9 +144,8 @@ class Body:
 
         table = np.asarray(sections, dtype=float)
         self._x, self._tip, self._end, self._end_edge, self._facet = table[:, 0], tip, end, end_edge, facet
-        self._section = PchipInterpolator(
-            table[:, 0], table[:, 1:], axis=0
-        )  # monotone, so that the flat tops stay exactly flat
+        # monotone, so that the flat tops stay exactly flat
+        self._section = PchipInterpolator(table[:, 0], table[:, 1:], axis=0)
 
     def field(self, point: np.ndarray) -> np.ndarray:
         """Implicit function at (n, 3) [mm] -> (n,); close to a distance, zero on the surface."""

@@ -18,9 +18,8 @@ class LearningConfig:
       mesh_kl, electrode_kl: weight of the divergence, summed over the code, against squared error summed over
         the field (in units of its scale), without annealing [4].
       mesh_channels, mesh_factors, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for
-      mean and log variance follow the
-        hidden layer [5]; no normalisation layers, no activation at the output, no bias in the last
-        convolution [11].
+        mean and log variance follow the hidden layer [5]; no normalisation layers, no activation at the
+        output, no bias in the last convolution [11].
       electrode_hidden, electrode_latent: of the paper.
       forward_hidden, inverse_hidden: the paper's widths are read as hidden, with a linear layer to the code
         behind them [6].

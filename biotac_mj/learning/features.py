@@ -62,12 +62,10 @@ class FilmFeatures(nn.Module):
     """Film and strain of the inner skin over each electrode, for one head that all electrodes share.
 
     The gap h of an inner node is its rest value plus the displacement along the direction away from the core
-    (linearised), at least 50 um.
-    For Gaussian patches of three radii around each electrode: mean ln(h / h0), mean h0 / h - 1, displacement
-      along the electrode's
-    normal and two tangents [mm]; the slopes of the displacement over the patch of the middle radius (6, the
-    skin's local strain and tilt); and mean ln(h / h0) near the four excitation electrodes and over the whole
-    film (5), which all currents cross.
+    (linearised), at least 50 um. For Gaussian patches of three radii around each electrode: mean ln(h / h0),
+    mean h0 / h - 1, displacement along the electrode's normal and two tangents [mm]; the slopes of the
+    displacement over the patch of the middle radius (6, the skin's local strain and tilt); and mean ln(h /
+    h0) near the four excitation electrodes and over the whole film (5), which all currents cross.
 
     The second tangent points away from the midplane, so that an electrode and its mirror image see alike.
 
@@ -120,9 +118,8 @@ class FilmFeatures(nn.Module):
         tangent = np.einsum("enk,eak->ena", offset, frame[:, 1:])  # (19, n, 2)
         centred = tangent - np.einsum("en,ena->ea", w, tangent)[:, None]
         spread = np.einsum("en,ena,enb->eab", w, centred, centred)
-        slope = np.einsum(
-            "en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2))
-        )  # (19, 2, n)
+        # (19, 2, n)
+        slope = np.einsum("en,ena,eab->ebn", w, centred, np.linalg.inv(spread + 1e-9 * np.eye(2)))
         operators = [w_[:, None] for w_ in patches] + [1e-3 * slope]
         operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
         linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(NELECTRODE * operator.shape[1] * 3, -1)
@@ -162,9 +159,8 @@ class FilmFeatures(nn.Module):
         mean_inverse = (
             torch.log1p((inverse @ self.patch.T).clamp(min=-0.9)).view(n, len(_RADII), -1).transpose(1, 2)
         )
-        local[..., len(_RADII) :] = (
-            mean_inverse  # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
-        )
+        # ln of the mean of 1/h: resistances in series; ln h alone is the mean of the ln
+        local[..., len(_RADII) :] = mean_inverse
         whole = (thinner @ self.whole.T)[:, self.order]
         return torch.cat([local, linear, whole], 2)
 
@@ -180,9 +176,8 @@ def mirror_matrix(geometry):
     b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
     b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
     best = np.argmax(b.min(2), axis=1)
-    chosen = np.clip(
-        b[np.arange(len(b)), best], 0, None
-    )  # curved surfaces do not mirror onto themselves exactly
+    # curved surfaces do not mirror onto themselves exactly
+    chosen = np.clip(b[np.arange(len(b)), best], 0, None)
     chosen /= chosen.sum(1, keepdims=True)
     node = tets[near[np.arange(len(b)), best]]
     rows = np.repeat(np.arange(len(vert)), 4)

@@ -54,10 +54,8 @@ def adapt(predicted, measured, owner, slope) -> np.ndarray:
     touches = [owner == k for k in np.unique(owner)]
     if len(touches) < 3:
         return np.ones(NELECTRODE)
-    x, y = (
-        [slope[t] * predicted[t] for t in touches],
-        [slope[t] * measured[t] for t in touches],
-    )  # changes of counts, to first order
+    # changes of counts, to first order
+    x, y = ([slope[t] * predicted[t] for t in touches], [slope[t] * measured[t] for t in touches])
     square = np.stack([(a**2).sum(0) for a in x]) + 1e-12
     gain = np.stack([(a * b).sum(0) for a, b in zip(x, y)]) / square
     noise = _FLOOR**2 * np.array([[len(a)] for a in x]) / square

@@ -2,7 +2,7 @@
 state on validation kept.
 
 These networks are small: on a GPU a step is mostly launches, so it is recorded once as a CUDA graph and
-  replayed.
+replayed.
 """
 
 import contextlib
@@ -71,9 +71,8 @@ def cycle(
         raise ValueError("no rows to train on: the train part of the split is empty")
     parameters = [p for p in module.parameters() if p.requires_grad]
     cuda = rows.is_cuda
-    rate = torch.tensor(
-        float(learning_rate), device=rows.device
-    )  # in the device's memory, where a replayed step finds it
+    # in the device's memory, where a replayed step finds it
+    rate = torch.tensor(float(learning_rate), device=rows.device)
     optimizer = torch.optim.AdamW(parameters, rate, weight_decay=weight_decay, fused=cuda, capturable=cuda)
     generator = torch.Generator(device=rows.device).manual_seed(seed)
     chosen = torch.zeros(min(batch, len(rows)), dtype=rows.dtype, device=rows.device)

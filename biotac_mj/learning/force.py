@@ -118,9 +118,8 @@ def _features(log_z, force, part, candidate):
         centred = log_z - log_z[part].mean(0)
         covariance = centred[part].T @ centred[part]
         main = centred @ np.linalg.eigh(covariance)[1][:, ::-1][:, : candidate.products]
-        main = np.clip(
-            main, main[part].min(0), main[part].max(0)
-        )  # products must not run away beyond what was seen
+        # products must not run away beyond what was seen
+        main = np.clip(main, main[part].min(0), main[part].max(0))
         i, j = np.triu_indices(candidate.products)
         columns.append(main[:, i] * main[:, j])
     if rise is not None and not candidate.shared:

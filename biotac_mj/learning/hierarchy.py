@@ -2,10 +2,9 @@
 
 Nodes of a level are chosen by farthest-point sampling in geodesic distance along the edges, which keeps the
 two faces of the thin skin apart; the coarse graph is the dual of their Voronoi cells. Down is the selection
-of those nodes. Up is affine-exact moving least squares
-over the nearest kept nodes: fields that are linear in space pass unchanged. (Quadric simplification, as COMA
-  uses it, measures a
-surface's flatness and has no meaning inside a volume.)
+of those nodes. Up is affine-exact moving least squares over the nearest kept nodes: fields that are linear in
+space pass unchanged. (Quadric simplification, as COMA uses it, measures a surface's flatness and has no
+meaning inside a volume.)
 """
 
 import dataclasses

@@ -13,9 +13,8 @@ class MeshVAE(nn.Module):
     """Code of a displacement field.
 
     Encoder: convolution to `channels[0]` ("conv 128"), then for every factor a convolution and a selection of
-      nodes, a last convolution,
-    fully connected layers to mean and log variance. The decoder mirrors it, interpolating up before each
-    convolution.
+    nodes, a last convolution, fully connected layers to mean and log variance. The decoder mirrors it,
+    interpolating up before each convolution.
 
     Args:
       levels: of `build_hierarchy`, one more than there are entries in `channels`.

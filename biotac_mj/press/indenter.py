@@ -128,8 +128,8 @@ def make_indenter(text: str) -> Indenter:
     """The indenter that a text asks for.
 
     A name of INDENTERS, "geom:TYPE:SIZE[,SIZE...]" with MuJoCo's types and sizes [m], or "mesh:FILE" in
-    metres. The z axis of a geom goes
-    ahead: a capsule presses with its cap, a cylinder with its end, a plane with its front.
+    metres. The z axis of a geom goes ahead: a capsule presses with its cap, a cylinder with its end, a plane
+    with its front.
 
     Raises:
       ValueError: unknown name or type, sizes that do not fit it, or a mesh that is open, empty or not in

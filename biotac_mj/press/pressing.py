@@ -20,9 +20,10 @@ __all__ = ["press", "render"]
 
 def _read(handle, data):
     """What one step left: (3,) force of the skin on the indenter [N], (23,) counts, non-converged steps."""
+    # of PAC's 22 the latest
     counts = np.concatenate(
         [handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])]
-    )  # of PAC's 22 the latest
+    )
     return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
 
 

@@ -19,9 +19,8 @@ _CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
 _SKIN = np.array([0.20, 0.55, 0.42])
 _HARD = np.array([0.75, 0.75, 0.78])
 _INDENTER = np.array([0.85, 0.45, 0.15])
-_TO_PAD_UP = np.array(
-    [[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]
-)  # BioTac frame to a frame whose z leaves the pad
+# BioTac frame to a frame whose z leaves the pad
+_TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
 def _unroll(points):

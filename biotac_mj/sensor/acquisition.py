@@ -27,7 +27,6 @@ from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE, NPAC
 __all__ = [
     "Acquisition",
     "BatchAcquisition",
-    "FRAME_TIME",
     "HELD",
     "HELD_PDC",
     "HELD_TAC",
@@ -42,7 +41,6 @@ wp.set_module_options({"enable_backward": False})
 
 SLOT_RATE = 4400.0  # [Hz]
 SLOTS_PER_FRAME = 44
-FRAME_TIME = SLOTS_PER_FRAME / SLOT_RATE  # [s]
 
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
 # temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 22.6 Hz [C/s]; counts.

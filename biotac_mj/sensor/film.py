@@ -446,8 +446,8 @@ def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
 
     A disc of radius a injects uniformly into a slab of thickness h between insulating planes. Its mean
     potential is a Hankel integral over coth(k h); the sheet keeps the part 1 / (k h) of it, the rest is
-    F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x)
-    - 1/(r x)) dx: F -> r / (3 pi) for thin films.
+    F(h/a) / (sigma a) with F(r) = 2/pi int J1(x)^2 / x^2 (coth(r x) - 1/(r x)) dx: F -> r / (3 pi) for thin
+    films.
 
     Args:
       ratio: (n,) h / a.

@@ -307,11 +307,6 @@ class SkinData:
     def reaction(self) -> np.ndarray:
         return -self.force.numpy()[self.model.fixed].sum(0)
 
-    def touching_geoms(self, ngeom: int) -> np.ndarray:
-        """Which geoms touched the outer surface when the last step ended: (nworld, ngeom) bool."""
-        geom = self.outer.anchor_geom.numpy()
-        return np.array([(geom == g).any(0) for g in range(ngeom)], bool).reshape(ngeom, self.nworld).T
-
     def tangent(self, geoms) -> np.ndarray:
         """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
         frame's origin, after a step."""

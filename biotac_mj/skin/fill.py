@@ -59,9 +59,8 @@ def _inflated(model):
     bare.options = dataclasses.replace(
         options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY
     )
-    bare.material = dataclasses.replace(
-        model.material, prony=(), mullins=None, hysteresis=()
-    )  # relaxed and virgin
+    # relaxed and virgin
+    bare.material = dataclasses.replace(model.material, prony=(), mullins=None, hysteresis=())
     bare.rest = Rest(vert, 0.0, volume, volume)
     data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
     liquid = data.liquid

@@ -7,11 +7,13 @@ p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the liquid h
 infinite K the pressure is an unknown of its own (see `docs/liquid.md`).
 
 Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c,
-  s = min(c / 2 p_ref, 1),
+
+    s = min(c / 2 p_ref, 1),
+
 p_ref the liquid's pressure when the step began. What pushes the skin off, c + (1 - s) p, then grows with the
 overlap everywhere. Switched at c = 0 instead, the skin would have two states of balance: pressed off the core
-by liquid under it, or stuck to it without. Bonded
-faces need no such care: their nodes are held, so it does not matter that pressure is counted on them as well.
+by liquid under it, or stuck to it without. Bonded faces need no such care: their nodes are held, so it does
+not matter that pressure is counted on them as well.
 """
 
 import dataclasses

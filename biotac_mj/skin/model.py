@@ -271,9 +271,8 @@ class SkinModel:
                 f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
                 "positive finite numbers"
             )
-        return np.repeat(
-            factor, self.nelem // n
-        )  # the eight linear parts of a ten-node tetrahedron follow each other
+        # the eight linear parts of a ten-node tetrahedron follow each other
+        return np.repeat(factor, self.nelem // n)
 
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""

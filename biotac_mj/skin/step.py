@@ -160,7 +160,7 @@ class _Vectors:
             if w <= FEW and model.device.is_cuda:
                 shapes = [s.trial_geom.shape for s in surfaces]
                 self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
-            self.no_vector, self.no_direction = (wp.zeros((0, w), dtype=kind) for kind in (vec3, vec))
+            self.no_vector = wp.zeros((0, w), dtype=vec3)
             self.no_list = wp.zeros(0, dtype=int)
             self.no_flag = wp.zeros((0, w), dtype=int)
             self.no_face = wp.zeros(0, dtype=wp.vec3i)

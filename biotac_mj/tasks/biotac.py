@@ -168,9 +168,8 @@ class BioTac(composer.Entity):
             return np.zeros(6)
         along, lever = force[:3] / size, np.cross(force[:3], force[3:]) / size**2
         node = self.vert_xpos(physics)[self._outer]
-        off = (
-            np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along
-        )  # of the two sides, the one that is pushed
+        # of the two sides, the one that is pushed
+        off = np.linalg.norm(np.cross(node - lever, along), axis=1) + 0.2 * node @ along
         return np.concatenate([node[off.argmin()], -along])
 
 

@@ -14,9 +14,8 @@ __all__ = ["Explore"]
 _PAD = 8.2e-3  # [m]
 CENTER = -9e-3  # x of the middle of the pad, BioTac frame [m]
 _OFF, _TURN = 1e-3, 0.2  # how badly the object is centred [m] and turned [rad]
-_TURNED_UP = np.array(
-    [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
-)  # an object's +y, which goes ahead, to the world's +z
+# an object's +y, which goes ahead, to the world's +z
+_TURNED_UP = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
 
 
 class Explore(TouchTask):

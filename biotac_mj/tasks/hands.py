@@ -10,7 +10,7 @@ from ..geometry.rigid import quaternion
 
 __all__ = ["HANDS", "Mount", "attach_to_hand"]
 
-_TIP, _CLAMP = 21.3e-3, 7.65e-3  # from the BioTac's origin to its tip and to the end of its clamp [m]
+_TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
 _CORE_MASS = 4e-3  # of the BioTac [kg], taken off the link that carries it
 
 

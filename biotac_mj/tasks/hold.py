@@ -99,8 +99,8 @@ class Hold(_Grip):
 
 class Lift(_Grip):
     """Pinch a block of 20 to 150 g on a table and lift it by 30 mm. Reward: the height as a share of 30 mm,
-    times a half to one for
-    gentleness: one up to twice the grip that friction needs plus 0.5 N, a half where it is 3 N more."""
+    times a half to one for gentleness: one up to twice the grip that friction needs plus 0.5 N, a half where
+    it is 3 N more."""
 
     seconds = 4.0
     _goal = 0.03
@@ -116,9 +116,8 @@ class Lift(_Grip):
         body = physics.bind(self._body)
         mass = random_state.uniform(0.02, 0.15)
         body.mass, body.inertia = mass, mass / 3 * (np.sum(_HALF**2) - _HALF**2)
-        physics.model.body_subtreemass[[0, body.element_id]] += (
-            mass - body.subtreemass
-        )  # as mj_setConst would
+        # as mj_setConst would
+        physics.model.body_subtreemass[[0, body.element_id]] += mass - body.subtreemass
         self._mass = mass
         self._put(physics, _PADS, random_state.uniform(2e-3, 5e-3))
 

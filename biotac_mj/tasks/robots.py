@@ -9,7 +9,6 @@ __all__ = ["Gantry", "Gripper"]
 
 _MASS = 0.15  # of a carriage [kg]
 _STIFFNESS = 3000.0  # of a servo [N/m]: 1 N moves it by 0.3 mm
-_DAMPING = 2 * np.sqrt(_STIFFNESS * _MASS)  # critical
 _YAW_INERTIA, _YAW_STIFFNESS = 1e-4, 20.0  # [kg m^2], [N m/rad]
 _LARGEST_FORCE = 12.0  # of a servo [N]: past it the finger gives way
 _PAD = 8.2e-3  # from the BioTac's axis to its pad [m]

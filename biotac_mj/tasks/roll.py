@@ -24,9 +24,8 @@ class RollBall(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
-        rolls = dict(
-            friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2
-        )  # 2: the finger's machine is not in the way
+        # 2: the finger's machine is not in the way
+        rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)
         floor = [0, 0, -_PAD - 2 * _RADIUS]
         world.add(
             "geom",

@@ -21,9 +21,8 @@ class Scripted:
 
     task: str
     calibration = None  # name of its estimator, where it is not that of the task
-    estimator = stored = (
-        None  # the estimator, once it is needed; arrays of the calibration, None: the package's
-    )
+    # the estimator, once it is needed; arrays of the calibration, None: the package's
+    estimator = stored = None
 
     @property
     def fit(self):
@@ -106,10 +105,8 @@ class Explore(Scripted):
     task = "explore"
     places = 1e-3 * np.array([[0, 0], [3, 0], [-3, 0], [0, 3], [0, -3]])
     depth, clear = 0.9e-3, 0.7e-3
-    settle, patience = (
-        4,
-        25,
-    )  # frames at depth before the reading; frames after which a stiff thing is taken as it is
+    # frames at depth before the reading; frames after which a stiff thing is taken as it is
+    settle, patience = (4, 25)
 
     def reset(self):
         super().reset()
@@ -167,12 +164,8 @@ class Hold(Scripted):
     friction limit: that is slip."""
 
     task, calibration = "hold", "grip"
-    least, share, spare, gain = (
-        1.0,
-        1.5,
-        0.35,
-        1.5,
-    )  # grip before there is a load [N]; what it needs times a share, and more [N]; haste
+    # grip before there is a load [N]; what it needs times a share, and more [N]; haste
+    least, share, spare, gain = (1.0, 1.5, 0.35, 1.5)
 
     def wait(self, observation):
         return np.zeros(1)

@@ -24,9 +24,8 @@ def environment(task, environment_kwargs=None, random=None, time_limit=None, **s
     # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
     # forces that act in it
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
-    limit = (
-        made.seconds if time_limit is None else time_limit
-    ) - 1e-6  # sums of time steps may fall short of it by rounding
+    # sums of time steps may fall short of it by rounding
+    limit = (made.seconds if time_limit is None else time_limit) - 1e-6
     env = composer.Environment(
         made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
     )

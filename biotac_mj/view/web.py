@@ -17,7 +17,6 @@ __all__ = ["Finger", "Page", "play_file", "play_model"]
 _WINDOW = 200  # samples that a trace shows
 _MAP = (150, 220)  # of the electrode map, (angle, x) [pixel]
 _FROM = np.array([-0.55, -0.75, 0.35])  # where the camera looks from: the tip's side, pad in sight
-_FULL = 300.0  # change at full colour [counts]
 
 
 @dataclasses.dataclass

@@ -18,9 +18,8 @@ from ..press.scene import see_through
 
 __all__ = ["build_hand", "build_scene", "view"]
 
-_PAD_UP = np.array(
-    [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
-)  # turns the pad, -y of the BioTac, to the world's +z
+# turns the pad, -y of the BioTac, to the world's +z
+_PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 
 

@@ -18,26 +18,19 @@ from .effects.loads import Hysteresis, Latency, LoadLowPass, Relaxation, play
 
 __all__ = ["BETWEEN", "ForceView", "find_between"]
 
-_KINS = (
-    [Latency(), LoadLowPass()],
-    [Relaxation(), Hysteresis()],
-)  # one of each at most: what a law a little different leaves is no effect
+# one of each at most: what a law a little different leaves is no effect
+_KINS = ([Latency(), LoadLowPass()], [Relaxation(), Hysteresis()])
 BETWEEN = [effect for kin in _KINS for effect in kin]
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
 _RIDGE = 1e-4
 _ROWS = 4000
-_GAIN = {
-    "latency": 0.03,
-    "lowpass": 0.03,
-    "relax": 0.06,
-    "hyster": 0.06,
-}  # least mean fall of a block's log mean square error
+# least mean fall of a block's log mean square error
+_GAIN = {"latency": 0.03, "lowpass": 0.03, "relax": 0.06, "hyster": 0.06}
 _FURTHER = 1.5  # times that beside another effect
 _P = 0.02
-_REMAINDER = (
-    0.1  # of the other's gain that a second effect needs: what a law a little different leaves is no effect
-)
+# of the other's gain that a second effect needs: what a law a little different leaves is no effect
+_REMAINDER = 0.1
 _LEAST = 0.06  # fraction of a relaxation or a loop
 _TIE = 1.64  # standard errors, paired over blocks
 
@@ -234,9 +227,8 @@ def _finding(session, view, one, rest, best, gain):
     parameters, theta = _parameters(effect, theta, thetas, table)
     shortest = thetas[0].get("tau")
     if isinstance(effect, Relaxation) and parameters["tau"][1] < 1.2 * shortest and "hyster" not in ties:
-        ties.append(
-            "hyster"
-        )  # a memory as short as the movements: whether it fades or is worn off they do not show
+        # a memory as short as the movements: whether it fades or is worn off they do not show
+        ties.append("hyster")
     if isinstance(effect, Hysteresis):
         x = view._features([*view.chain, *rest])[0]
         theta["width"] = theta.pop("share") * view.predict(x)[0].std(0)

@@ -12,9 +12,8 @@ from ...sensor.channels import CHANNELS, FULL_SCALE, REST_COUNTS, log_impedance
 
 __all__ = ["BUS_RATE", "Recording", "read_recording"]
 
-BUS_RATE = (
-    100.0  # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
-)
+# [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
+BUS_RATE = 100.0
 MIN_ROWS = 400  # fewer leave no part to keep aside
 
 

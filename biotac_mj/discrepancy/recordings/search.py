@@ -2,8 +2,8 @@
 kept aside.
 
 The model is amended step by step: faults of samples, then noise, then what develops over time, then what lies
-  between force and electrodes;
-each round takes the effect with the most evidence, takes it out of the recording and looks again.
+between force and electrodes; each round takes the effect with the most evidence, takes it out of the
+recording and looks again.
 """
 
 import dataclasses
@@ -48,11 +48,8 @@ _COMMON = {"warmup", "count_offset", "count_gain", "thermal"}
 _FAULTS, _NOISE = EFFECTS[:5], EFFECTS[6:11]
 _MOVING = [EFFECTS[5], *EFFECTS[11:17]]
 _MOST = 8
-_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = (
-    43 / 44,
-    17 / 19,
-    2 / 5,
-)  # confidence: of 42, 17 and 3 names 42, 16 and 1 right
+# confidence: of 42, 17 and 3 names 42, 16 and 1 right
+_CONFIRMED, _AGAINST_OTHERS, _UNCHECKED = (43 / 44, 17 / 19, 2 / 5)
 
 
 @dataclasses.dataclass
@@ -169,9 +166,8 @@ def _search(session, effects, bar):
 def _choose(session, candidates):
     """The strongest; common patterns are told apart by how well they fit, and tied where they fit alike."""
     if session.timeline().loaded and not any(f.id == "warmup" for f in candidates):
-        candidates = [
-            f for f in candidates if not f.id.startswith("count_")
-        ]  # under load they are no more than ties of a shared gain
+        # under load they are no more than ties of a shared gain
+        candidates = [f for f in candidates if not f.id.startswith("count_")]
     if not candidates:
         return None
     best = max(candidates, key=lambda f: f.nats)
@@ -193,9 +189,8 @@ def _choose(session, candidates):
         if patterns:
             order = sorted(patterns, key=lambda f: f.theta["misfit"])
             loaded = session.timeline().loaded
-            slack = (
-                12.0 if not loaded else 40.0
-            )  # loaded, nearly parallel patterns are told apart by nothing but the load's remains
+            # loaded, nearly parallel patterns are told apart by nothing but the load's remains
+            slack = 12.0 if not loaded else 40.0
             best = order[0]
             near = [f for f in order if f.theta["misfit"] - order[0].theta["misfit"] < slack]
             preferred = [f for f in (patterns if loaded else near) if f.id == "warmup"]
@@ -243,9 +238,8 @@ def _late(session, effects):
     for _ in range(4):
         candidates = [f for effect in (*_MOVING, *_NOISE[:1], *effects) for f in effect.find(whole)]
         known = {(f.id, f.channels) for f in session.findings}
-        candidates = [
-            f for f in candidates if (f.id, f.channels) not in known
-        ]  # an extrapolation that is a little off is no new effect
+        # an extrapolation that is a little off is no new effect
+        candidates = [f for f in candidates if (f.id, f.channels) not in known]
         if session.unnamed:
             candidates = [f for f in candidates if f.theta.get("kind") not in ("step", "pulse")]
         if any(f.id in _COMMON for f in session.findings):

@@ -109,9 +109,8 @@ def fit_shapes(
     if through is not None:
         columns = through(columns)
         columns = columns - columns.mean(0)
-        power = np.maximum(
-            (columns**2).sum(0), 0.02 * power
-        )  # a shape that the others mimic is not found here
+        # a shape that the others mimic is not found here
+        power = np.maximum((columns**2).sum(0), 0.02 * power)
     centred = x - x.mean()
     total = float(centred @ centred)
     if total <= 0:

@@ -66,9 +66,8 @@ class Timeline:
         self._departures = {}
         self.covariance = self._fast_covariance()
         c = len(self.used)
-        apart = (
-            np.eye(c) - 1 / c
-        )  # what all electrodes do alike is no load: a contact raises some and lowers others
+        # what all electrodes do alike is no load: a contact raises some and lowers others
+        apart = np.eye(c) - 1 / c
         size = np.sqrt(np.diag(apart @ self.covariance @ apart))
         # A load moves electrodes by tens of counts within seconds; noise, filtered or not, does not.
         self.loaded = bool(
@@ -127,11 +126,8 @@ class Timeline:
         at = np.arange(w, n - w - 1)
         for time in known:
             at = at[np.abs(self.time[at] - time) > (w + 2) * self.period]
-        return (
-            at,
-            (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w,
-            w,
-        )  # bin `at` itself may be cut in two
+        # bin `at` itself may be cut in two
+        return (at, (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w, w)
 
     def jump_at(self, row, known=(), seconds=6.0):
         """(c,) change of level at bin `row`, a straight line on either side taken into account [ln Z]."""

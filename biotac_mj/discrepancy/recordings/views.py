@@ -19,13 +19,8 @@ from .session import Session
 
 __all__ = ["Amended", "Choice", "VIEWS", "choose", "cross_residual", "options", "whole_line"]
 
-_EDGES = (
-    0.4,
-    0.55,
-    0.7,
-    0.85,
-    1.0,
-)  # of the part fitted: each trial uses all rows up to an edge and is judged up to the next
+# of the part fitted: each trial uses all rows up to an edge and is judged up to the next
+_EDGES = (0.4, 0.55, 0.7, 0.85, 1.0)
 _WEIGHTS = (1.0, 2.0, 3.0, 4.0)  # of the trials: the last ones are the most like what is to come
 _LEAST_ROWS = 500  # in a trial
 _SLACK = 0.005  # of the logarithm of the error: less does not decide against what was found
@@ -155,9 +150,8 @@ def squares(view, amended, rows):
         else np.ones(error.shape, bool)
     )
     each = (error * good).sum(0) / np.maximum(good.sum(0), 1)
-    return (
-        np.array([each.mean()]) if view == "electrodes at rest" else each
-    )  # at rest all electrodes have the same choice
+    # at rest all electrodes have the same choice
+    return np.array([each.mean()]) if view == "electrodes at rest" else each
 
 
 # --- trials  ---
@@ -210,8 +204,7 @@ def _best(asked, x, mean, wary):
     tells.
 
     Wary, with force: regressions turn the load's own trend into a gain and a wrong gain into newtons, so two
-      trials have to tell, and both
-    of the last two that do have to improve.
+    trials have to tell, and both of the last two that do have to improve.
     """
     allowed = list(range(len(asked)))
     if wary:

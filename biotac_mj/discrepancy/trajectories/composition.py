@@ -23,10 +23,9 @@ class Candidate:
     Attributes:
       effect, fit. gain: (chosen,) evidence on trajectories left out over the model without it; nats: its
         mean; p, q: of sign flips.
-      held: (chosen,) that evidence itself. share: of the closable log mean square. energy: of the mean square
-        taken away by all effects so
-      far, what this one took. refused: reasons. ties: ids that do as well. lead: over the runner-up, in
-        standard errors.
+      held: (chosen,) that evidence itself. share: of the closable log mean square.
+      energy: of the mean square taken away by all effects so far, what this one took.
+      refused: reasons. ties: ids that do as well. lead: over the runner-up, in standard errors.
     """
 
     effect: object

@@ -14,11 +14,8 @@ __all__ = ["HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 # In the order of Nuisance's fields: standard deviations of the prior, bounds.
 PRIOR = np.array([0.4, 0.4, 0.05, 0.7])
 LOW, HIGH = np.array([-1.5, -1.5, -0.2, -1.0]), np.array([1.5, 1.5, 0.2, 2.0])
-OTHER_MESH = {
-    "coarse": "default",
-    "default": "coarse",
-    "fine": "default",
-}  # measured on the condensed tier, whose price is seconds
+# measured on the condensed tier, whose price is seconds
+OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 
 
 @dataclasses.dataclass(frozen=True)

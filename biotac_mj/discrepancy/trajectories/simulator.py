@@ -120,9 +120,8 @@ class Simulator:
         model, film = self._model(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate
         longest = max(len(pos) for _, _, pos, _, _, _ in todo)
-        rows = [
-            np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo
-        ]  # who has arrived waits there
+        # who has arrived waits there
+        rows = [np.minimum(np.arange(longest), len(pos) - 1) for _, _, pos, _, _, _ in todo]
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
         times = [_waiting(time, longest) for *_, time, _ in todo]
         fields = walk(model, [tool for _, tool, *_ in todo], motions, time=times)

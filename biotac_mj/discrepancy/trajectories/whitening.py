@@ -10,9 +10,8 @@ from .simulator import Fields, Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
 
-REPEATABILITY = (
-    0.05e-3  # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
-)
+# [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
+REPEATABILITY = 0.05e-3
 # of a channel's largest change: the base model (mesh, tier, film) is not better than that (docs/condensed.md)
 _RESOLUTION = 0.01
 
@@ -22,8 +21,8 @@ class Comparison:
     """Data against a simulator: trajectories, noise, fields.
 
     Whitening marginalises the pose error b_i of every trial: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the
-      fields' differences
-    (Woodbury, rank 3). Electrodes are compared about their rest: the mean over all trajectories of row 0.
+    fields' differences (Woodbury, rank 3). Electrodes are compared about their rest: the mean over all
+    trajectories of row 0.
     """
 
     sim: Simulator

@@ -26,11 +26,10 @@ class Report:
 
     Attributes:
       verdict: one line. effects: list of dicts (id, name, stage, parameters, confidence, ties, p, nats).
-        ranking: list of (id, nats per
-      trajectory left out, p) of the first round. where: list of cells. before, after: dicts of mean square
-      and RMS per channel on the
-      locked trajectories. closed: share S on them. isolability: dict ids, matrix, nats. next_experiment:
-        text. notes: what cannot be known.
+      ranking: list of (id, nats per trajectory left out, p) of the first round. where: list of cells.
+      before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
+        them.
+      isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
       fit: Fit. comparison, selection, locked: what it was made of. trace: numbers that thresholds are set on,
         as a file can hold them.
     """

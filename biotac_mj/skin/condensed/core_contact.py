@@ -17,10 +17,8 @@ __all__ = ["CoreContact", "Meeting"]
 
 wp.set_module_options({"enable_backward": False})
 
-CONCAVE, SLACK = (
-    wp.constant(100.0),
-    wp.constant(1e-4),
-)  # hollows of the core are wider than 5 mm [1/m]; gradients are averages [m]
+# hollows of the core are wider than 5 mm [1/m]; gradients are averages [m]
+CONCAVE, SLACK = (wp.constant(100.0), wp.constant(1e-4))
 _PROBE = 2e-4  # half a step of the differences that give the directions, half a cell of the core's grid [m]
 
 
@@ -190,9 +188,8 @@ class CoreContact:
         # the grid rounds edges of the core by micrometres: what starts outside stays outside
         self._offset = np.minimum(self._gap, 0)
         self._corner = self._number[self._face]
-        node_gap = np.full(
-            len(self.node) + 1, np.inf
-        )  # of the nearest face of each node; held corners, -1, are the last
+        # of the nearest face of each node; held corners, -1, are the last
+        node_gap = np.full(len(self.node) + 1, np.inf)
         np.minimum.at(node_gap, self._corner, rest_gap[:, None])
         order = np.argsort(self._corner.ravel(), kind="stable")
         order = order[self._corner.ravel()[order] >= 0]

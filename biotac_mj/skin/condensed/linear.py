@@ -103,9 +103,8 @@ class Compliance:
 
     def __matmul__(self, p: np.ndarray) -> np.ndarray:
         """W p of p (n,)."""
-        out = sgemv(self._scale, self._rest.T, p).astype(
-            float
-        )  # in single precision: half the memory, and rest is no better than that
+        # in single precision: half the memory, and rest is no better than that
+        out = sgemv(self._scale, self._rest.T, p).astype(float)
         if self._a is not None:
             out -= (self._share * float(self._a @ p)) * self._a
         return out

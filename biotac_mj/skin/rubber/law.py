@@ -2,14 +2,10 @@
 
 The four laws take the same two Lame-like constants and differ in the energy W(F):
 
-  corotational  W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2
-                R the rotation of the polar decomposition
-  svk           W = lambda/2 tr(E)^2 + mu tr(E^2),  E = (F^T F - I)/2
-                Saint Venant-Kirchhoff
-  neo_hookean   W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2
-                isochoric split, as ANSYS and CalculiX
-  linear        W = lambda/2 tr(e)^2 + mu e:e,  e = sym(F) - I
-                small strain; not invariant to rotation
+  corotational W = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2            R the rotation of F: polar decomposition
+  svk          W = lambda/2 tr(E)^2 + mu tr(E^2)                      E = (F^T F - I)/2, St. Venant-Kirchhoff
+  neo_hookean  W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2  isochoric split: ANSYS, CalculiX
+  linear       W = lambda/2 tr(e)^2 + mu e:e                          e = sym(F) - I: small rotations only
 """
 
 import warp as wp

@@ -7,7 +7,8 @@ an overstress Q_i to the second Piola-Kirchhoff stress S of the elastic law, whi
 
 and S, taken as linear in time within a step, gives Q_i exactly from its last value. Softening is the
 pseudo-elasticity of Ogden and Roxburgh (1999): S is multiplied by
-eta = 1 - erf((W_max - W) / (m + beta W_max)) / r,  W_max the largest energy density so far.
+
+    eta = 1 - erf((W_max - W) / (m + beta W_max)) / r,    W_max the largest energy density so far.
 
 Both act on what has to do with shape. For neo_hookean that is the isochoric part; the other laws have no such
 split and the whole stress remembers, but for the dilatation that ten-node elements keep for an element's mean

@@ -3,7 +3,6 @@
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...noise import noise_level
 from .effect import Finding, Parameter, RecordedEffect, runs, spans
 
@@ -280,9 +279,8 @@ class Spikes(RecordedEffect):
         middle = median_filter(x, size=(7, 1), mode="nearest")
         off = np.abs(x - middle)
         before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
-        around = uniform_filter1d(
-            np.minimum(off, 200), 101, axis=0, mode="nearest"
-        )  # lively stretches leave the median by more
+        # lively stretches leave the median by more
+        around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
         return (off > np.maximum(np.maximum(10 * noise_level(x), 25), 10 * around)) & (
             np.abs(before - after) < 0.3 * off
         )
@@ -440,15 +438,3 @@ def _lattice(x):
     if len(values) < 4:
         return 1
     return int(np.gcd.reduce(np.diff(values)))
-
-
-def interpolated(counts, masked, line):
-    """Counts with masked samples replaced by linear interpolation in ln Z over time, for effects that need a
-    complete series."""
-    z = log_impedance(counts)
-    rows = np.arange(len(z))
-    for k in np.flatnonzero(masked.any(0)):
-        good = ~masked[:, k]
-        if good.any():
-            z[~good, k] = np.interp(rows[~good], rows[good], z[good, k])
-    return counts_from_log_impedance(z)

@@ -166,9 +166,8 @@ class Hysteresis(ForceEffect):
     confusable = {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"}
 
     def tried(self, rate, seconds):
-        return [
-            {"share": share} for share in (0.15, 0.3, 0.6, 1.2)
-        ]  # widths in standard deviations; the fraction is fitted
+        # widths in standard deviations; the fraction is fitted
+        return [{"share": share} for share in (0.15, 0.3, 0.6, 1.2)]
 
     def see(self, force, rate, theta):
         return force - theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
