@@ -29,6 +29,8 @@ NDISC = len(DISCS)
 NEXCITATION = NDISC - NELECTRODE
 NSAMPLE = 24  # points that stand for equal parts of a disc
 TILE = 32  # rows of a tile, and columns of right-hand sides: the discs, padded
+# barycentric coordinate of a sample on an edge: both faces take it, whichever way it is rounded
+_ON_EDGE = 1e-9
 real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d
@@ -181,7 +183,7 @@ def cover_discs(
                     d = disc[i] - a
                     u = (d[0] * e2[1] - d[1] * e2[0]) / area
                     v = (e1[0] * d[1] - e1[1] * d[0]) / area
-                    if u >= real(0.0) and v >= real(0.0) and u + v <= real(1.0):
+                    if wp.min(wp.min(u, v), real(1.0) - u - v) >= real(-_ON_EDGE):
                         if sweep == 0:
                             if hits[i] == 0:
                                 covered += 1

@@ -66,8 +66,11 @@ def step(
     ready = prepare_step(model, data, geoms)
     _set_time(model, data, dt, core_pos, core_mat)
     data.laws.refuse_coarse_grids(geoms)
-    with single_thread():
+    if model.device.is_cuda:
         ready.run()
+    else:
+        with single_thread():
+            ready.run()
     if model.has_core and geoms.count and (data.worlds.reason.numpy() == worlds.INSIDE_CORE).any():
         _refuse_core(model, geoms)
 
