@@ -25,6 +25,7 @@ from .law import (
     energy_density,
     polar,
     polar_single,
+    polar_upright,
     stress,
     stress_derivative,
 )
@@ -120,6 +121,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     thin, wide = precision.narrow, precision.widen
     is_single = precision.name == "single"
     polar_thin = polar_single if is_single else polar
+    # a step never ends inside out: on CUDA registers are worth more than the digits of such a rotation
+    polar_full = polar_upright if is_single else polar
     positions = wp.types.matrix(shape=(3, corners), dtype=real)
     directions = wp.types.matrix(shape=(3, corners), dtype=scalar)
     gradients = wp.types.matrix(shape=(corners, 3), dtype=real)
@@ -132,7 +135,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     @wp.func
     def rotation(F: mat33):
         if wp.static(corotational):
-            return polar(F)
+            return polar_full(F)
         return mat33()
 
     @wp.func

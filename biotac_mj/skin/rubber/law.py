@@ -20,6 +20,7 @@ __all__ = [
     "energy_density",
     "polar",
     "polar_single",
+    "polar_upright",
     "stress",
     "stress_derivative",
 ]
@@ -99,23 +100,29 @@ def turn_left(S: mat33):
 
 
 @wp.func
-def polar(F: mat33):
+def polar_upright(F: mat33):
     """Rotation of the polar decomposition to double precision: the single-precision one, made orthogonal,
-    then turned by what is left (error squared)."""
-    R = widen(polar_single(narrow(F)))
-    if wp.determinant(F) < real(1.0e-3):  # `turn_towards` may have come near only
-        steps = int(15)  # a variable: unrolled, the loop would double the time to compile
-        for _ in range(steps):
-            R = orthogonal(R)
-            turn = turn_left(wp.transpose(R) * F)
-            R = R + R * wp.skew(double(turn))
-        return R
-    R = orthogonal(R)
+    then turned by what is left (error squared). Where the determinant is small it is only near."""
+    R = orthogonal(widen(polar_single(narrow(F))))
     S = wp.transpose(R) * F
     # what is left is 1e-7: single precision gives the rest of its digits
     s = narrow(S)
     turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=float) - s) * single(axial(S))
     return R + R * wp.skew(double(turn))
+
+
+@wp.func
+def polar(F: mat33):
+    """Rotation of the polar decomposition to double precision, of any F."""
+    if wp.determinant(F) >= real(1.0e-3):
+        return polar_upright(F)
+    R = widen(polar_single(narrow(F)))  # `turn_towards` may have come near only
+    steps = int(15)  # a variable: unrolled, the loop would double the time to compile
+    for _ in range(steps):
+        R = orthogonal(R)
+        turn = turn_left(wp.transpose(R) * F)
+        R = R + R * wp.skew(double(turn))
+    return R
 
 
 @wp.func
