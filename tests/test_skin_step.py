@@ -276,3 +276,13 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
     assert np.abs(plain.wrench).max() > 0.01
     np.testing.assert_allclose(other.vert_xpos, plain.vert_xpos, atol=2e-8)
     np.testing.assert_allclose(other.wrench, plain.wrench, atol=1e-4 * np.abs(plain.wrench).max())
+
+
+@pytest.mark.parametrize("name, value", [("dynamics", "implicit"), ("samples", 5), ("core_contact", False)])
+def test_options_that_the_data_was_not_made_for_are_refused(name, value):
+    model = finger()
+    data, geoms = SkinData(model), GeomSet([], [])
+    step(model, data, geoms)
+    model.options = dataclasses.replace(model.options, **{name: value})
+    with pytest.raises(ValueError, match=rf"the model's {name} changed since its SkinData was made"):
+        step(model, data, geoms, 1e-3)

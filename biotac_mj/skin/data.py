@@ -102,7 +102,7 @@ class SkinData:
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
         self.options = model.rubber_options
         _refuse_other_kinds(materials, model.material, self.options)
-        self.nworld, self.model = nworld, model
+        self.nworld, self.model, self.made_for = nworld, model, model.options
         self.rubber = rubber_of_worlds(model, materials, _modulus_of_worlds(model, modulus, nworld))
         nsample, lawful = len(model.sample), model.options.contact_law is not None
         with wp.ScopedDevice(model.device):

@@ -36,6 +36,7 @@ from .types import mat33, real, vec3
 
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
 
+_ALLOCATED = ("dynamics", "liquid", "core_contact", "samples", "contact_law", "element")  # options
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 
@@ -80,7 +81,8 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
     others.
 
     Raises:
-      ValueError: geoms of another number of worlds, or called first while a graph is captured.
+      ValueError: geoms of another number of worlds, options that the data was not made for, or called first
+        while a graph is captured.
     """
     if geoms.nworld != data.nworld:
         raise ValueError(
@@ -93,8 +95,21 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
             raise ValueError(
                 "the step is not ready: call prepare_step(model, data, geoms) before the capture begins"
             )
+        _refuse_other_options(model, data)
         data.steps[key] = SkinStep(model, data, geoms)
     return data.steps[key]
+
+
+def _refuse_other_options(model, data):
+    """What the data was allocated for cannot change; tolerances and limits can."""
+    now, made = model.options, data.made_for
+    changed = [name for name in _ALLOCATED if getattr(now, name) != getattr(made, name)]
+    if bool(now.stiffness_damping) != bool(made.stiffness_damping):
+        changed.append("stiffness_damping")
+    if changed:
+        raise ValueError(
+            f"the model's {' and '.join(changed)} changed since its SkinData was made: make a new one"
+        )
 
 
 def launch_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> None:
