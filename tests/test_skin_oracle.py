@@ -11,6 +11,15 @@ import warp as wp
 from skin_oracle import CASES, FILE, solve
 
 WAYS = [("cpu", "sparse"), ("cpu", "dense"), *([("cuda:0", "dense")] if wp.is_cuda_available() else [])]
+# of the dense preconditioner on the CPU, which is there for tests, some are enough to be quick
+QUICK = {"water", "worlds", "corotational_slide", "adhesion", "core_in_liquid", "rest_pressure", "svk_bar"}
+RUNS = [
+    pytest.param(
+        name, *way, marks=[pytest.mark.slow] if way == ("cpu", "dense") and name not in QUICK else []
+    )
+    for name in CASES
+    for way in WAYS
+]
 CLOSE = {"sparse": 1e-6, "dense": 1e-4}  # of the peak; the dense preconditioner is of mixed precision
 # tangents come from the preconditioner: rows of single precision, or of half
 TANGENTS, CLOSE_TANGENT = ("translation", "rotation", "coupling"), {"sparse": 1e-6, "dense": 3e-3}
@@ -42,8 +51,7 @@ def far(name, answers, kind):
     return out
 
 
-@pytest.mark.parametrize("device, kind", WAYS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name, device, kind", RUNS)
 def test_answers_are_the_frozen_ones(name, device, kind):
     answers = solve(CASES[name], device, preconditioner=kind, **OPTIONS[kind])
     assert answers["converged"].all() and answers["converged"].shape == frozen()[f"{name}.converged"].shape

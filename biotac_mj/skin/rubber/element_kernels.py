@@ -228,7 +228,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         else:  # Warp compiles what follows a return
             return g
 
-    if averaged:
+    if averaged and is_single:  # a thread for each point: for CUDA
 
         @wp.kernel(module=module, enable_backward=False)
         def force(
