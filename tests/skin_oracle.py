@@ -90,6 +90,8 @@ def solve(case, device="cpu", modulus=1.0, preconditioner=None, **options):
     """
     given = (case.material, *(case.worlds or (case.material,)))
     rubber, *worlds = (dataclasses.replace(m, youngs_modulus=modulus * m.youngs_modulus) for m in given)
+    if case.worlds:  # what froze the answers had one contact stiffness for all worlds, the model's
+        options = {"contact_stiffness": 180e3 * rubber.youngs_modulus, **options}
     options = SkinOptions(**{**TIGHT, **case.options, **options})
     model = SkinModel(case.geometry(), rubber, options, device=device, **case.model)
     data = SkinData(model, len(worlds), worlds, preconditioner=preconditioner)

@@ -278,7 +278,10 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
     np.testing.assert_allclose(other.wrench, plain.wrench, atol=1e-4 * np.abs(plain.wrench).max())
 
 
-@pytest.mark.parametrize("name, value", [("dynamics", "implicit"), ("samples", 5), ("core_contact", False)])
+@pytest.mark.parametrize(
+    "name, value",
+    [("dynamics", "implicit"), ("samples", 5), ("core_contact", False), ("contact_stiffness", 1e10)],
+)
 def test_options_that_the_data_was_not_made_for_are_refused(name, value):
     model = finger()
     data, geoms = SkinData(model), GeomSet([], [])

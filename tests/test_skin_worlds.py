@@ -410,3 +410,26 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
         data.worlds.failed.zero_()
         ready._once(ready._refuse_impossible)
         assert data.worlds.failed.numpy().tolist() == [0, 1, 0], spoil
+
+
+def test_worlds_have_the_contact_of_their_own_modulus():
+    """Contact stiffness and the range of adhesion follow from each world's rubber, whichever world is first."""
+    soft, stiff = (Material("neo_hookean", E, 0.4) for E in (3e5, 1.5e6))
+    options = SkinOptions(contact_law=ContactLaw(adhesion=0.05), tolerance=1e-8, max_newton=200, liquid=False)
+
+    def pressed(materials):
+        n, model = len(materials), SkinModel(finger().geometry, materials[0], options)
+        data, geoms = SkinData(model, n, materials), GeomSet(["sphere"], [(3.5e-3,)], nworld=n)
+        for depth in (0.0, 2e-4, 4e-4):
+            geoms.set_pose([[0, 0, START - depth]])
+            step(model, data, geoms)
+            assert data.converged.all()
+        return data.wrench[:, 0, 2], data.laws.range
+
+    force, reach = zip(*(pressed([m]) for m in (soft, stiff)))
+    force, reach = np.concatenate(force), np.concatenate(reach)
+    assert force[1] > 2 * force[0] > 0.01 and reach[0] == pytest.approx(5**0.5 * reach[1])
+    for order in ([0, 1], [1, 0]):
+        together, ranges = pressed([(soft, stiff)[k] for k in order])
+        np.testing.assert_allclose(together, force[order], rtol=1e-6)
+        np.testing.assert_allclose(ranges, reach[order], rtol=1e-12)

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin.model import SkinOptions
+from ..skin.model import SkinOptions, stiffness_of_contact
 from ..skin.rubber.material import Material
 from .configurations import Configuration
 from .forward import simulate
@@ -235,7 +235,7 @@ def calibrate(
     parameters = [p if isinstance(p, Parameter) else parameter(p) for p in parameters]
     if not parameters or len({p.name for p in parameters}) != len(parameters):
         raise ValueError("name each parameter to fit once, and at least one")
-    stiffness = configuration.options.contact_stiffness or 180e3 * material.youngs_modulus
+    stiffness = configuration.options.contact_stiffness or stiffness_of_contact(material)
     exact = dict(
         tolerance=min(TOLERANCE, configuration.options.tolerance),
         max_newton=max(MAX_NEWTON, configuration.options.max_newton),

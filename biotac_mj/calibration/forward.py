@@ -48,8 +48,7 @@ def simulate(
 ) -> Response:
     """Walks the indentation once, every material as a world of one batch.
 
-    The contact stiffness is `options.contact_stiffness`, or that which belongs to the first material: it is
-    one number for the batch.
+    The contact stiffness is `options.contact_stiffness`, or that which belongs to each material.
 
     Args:
       geometry, options: the body; its options count for all.

@@ -5,7 +5,7 @@ import warp as wp
 
 from .contact.law import WorldLaws
 from .liquid import Liquid
-from .model import SkinModel
+from .model import SkinModel, stiffness_of_contact
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
@@ -126,13 +126,15 @@ class SkinData:
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
         self.worlds.density.assign([float(m.density) for m in materials])
-        self.laws = WorldLaws(model, nworld)
+        stiffness = [model.options.contact_stiffness or stiffness_of_contact(m) for m in materials]
+        self.worlds.contact_stiffness.assign(stiffness)
+        self.laws = WorldLaws(model, materials, np.array(stiffness))
         self.worlds.pulls = self.laws.pulls
         self.liquid = Liquid(model, nworld, self.worlds) if model.inner is not None else None
         remembers = model.material.remembers
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
         self._preconditioner, self._chosen = None, _choose(model, preconditioner)
-        self.steps, self._vectors = {}, None  # see `step`
+        self.steps, self._vectors, self.external = {}, None, None  # see `step`
         self._of_geoms, self._of_groups, self._counts = {}, {}, (0, 0)
         self.reset()
 
@@ -219,17 +221,21 @@ class SkinData:
         Raises:
           ValueError: a wrong shape or NaN.
         """
-        self.steps.clear()  # what was recorded knew the old loads
-        self.external = None
+        shape = (self.nworld, self.model.nvert, 3)
         if force is None:
+            if self.external is not None:
+                self.steps.clear()  # what was recorded knows of loads
+            self.external = None
             return
-        force, shape = np.asarray(force, float), (self.nworld, self.model.nvert, 3)
+        force = np.asarray(force, float)
         if force.shape != shape or not np.isfinite(force).all():
             raise ValueError(
                 f"external forces have shape {force.shape}: pass finite numbers of shape {shape}"
             )
-        nodal = np.ascontiguousarray(np.swapaxes(force, 0, 1))
-        self.external = wp.array(nodal, dtype=vec3, ndim=2, device=self.x.device)
+        if self.external is None:
+            self.steps.clear()  # what was recorded knows of no loads
+            self.external = wp.zeros_like(self.x)
+        self.external.assign(np.ascontiguousarray(np.swapaxes(force, 0, 1)))
 
     def set_liquid(self, bulk_modulus=None, fill_volume=None) -> None:
         """Gives each world its liquid, from the next step on and through `reset`.

@@ -88,7 +88,7 @@ def wet_faces(
     slot: wp.array(dtype=int),
     sample: wp.array(dtype=vec3),
     area: wp.array(dtype=real),
-    stiffness: real,
+    stiffness: wp.array(dtype=real),
     reference: wp.array(dtype=real),
     touching: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
@@ -127,9 +127,9 @@ def wet_faces(
                     dry = real(1.0)
                     if pressure < full:
                         dry = pressure / full
-                        overlap += share * dry * pressure / (real(2.0) * stiffness)
+                        overlap += share * dry * pressure / (real(2.0) * stiffness[w])
                     else:
-                        overlap += share * (pressure - reference[w]) / stiffness
+                        overlap += share * (pressure - reference[w]) / stiffness[w]
                     wet -= share * dry * sample[s]
                 total += overlap * wp.length(normal) / real(2.0)
         wet_out[f, w] = wet
@@ -204,7 +204,7 @@ def release_pressure(
     # In:
     sample: wp.array(dtype=vec3),
     area: wp.array(dtype=real),
-    stiffness: real,
+    stiffness: wp.array(dtype=real),
     reference: wp.array(dtype=real),
     pressure: wp.array(dtype=real),
     touching: wp.array2d(dtype=int),
@@ -220,7 +220,7 @@ def release_pressure(
     if on[w] == 0:
         return
     if near[f, w] == 1 and touching[f, w] == 1 and pressure[w] > real(0.0):
-        soften_face(f, w, sample, area, stiffness, reference[w], pressure[w], geom, force, block)
+        soften_face(f, w, sample, area, stiffness[w], reference[w], pressure[w], geom, force, block)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,7 +52,7 @@ class SkinOptions:
         contact [m].
       max_core_depth: a geom that reaches deeper into the core than this is refused [m].
       contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference
-        solutions' ratio.
+        solutions' ratio, with each world's own E.
       stick_ratio: tangential stiffness of sticking contact relative to k.
       samples: contact is sampled at samples^2 points per face.
       contact_law: a ContactLaw, or a dict of its fields: load-dependent friction, adhesion. None is Coulomb's
@@ -121,6 +121,11 @@ class SkinOptions:
             )
         if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
             raise ValueError("samples, max_newton and max_cg must be at least 1")
+
+
+def stiffness_of_contact(material: Material) -> float:
+    """Pressure per overclosure [Pa/m]: 180 E per millimetre, the reference solutions' ratio."""
+    return 180e3 * material.youngs_modulus
 
 
 def solved_geometry(
@@ -224,7 +229,7 @@ class SkinModel:
             )
         self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
-        self.contact_stiffness = self.options.contact_stiffness or 180e3 * self.material.youngs_modulus
+        self.contact_stiffness = self.options.contact_stiffness or stiffness_of_contact(self.material)
         self.crushed_depth = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness  # [m]
 
         self.modulus = None if modulus is None else self._moduli(modulus, given)

@@ -18,6 +18,7 @@ A world whose input is not finite, that has a geom deep inside the core or that 
 last good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do
 not notice. Worlds that are done idle inside the loops."""
 
+import dataclasses
 import weakref
 
 import numpy as np
@@ -36,7 +37,15 @@ from .types import mat33, real, vec3
 
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
 
-_ALLOCATED = ("dynamics", "liquid", "core_contact", "samples", "contact_law", "element")  # options
+_FREE = (
+    "tolerance",
+    "max_newton",
+    "max_cg",
+    "stick_ratio",
+    "mass_damping",
+    "stiffness_damping",
+    "max_core_depth",
+)
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 
@@ -101,9 +110,10 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
 
 
 def _refuse_other_options(model, data):
-    """What the data was allocated for cannot change; tolerances and limits can."""
+    """What model and data were made for cannot change; tolerances, limits and damping can."""
     now, made = model.options, data.made_for
-    changed = [name for name in _ALLOCATED if getattr(now, name) != getattr(made, name)]
+    names = [f.name for f in dataclasses.fields(now) if f.name not in _FREE]
+    changed = [name for name in names if getattr(now, name) != getattr(made, name)]
     if bool(now.stiffness_damping) != bool(made.stiffness_damping):
         changed.append("stiffness_damping")
     if changed:
@@ -520,10 +530,10 @@ class SkinStep:
             [near, state.trial_geom, state.bond],
         )  # fmt: skip
         if len(laws.reach):
-            inputs = [s.face, s.area, m.sample, m.contact_stiffness, geoms.struct, d.x, on, near]
+            inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
             self._launch(faces.push, dim, inputs, [k.corner_push])
             self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
-        surface = [s.face, s.area, m.sample, m.contact_stiffness, m.options.stick_ratio]
+        surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
         held = [state.anchor_geom, state.anchor, on, near]
         law = [*surface, geoms.struct, laws, d.x, d.x_last, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
@@ -545,7 +555,7 @@ class SkinStep:
         """The liquid's volume; with it, its pressure."""
         m, d, k, st = self.m, self.d, self.k, self.st
         c = d.core
-        law = [m.contact_stiffness, st.reference]
+        law = [st.contact_stiffness, st.reference]
         area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
         if c:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]

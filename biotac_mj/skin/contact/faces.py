@@ -417,7 +417,7 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         face: wp.array(dtype=wp.vec3i),
         area: wp.array(dtype=real),
         sample: wp.array(dtype=vec3),
-        stiffness: real,
+        stiffness: wp.array(dtype=real),
         stick_ratio: real,
         geoms: Geoms,
         laws: Laws,
@@ -446,7 +446,7 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         if near[f, w] == 0:
             return
         free = touch_face(
-            f, w, face, area, sample, stiffness, stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
+            f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
             corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
         )  # fmt: skip
         if still == 1:
@@ -461,7 +461,7 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         face: wp.array(dtype=wp.vec3i),
         area: wp.array(dtype=real),
         sample: wp.array(dtype=vec3),
-        stiffness: real,
+        stiffness: wp.array(dtype=real),
         stick_ratio: real,
         geoms: Geoms,
         laws: Laws,
@@ -488,7 +488,7 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
             return
         t = face[f]
         share = area[f] / real(sample.shape[0])
-        k = stiffness * share
+        k = stiffness[w] * share
         touched, bond, gap, force, K, stick = touch_sample(
             i,
             w,
@@ -523,7 +523,7 @@ def push(
     face: wp.array(dtype=wp.vec3i),
     area: wp.array(dtype=real),
     sample: wp.array(dtype=vec3),
-    stiffness: real,
+    stiffness: wp.array(dtype=real),
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
@@ -538,7 +538,7 @@ def push(
     total = vec3()
     if near[f, w] == 1:
         t = face[f]
-        k = stiffness * area[f] / real(sample.shape[0])
+        k = stiffness[w] * area[f] / real(sample.shape[0])
         for g in range(geoms.count):
             R = wp.transpose(geoms.mat[g, w])
             for s in range(sample.shape[0]):

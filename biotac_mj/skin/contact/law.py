@@ -96,7 +96,8 @@ class WorldLaws:
     """A surface's ContactLaw in every world; worlds may have laws of their own, see `set`.
 
     Args:
-      model: SkinModel, perhaps with a contact law; nworld: number of worlds.
+      model: SkinModel, perhaps with a contact law; materials: of each world; stiffness: (nworld,) of contact
+        [Pa/m].
 
     Attributes:
       struct: `faces.Laws`, empty where the model has no contact law.
@@ -104,7 +105,8 @@ class WorldLaws:
       range: (nworld,) at which adhesion ends [m].
     """
 
-    def __init__(self, model, nworld: int):
+    def __init__(self, model, materials: list, stiffness: np.ndarray):
+        nworld = len(materials)
         self.law, self.nworld, self.device = model.options.contact_law, nworld, model.device
         n, nvert = (nworld, model.nvert) if self.law else (0, 0)
         self.struct = Laws()
@@ -116,10 +118,10 @@ class WorldLaws:
             self.pulls = wp.zeros(nworld, dtype=int)
         if self.law is None:
             return
-        self.stiffness = model.contact_stiffness
+        self.stiffness = stiffness
         face, vert = model.outer.face_np, model.geometry.vert
         self.edge = float(np.linalg.norm(vert[face] - vert[np.roll(face, 1, 1)], axis=2).mean())
-        self.modulus = model.material.youngs_modulus / (1 - model.material.poissons_ratio**2)
+        self.modulus = np.array([m.youngs_modulus / (1 - m.poissons_ratio**2) for m in materials])
         area = np.bincount(face.ravel(), np.repeat(model.outer.area.numpy() / 3, 3), nvert)
         self.struct.node_area.assign(area)
         self._values = {}
@@ -168,13 +170,13 @@ class WorldLaws:
         if reach is None:
             reach = np.sqrt(_RESOLVED * parting * self.edge / self.modulus)
         reach = np.where(parting > 0, reach, 0.0)
-        if (4 * parting > self.stiffness * reach**2).any():
-            most = np.max(parting)
+        shortest = 2 * np.sqrt(parting / self.stiffness)
+        if (reach < shortest).any():
+            w = int(np.argmax(shortest - reach))
             raise ValueError(
-                f"adhesion_range {np.max(reach):g} m is too short for a work of {most:g} J/m^2: the "
-                "contact's "
-                f"own springs of {self.stiffness:g} Pa/m stretch by half of it; take a range above "
-                f"{2 * np.sqrt(most / self.stiffness):.1e} m"
+                f"adhesion_range {reach[w]:g} m is too short for a work of {parting[w]:g} J/m^2: the "
+                f"contact's own springs of {self.stiffness[w]:g} Pa/m stretch by half of it; "
+                f"take a range above {shortest[w]:.1e} m"
             )
         self._values, s = values, self.struct
         for array, value in (

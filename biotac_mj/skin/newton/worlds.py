@@ -44,6 +44,7 @@ class Worlds:
 
     mu: wp.array(dtype=real)
     lam: wp.array(dtype=real)
+    contact_stiffness: wp.array(dtype=real)  # pressure per overclosure [Pa/m]
     density: wp.array(dtype=real)  # [kg/m^3], of implicit dynamics
     softness: wp.array(dtype=real)  # E of the model over E of the world
     kappa: wp.array(dtype=real)  # K / natural volume [Pa/m^3]
