@@ -413,7 +413,9 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
 
 
 def test_worlds_have_the_contact_of_their_own_modulus():
-    """Contact stiffness and the range of adhesion follow from each world's rubber, whichever world is first."""
+    options = SkinOptions(
+        contact_law=ContactLaw(adhesion=0.05), tolerance=1e-8, max_newton=200, liquid=False
+    )
     soft, stiff = (Material("neo_hookean", E, 0.4) for E in (3e5, 1.5e6))
     options = SkinOptions(contact_law=ContactLaw(adhesion=0.05), tolerance=1e-8, max_newton=200, liquid=False)
 
