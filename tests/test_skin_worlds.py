@@ -23,7 +23,7 @@ from biotac_mj.skin import (
     prepare_step,
     step,
 )
-from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, judge_balance
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
 
@@ -413,9 +413,8 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
 
 
 def test_worlds_have_the_contact_of_their_own_modulus():
-    options = SkinOptions(
-        contact_law=ContactLaw(adhesion=0.05), tolerance=1e-8, max_newton=200, liquid=False
-    )
+    """Contact stiffness and the range of adhesion follow from each world's rubber, whichever world is
+    first."""
     soft, stiff = (Material("neo_hookean", E, 0.4) for E in (3e5, 1.5e6))
     options = SkinOptions(contact_law=ContactLaw(adhesion=0.05), tolerance=1e-8, max_newton=200, liquid=False)
 
@@ -435,3 +434,20 @@ def test_worlds_have_the_contact_of_their_own_modulus():
         together, ranges = pressed([(soft, stiff)[k] for k in order])
         np.testing.assert_allclose(together, force[order], rtol=1e-6)
         np.testing.assert_allclose(ranges, reach[order], rtol=1e-12)
+
+
+@pytest.mark.parametrize("rz, balanced", [(1e-12, True), (-1e-12, True), (1e-6, False), (-1e-6, False)])
+def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
+    """The error is sqrt(|r . z| / work): a negative product is no smaller an error than a positive one."""
+    st = SkinData(finger()).worlds
+    st.active.fill_(1)
+    st.touched.fill_(1)
+    part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
+    part[0], worth[0], worth[1] = rz, 1e-4, 1.0  # residual squared [N^2], work of the load [J]
+    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
+    go_on = wp.zeros(1, dtype=int, device="cpu")
+    wp.launch_tiled(
+        judge_balance, dim=[1], inputs=[1e-4, 30, 0, *arrays, st], outputs=[go_on], block_dim=1, device="cpu"
+    )
+    assert bool(st.active.numpy()[0]) is not balanced and bool(go_on.numpy()[0]) is not balanced
+    assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)

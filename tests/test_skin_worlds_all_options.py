@@ -23,7 +23,6 @@ OPTIONS = SkinOptions(
     max_newton=100,
     max_cg=200,
 )
-RANGE = 6e-5  # [m] of adhesion, one for all: the automatic one depends on the model's own material
 
 
 @functools.cache
@@ -92,7 +91,7 @@ def walk(model, data, ways, who, device):
 
 def together(n, device):
     materials, values, ways = draw(n)
-    options = dataclasses.replace(OPTIONS, contact_law=ContactLaw(adhesion_range=RANGE))
+    options = dataclasses.replace(OPTIONS, contact_law=ContactLaw())
     options, modulus = make_room(options, None, values, len(body().elem))
     model = SkinModel(body(), materials[0], options, device, modulus=modulus)
     data = make_worlds(model, n, materials, values)
@@ -104,7 +103,6 @@ def alone(n, w, device):
     mine = {name: value[w] for name, value in values.items()}
     law = ContactLaw(
         *(mine[k] for k in ("friction_exponent", "friction_pressure", "adhesion", "adhesion_hysteresis")),
-        adhesion_range=RANGE,
     )
     bulk, fill = mine["bulk_modulus"], mine["fill_volume"]
     options = dataclasses.replace(OPTIONS, contact_law=law, liquid=bool(bulk))

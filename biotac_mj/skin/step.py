@@ -26,7 +26,7 @@ import warp as wp
 
 from ..threads import single_thread
 from . import liquid
-from .contact import faces, limits
+from .contact import faces, limits, touch
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
@@ -521,7 +521,7 @@ class SkinStep:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s = self.m, self.d, self.k, state.surface
         laws = d.laws.struct if not still else self._lawless
-        kernels = faces.contact_kernels(bool(len(laws.reach)))
+        kernels = touch.contact_kernels(bool(len(laws.reach)))
         dim, nsample = state.touching.shape, len(m.sample)
         known = [state.seen, state.clearance]
         self._launch(

@@ -7,7 +7,8 @@ them, which also fixes the order of sums."""
 import numpy as np
 import warp as wp
 
-from ..contact.faces import Geoms, Laws, contact_kernels, distance_from_afar, empty_laws
+from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
+from ..contact.touch import contact_kernels
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
 

@@ -1,0 +1,303 @@
+"""What a sample of a face feels: overclosure, adhesion, friction with stick and slip; and the faces that it
+is summed over.
+
+Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that stays
+put on the geom, returned radially to mu times the normal force where it slips. Surfaces with a
+`law.ContactLaw` have kernels of their own, in which friction depends on pressure and surfaces stick together;
+Coulomb's law is the case without. Few worlds are evaluated sample by sample on CUDA, all others face by face.
+"""
+
+import functools
+import types
+
+import warp as wp
+
+from ..types import mat33, real, vec3
+from .faces import FaceSum, Geoms, Laws, known_clearance, with_sample, write_face
+from .shapes import distance
+
+__all__ = ["contact_kernels", "stick_or_slip"]
+
+wp.set_module_options({"enable_backward": False})
+
+_LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
+
+
+@wp.func
+def stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real):
+    """Coulomb's friction of at most `most` [N] at `local`, held by a spring kt about the anchor `stick`:
+    force, its tangent, anchor."""
+    slip = local - stick
+    slip = slip - wp.dot(slip, normal) * normal
+    length = wp.length(slip)
+    tangent = wp.identity(n=3, dtype=real) - wp.outer(normal, normal)
+    force = -kt * slip
+    K = kt * tangent
+    anchor = stick
+    if kt * length > most:
+        along = slip / length
+        force = -most * along
+        K = most / length * (tangent - wp.outer(along, along))
+        anchor = local - most / kt * along
+    return force, K, anchor
+
+
+@wp.func
+def normal_traction(k: real, peak: real, reach: real, gap: real):
+    """Push (negative: pull) per area and its slope where it is not softening, for contact springs k; all
+    three in one unit of area."""
+    if k * gap <= peak:
+        return wp.vec2d(-k * gap, k)
+    return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
+
+
+@functools.cache
+def contact_kernels(lawful: bool) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_face` is a function
+    of theirs."""
+    module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
+
+    @wp.func
+    def touch_sample(
+        i: int,
+        w: int,
+        b: vec3,
+        t: wp.vec3i,
+        x0: vec3,
+        x1: vec3,
+        x2: vec3,
+        k: real,
+        kt: real,
+        share: real,
+        laws: Laws,
+        geoms: Geoms,
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+    ):
+        """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
+        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor."""
+        p = b[0] * x0 + b[1] * x1 + b[2] * x2
+        touched = int(-1)
+        clearance = real(1.0)
+        gap = real(0.0)
+        if wp.static(lawful):
+            gap = laws.reach[w]
+        normal = vec3()
+        local = vec3()
+        for g in range(geoms.count):
+            R = geoms.mat[g, w]
+            y = wp.transpose(R) * (p - geoms.pos[g, w])
+            dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            clearance = wp.min(clearance, dn[3])
+            if dn[3] < gap:
+                gap = dn[3]
+                touched = g
+                normal = vec3(dn[0], dn[1], dn[2])
+                local = y
+        force = vec3()
+        K = mat33()
+        stick = local
+        bond = touched
+        if touched >= 0:
+            mu = geoms.friction[touched, w]
+            fn = -k * gap
+            if wp.static(lawful):
+                joined = real(2.0) * laws.work[w] * share  # peak force times range
+                work = joined
+                bond = int(-1)
+                if anchor_geom[i, w] == touched:
+                    work = real(2.0) * laws.parting[w] * share
+                    bond = touched
+                peak = real(0.0)
+                if laws.reach[w] > real(0.0):
+                    peak = work / laws.reach[w]
+                    joined = joined / laws.reach[w]
+                if k * gap <= joined:
+                    bond = touched
+                traction = normal_traction(k, peak, laws.reach[w], gap)
+                fn = traction[0]
+                K = traction[1] * wp.outer(normal, normal)
+                if laws.exponent[w] != real(0.0):
+                    pressure = real(0.0)
+                    for c in range(3):
+                        pressure += b[c] * laws.node_push[t[c], w] / laws.node_area[t[c]]
+                    pressure = wp.max(pressure, real(_LEAST) * laws.pressure[w])
+                    mu = mu * wp.pow(pressure / laws.pressure[w], -laws.exponent[w])
+            else:
+                K = k * wp.outer(normal, normal)
+            force = fn * normal
+            if mu > real(0.0) and fn > real(0.0):
+                if anchor_geom[i, w] == touched:
+                    stick = anchor[i, w]
+                else:
+                    # touched within this step: slip counts from where the sample was on the geom when the
+                    # step began
+                    last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
+                    stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+                ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
+                force = force + ft
+                K = K + Kt
+            R = geoms.mat[touched, w]
+            force = R * force
+            K = R * K * wp.transpose(R)
+        return touched, bond, clearance, force, K, stick
+
+    @wp.func
+    def touch_face(
+        f: int,
+        w: int,
+        # In:
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: real,
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        # Out:
+        corner_out: wp.array2d(dtype=vec3),
+        block_out: wp.array2d(dtype=mat33),
+        touching_out: wp.array2d(dtype=int),
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+    ):
+        """Evaluates a face; returns how far its nearest sample is from touching [m]."""
+        nsample = sample.shape[0]
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        free = real(1.0)
+        touching = int(0)
+        total = FaceSum()
+        share = area[f] / real(nsample)
+        k = stiffness * share
+        for s in range(nsample):
+            i = f * nsample + s
+            b = sample[s]
+            touched, bond, gap, force, K, stick = touch_sample(
+                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor
+            )
+            free = wp.min(free, gap)
+            geom_out[i, w] = touched
+            bond_out[i, w] = bond
+            if touched >= 0:
+                touching = 1
+                anchor_out[i, w] = stick
+                force_out[i, w] = force
+                total = with_sample(total, b, force, K)
+        write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        return free
+
+    @wp.kernel(module=module, enable_backward=False)
+    def by_face(
+        # In:
+        still: int,
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        near: wp.array2d(dtype=int),
+        # In and out:
+        seen: wp.array2d(dtype=vec3),
+        clearance: wp.array2d(dtype=real),
+        # Out:
+        corner_out: wp.array2d(dtype=vec3),
+        block_out: wp.array2d(dtype=mat33),
+        touching_out: wp.array2d(dtype=int),
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+    ):
+        """Contact of the near faces."""
+        f, w = wp.tid()
+        if on[w] == 0:
+            return
+        if near[f, w] == 0:
+            return
+        free = touch_face(
+            f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
+            corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
+        )  # fmt: skip
+        if still == 1:
+            t = face[f]
+            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
+            for c in range(3):
+                seen[3 * f + c, w] = x[t[c], w]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def by_sample(
+        # In:
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        on: wp.array(dtype=int),
+        near: wp.array2d(dtype=int),
+        # Out:
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+        gap_out: wp.array2d(dtype=real),
+        tangent_out: wp.array2d(dtype=mat33),
+    ):
+        """The same by samples, for few worlds: `sum_samples` then adds up the faces."""
+        i, w = wp.tid()
+        f = i // sample.shape[0]
+        if on[w] == 0:
+            return
+        if near[f, w] == 0:
+            return
+        t = face[f]
+        share = area[f] / real(sample.shape[0])
+        k = stiffness[w] * share
+        touched, bond, gap, force, K, stick = touch_sample(
+            i,
+            w,
+            sample[i % sample.shape[0]],
+            t,
+            x[t[0], w],
+            x[t[1], w],
+            x[t[2], w],
+            k,
+            k * stick_ratio,
+            share,
+            laws,
+            geoms,
+            x_last,
+            anchor_geom,
+            anchor,
+        )
+        geom_out[i, w] = touched
+        bond_out[i, w] = bond
+        gap_out[i, w] = gap
+        if touched >= 0:
+            anchor_out[i, w] = stick
+            force_out[i, w] = force
+            tangent_out[i, w] = K
+
+    return types.SimpleNamespace(touch_face=touch_face, by_face=by_face, by_sample=by_sample)
