@@ -6,7 +6,16 @@ import inspect
 import pytest
 from imports import modules
 
-TYPED = ("coupling", "batch", "press", "view", "effects", "geometry", "calibration")  # those that are done
+TYPED = (
+    "coupling",
+    "batch",
+    "press",
+    "view",
+    "effects",
+    "geometry",
+    "calibration",
+    "tasks",
+)  # those that are done
 
 
 def _public_modules():

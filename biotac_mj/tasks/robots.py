@@ -147,9 +147,9 @@ class Gripper(_Machine):
             )
 
     @property
-    def axes(self):
+    def axes(self) -> list[str]:
         return ["lift", "grip"] if len(self._actuators) == 3 else ["grip"]
 
-    def command(self, physics, action):
+    def command(self, physics: mjcf.Physics, action: np.ndarray) -> None:
         """action: (lift, grip) or (grip,) in [-1, 1]; a grip of 1 closes."""
         super().command(physics, np.append(action, action[-1]))

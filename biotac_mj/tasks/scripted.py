@@ -5,10 +5,17 @@ A controller never sees the simulation's hidden state. What it believes about fo
 `touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, in the calibration itself,
 from the truth handed to `act`."""
 
+import pathlib
+import typing
+
 import numpy as np
 
 from ..data.objects import OBJECTS
 from .touch import Touch, check_fitted_on, load_calibration, load_estimator
+
+if typing.TYPE_CHECKING:
+    from dm_control import composer
+    from dm_env import specs
 
 __all__ = ["SCRIPTED", "Random", "make_controller"]
 
@@ -210,20 +217,22 @@ class Lift(Hold):
 class Random:
     """Uniform in the action's bounds."""
 
-    def __init__(self, spec, seed=0):
+    def __init__(self, spec: "specs.BoundedArray", seed: int = 0):
         self.spec, self.rng = spec, np.random.RandomState(seed)
 
-    def reset(self):
+    def reset(self) -> None:
         """Nothing to forget."""
 
-    def act(self, observation):
+    def act(self, observation: dict) -> np.ndarray:
         return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 
 SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}
 
 
-def make_controller(task, env=None, calibration=None) -> Scripted:
+def make_controller(
+    task: str, env: "composer.Environment | None" = None, calibration: pathlib.Path | str | None = None
+) -> Scripted:
     """The scripted controller of a task.
 
     Args:
