@@ -6,6 +6,7 @@ import inspect
 import pytest
 from imports import modules
 
+# those that are done
 TYPED = (
     "coupling",
     "batch",
@@ -15,7 +16,10 @@ TYPED = (
     "geometry",
     "calibration",
     "tasks",
-)  # those that are done
+    "learning",
+    "data",
+    "sensor",
+)
 
 
 def _public_modules():
