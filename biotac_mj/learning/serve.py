@@ -4,7 +4,6 @@ electrodes."""
 import functools
 import pathlib
 import typing
-from typing import Any
 
 import numpy as np
 import torch
@@ -105,7 +104,7 @@ class LearnedReadings:
     """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to
     it."""
 
-    def __init__(self, config: Any, geometry: "SkinGeometry"):
+    def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         self._network = NetworkReadings(
             geometry, seed=config.seed, **dict(config.options.get("readings", {}))
         )
