@@ -1,5 +1,7 @@
 """Drift, jump or changed gain of single electrodes: what one of them does and the others do not."""
 
+from typing import Any
+
 import numpy as np
 
 from ....sensor.channels import counts_from_log_impedance, log_impedance
@@ -32,7 +34,7 @@ class Drift(TimeShaped):
         "warmup": "one electrode or all",
     }
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         line = session.timeline()
         kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
         best, evidence = None, {}
@@ -161,7 +163,7 @@ class GainChange(RecordedEffect):
     params = {"gain": Parameter("1", -0.95, 3, "manufacturing scatter 3-15 %, damage more"), "onset": ONSET}
     confusable = {"drift": "load the electrode before and after", "saturate": "depth ladder at one place"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         line = session.timeline()
         if not line.loaded:
             return []
@@ -238,10 +240,10 @@ class GainChange(RecordedEffect):
             )
         ]
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return self._scale(counts, time, channels, theta, 1 + theta["gain"], theta["shift"], False)
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return self._scale(
             counts, time, channels, theta, 1 / max(1 + theta["gain"], 0.05), theta["shift"], True
         )
