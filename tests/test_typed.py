@@ -19,6 +19,8 @@ TYPED = (
     "learning",
     "data",
     "sensor",
+    "discrepancy",
+    "skin",
 )
 
 
