@@ -281,7 +281,7 @@ class Liquid:
         return self._worlds.last_pressure.numpy().copy()
 
     @last_pressure.setter
-    def last_pressure(self, value):
+    def last_pressure(self, value: ArrayLike) -> None:
         self._write("last_pressure", value)
 
     def reset(self) -> None:

@@ -339,7 +339,7 @@ class SkinModel:
         return self._rest
 
     @rest.setter
-    def rest(self, value: liquid.Rest):
+    def rest(self, value: liquid.Rest) -> None:
         self._rest = value
 
     @functools.cached_property

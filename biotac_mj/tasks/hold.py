@@ -18,7 +18,7 @@ _GRAVITY = 9.81
 class _Grip(TouchTask):
     estimated = ("grip", "load")
 
-    def __init__(self, lift, mass, **settings):
+    def __init__(self, lift: bool, mass: float, **settings: object):
         gripper = Gripper(lift=lift)
         super().__init__(gripper, gripper.mounts, **settings)
         world = self._arena.mjcf_model.worldbody
@@ -43,15 +43,15 @@ class _Grip(TouchTask):
         fingers = np.full(2, -_HALF[1] - open_by)
         self.machine.place(physics, fingers if len(self.machine.joints) == 2 else np.append(0.0, fingers))
 
-    def height(self, physics):
+    def height(self, physics: mjcf.Physics) -> float:
         """Of the object's middle [m]."""
         return float(physics.bind(self._joint).qpos[2])
 
-    def hidden(self, physics):
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         # what the object's weight pulls is towards the tips, -x of the BioTacs
         return np.array([self.contact_force(physics, i)[[1, 0]] for i in range(2)]) * [1, -1]
 
-    def grip(self, physics):
+    def grip(self, physics: mjcf.Physics) -> float:
         """Mean normal force of the fingers [N]."""
         return float(self.hidden(physics)[:, 0].mean())
 

@@ -177,7 +177,7 @@ def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
 
 
 @functools.cache
-def load_calibration(path=None) -> dict:
+def load_calibration(path: str | None = None) -> dict:
     """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's,
     `biotac_mj/tasks/calibration.npz`."""
     if path is None:

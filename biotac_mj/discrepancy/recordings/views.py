@@ -52,7 +52,7 @@ class Choice:
         return ", ".join([*moving, *between]) or "nothing"
 
 
-def over_time(finding):
+def over_time(finding: "Finding") -> bool:
     return isinstance(finding.effect, (TimeShaped, GainChange))
 
 
@@ -106,7 +106,7 @@ class Amended:
 # --- the views: Amended -> prediction, measured numbers (n or bins, components), time of the rows [s]
 
 
-def electrodes_from_force(a):
+def electrodes_from_force(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (
         a.measured_counts(_from_force(a.force, a.counts, a.session.fit)),
         a.session.recording.electrodes,
@@ -114,12 +114,12 @@ def electrodes_from_force(a):
     )
 
 
-def electrodes_at_rest(a):
+def electrodes_at_rest(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     level = counts_from_log_impedance(log_impedance(a.counts[a.session.fit]).mean(0))
     return a.measured_counts(np.tile(level, (len(a.counts), 1))), a.session.recording.electrodes, a.time
 
 
-def force_from_electrodes(a):
+def force_from_electrodes(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear in ln Z, ridge."""
     z, fit = log_impedance(a.counts), a.session.fit
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
@@ -130,7 +130,7 @@ def force_from_electrodes(a):
     return a.measured_force(A @ w), a.session.recording.force, a.time
 
 
-def each_from_the_others(a):
+def each_from_the_others(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     line, deviation, _ = whole_line(a.session)
     e = np.median(a.session.recording.electrodes, axis=0)[line.used]
     residual = np.zeros((len(line.time), 19))  # zero of electrodes that are masked for the most part
@@ -144,7 +144,7 @@ VIEWS = {
 }  # fmt: skip
 
 
-def squares(view, amended, rows):
+def squares(view: str, amended: "Amended", rows: np.ndarray) -> np.ndarray:
     """(components,) mean square error of a view on rows (n,) bool, of every force component or electrode;
     masked samples do not count."""
     said, measured, time = VIEWS[view](amended)

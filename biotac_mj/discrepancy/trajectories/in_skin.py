@@ -137,7 +137,13 @@ class _Remembering(Simulator):
     """Solves the skin with what is `inside`; nothing is cached, since the past decides."""
 
     def solve(
-        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+        self,
+        trajectories: "list[Trajectory]",
+        offset: list | None = None,
+        log_radius: list | None = None,
+        log_friction: float = 0.0,
+        bubble: float = 0.0,
+        progress: Callable[[], object] | None = None,
     ) -> list:
         poses = [
             placed(

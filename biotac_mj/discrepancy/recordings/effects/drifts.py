@@ -263,11 +263,11 @@ class _InCounts(Common):
         found.theta["counts"] = -1 / float(mass.mean())
         return found
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         change = theta["counts"] * self._level(time, theta)[:, None]
         return np.clip(counts * (1 + change) if self.multiplies else counts + change, 0, 4095)
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         change = theta["counts"] * self._level(time, theta)[:, None]
         return np.clip(counts / np.maximum(1 + change, 0.05) if self.multiplies else counts - change, 0, 4095)
 

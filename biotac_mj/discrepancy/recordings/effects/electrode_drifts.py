@@ -1,6 +1,6 @@
 """Drift, jump or changed gain of single electrodes: what one of them does and the others do not."""
 
-from typing import Any
+import typing
 
 import numpy as np
 
@@ -8,6 +8,9 @@ from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ..shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 from .drifts import LENGTH, ONSET, Common, TimeShaped, counts_per_log, least_squares
 from .effect import Finding, Parameter, RecordedEffect
+
+if typing.TYPE_CHECKING:
+    from ..timeline import Timeline
 
 __all__ = ["Drift", "GainChange"]
 
@@ -34,7 +37,7 @@ class Drift(TimeShaped):
         "warmup": "one electrode or all",
     }
 
-    def find(self, session: Any) -> list:
+    def find(self, session: typing.Any) -> list:
         line = session.timeline()
         kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
         best, evidence = None, {}
@@ -163,7 +166,7 @@ class GainChange(RecordedEffect):
     params = {"gain": Parameter("1", -0.95, 3, "manufacturing scatter 3-15 %, damage more"), "onset": ONSET}
     confusable = {"drift": "load the electrode before and after", "saturate": "depth ladder at one place"}
 
-    def find(self, session: Any) -> list:
+    def find(self, session: typing.Any) -> list:
         line = session.timeline()
         if not line.loaded:
             return []
@@ -259,7 +262,7 @@ class GainChange(RecordedEffect):
         return out
 
 
-def whole_electrodes(session, line):
+def whole_electrodes(session: typing.Any, line: "Timeline") -> list[int]:
     """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken
     for a drift."""
     return [i for i, k in enumerate(line.used) if session.masked[session.fit, k].mean() < 0.03]

@@ -21,7 +21,7 @@ _THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _WINDOWS = 24
 
 
-def windows(session, rows=None):
+def windows(session: Any, rows: np.ndarray | None = None) -> list[tuple]:
     """Third differences (without repeated rows) cut into windows: list of (first time, last time, (n,
     19))."""
     recording = session.recording
@@ -36,7 +36,7 @@ def windows(session, rows=None):
     return [(t[a], t[min(a + size, len(t)) - 1], d[a : a + size]) for a in range(0, len(d) - size // 2, size)]
 
 
-def differenced_correlation(pole):
+def differenced_correlation(pole: float) -> float:
     """Lag-1 autocorrelation of the third differences of noise with an exponential autocorrelation
     pole^|h|."""
     c = np.convolve(_THIRD, _THIRD[::-1])
@@ -46,7 +46,7 @@ def differenced_correlation(pole):
     return one / zero
 
 
-def pole_of(correlation):
+def pole_of(correlation: float) -> float:
     """Inverse of `differenced_correlation`, nan below white."""
     white, stiff = differenced_correlation(0.0), differenced_correlation(0.995)
     if not white < correlation:
@@ -75,7 +75,7 @@ def _mean(x):
         return np.where(known, x, 0).sum(0) / known.sum(0)
 
 
-def quiet(cuts, share=0.5):
+def quiet(cuts: list[tuple], share: float = 0.5) -> list[tuple]:
     """The windows in which the third differences are smallest."""
     energy = np.array([np.nanmedian(_mean(d**2)) for _, _, d in cuts])
     return [c for c, e in zip(cuts, energy) if e <= np.quantile(energy, share)]
