@@ -6,7 +6,22 @@ import inspect
 import pytest
 from imports import modules
 
-TYPED = ("coupling", "batch", "press", "view", "effects", "geometry", "calibration")  # those that are done
+# those that are done
+TYPED = (
+    "coupling",
+    "batch",
+    "press",
+    "view",
+    "effects",
+    "geometry",
+    "calibration",
+    "tasks",
+    "learning",
+    "data",
+    "sensor",
+    "discrepancy",
+    "skin",
+)
 
 
 def _public_modules():

@@ -24,8 +24,7 @@ __all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
 # head of the plugin state: steps that did not converge, then how the last committed step went
 _HEAD = 4
 _MODEL = 6 + 36 + 3 + 9  # of a touching body: wrench, tangent, and the pose they belong to
-_FAILED, _CONVERGED, _ITERATIONS, _RESIDUAL = range(_HEAD)
-STATUS = ("converged", "failed_steps", "iterations", "residual", "tier")
+_FAILED, _CONVERGED = 0, 1  # in the head; iterations and residual follow
 
 
 class _Skin:

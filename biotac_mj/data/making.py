@@ -7,11 +7,14 @@ import dataclasses
 import gc
 import multiprocessing
 import os
+import pathlib
 import platform
 import queue
 import signal
 import time
 import traceback
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 import tqdm
@@ -29,7 +32,9 @@ _VISIBLE = "CUDA_VISIBLE_DEVICES"
 _AHEAD = 4  # batches that wait for their readings at most: they lie in memory
 
 
-def make_shards(out, options, settings, todo, workers, progress) -> dict:
+def make_shards(
+    out: pathlib.Path, options: Any, settings: dict, todo: Iterable, workers: int, progress: bool
+) -> dict:
     """Makes the shards of batches `todo` in folder `out`, on all of the options' devices.
 
     Args:
@@ -162,7 +167,15 @@ class Maker:
       seconds: of each stage.
     """
 
-    def __init__(self, out, options, settings, device="cpu", update=lambda n: None, tell=lambda text: None):
+    def __init__(
+        self,
+        out: pathlib.Path,
+        options: Any,
+        settings: dict,
+        device: str = "cpu",
+        update: Callable[[int], object] = lambda n: None,
+        tell: Callable[[str], object] = lambda text: None,
+    ):
         from ..geometry import load_skin
         from ..skin import SkinModel
         from ..skin.condensed.refusals import refuse
@@ -212,7 +225,7 @@ class Maker:
             self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
         self._count("start", clock)
 
-    def run(self, todo, workers):
+    def run(self, todo: Iterable, workers: int) -> None:
         """Makes the shards of an iterator of batches with that many worker processes."""
         from . import readings, synthetic_sensor
 

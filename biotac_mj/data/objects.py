@@ -3,7 +3,7 @@ table.
 
 Narang et al. (ICRA 2021) name pegs and table features without their sizes: those here are chosen. Frames are
 those of
-`press_indenter`: the tip at the origin, +y ahead.
+`press.indenter`: the tip at the origin, +y ahead.
 """
 
 import functools
@@ -74,7 +74,7 @@ def _prism(name, corners, width):
 
 @functools.lru_cache(maxsize=32)
 def make_object(name: str) -> Indenter:
-    """One of OBJECTS; besides, whatever `press_indenter.make_indenter` understands.
+    """One of OBJECTS; besides, whatever `press.indenter.make_indenter` understands.
 
     Raises:
       ValueError: unknown name; the text lists the names.

@@ -5,9 +5,11 @@ import bisect
 import dataclasses
 import json
 import pathlib
+from collections.abc import Sequence
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..files import replacing, versions
 from ..geometry.skin_geometry import SkinGeometry
@@ -31,13 +33,16 @@ _TABLE = (
 _TEXT = ("id", "object", "kind", "split", "parameters")
 
 
-def shard_path(folder, number: int) -> pathlib.Path:
+def shard_path(folder: pathlib.Path | str, number: int) -> pathlib.Path:
     """Where shard `number` of a set lies."""
     return pathlib.Path(folder) / f"shard-{number:05d}.h5"
 
 
 def write_shard(
-    path, interactions, geometry: SkinGeometry | None = None, attributes: dict | None = None
+    path: pathlib.Path | str,
+    interactions: Sequence[Interaction],
+    geometry: SkinGeometry | None = None,
+    attributes: dict | None = None,
 ) -> None:
     """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the
     versions alone.
@@ -135,7 +140,7 @@ class Column:
       name; shape (nstep, ...); dtype of what indexing returns.
     """
 
-    def __init__(self, name, parts, shape, offsets):
+    def __init__(self, name: str, parts: list, shape: tuple, offsets: np.ndarray):
         self.name, self._parts, self._offsets = name, parts, offsets
         self.shape = shape
         self.dtype = (
@@ -200,7 +205,7 @@ class TactileSet:
       ValueError: a file that is no shard, of another schema, or shards that do not belong together.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: pathlib.Path | str):
         self.path = pathlib.Path(path)
         files = sorted(self.path.glob("shard-*.h5")) if self.path.is_dir() else [self.path]
         if not files or not files[0].is_file():
@@ -267,7 +272,7 @@ class TactileSet:
     def __exit__(self, *_):
         self.close()
 
-    def close(self):
+    def close(self) -> None:
         for file in self._files:
             file.close()
 
@@ -300,12 +305,12 @@ class TactileSet:
         shape = next(p for p in parts if p is not None).shape[1:]
         return Column(name, parts, (self.nstep, *shape), self._offsets[:-1])
 
-    def vert_xpos(self, index) -> np.ndarray:
+    def vert_xpos(self, index: int | slice | np.ndarray) -> np.ndarray:
         """(..., nvert, 3) float32 positions of the nodes at time steps [m]."""
         rest = self.rest_vert.astype(np.float32)
         return self["displacement"][index] + rest
 
-    def steps(self, interactions) -> np.ndarray:
+    def steps(self, interactions: ArrayLike) -> np.ndarray:
         """Time steps (k,) of interactions, given by number or as a mask."""
         chosen = np.atleast_1d(np.arange(len(self))[interactions])
         return np.concatenate([np.arange(self.start[i], self.stop[i]) for i in chosen] or [np.zeros(0, int)])

@@ -151,7 +151,7 @@ class Meter:
     def __post_init__(self):
         self._conduction = None
 
-    def impedance(self, vert_xpos) -> np.ndarray:
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
         """(n, 19) [ohm] for nodes (n, nvert, 3) [m]; with the cell constants that give the sensor's counts at
         rest."""
         if self._conduction is None:
@@ -168,7 +168,9 @@ class Meter:
             )
         return np.array(out)
 
-    def measure(self, vert_xpos, time, pressure, start: float, seed: int) -> np.ndarray:
+    def measure(
+        self, vert_xpos: np.ndarray, time: np.ndarray, pressure: np.ndarray, start: float, seed: int
+    ) -> np.ndarray:
         """(n, 23) counts, in the order of sensor.channels.CHANNELS, of one contact that begins `start`
         seconds into the session.
 
@@ -197,7 +199,7 @@ class Meter:
         `rest_counts`."""
         return self.variation.drift / _PER_DEGREE
 
-    def temperature(self, t) -> np.ndarray:
+    def temperature(self, t: np.ndarray) -> np.ndarray:
         """(n,) [C] at times (n,) of the session [s]: warming up, then wandering as slow sines, the same for
         every contact."""
         v = self.variation

@@ -1,9 +1,11 @@
 """What `biotac generate`, `biotac import-data` and `biotac export-data` do with their arguments."""
 
+import argparse
+
 __all__ = ["export_verb", "generate_verb", "import_verb"]
 
 
-def generate_verb(args) -> None:
+def generate_verb(args: argparse.Namespace) -> None:
     """`biotac generate`; raises ValueError or FileNotFoundError for what cannot be."""
     from .generate import GenerateOptions, generate
 
@@ -44,7 +46,7 @@ def generate_verb(args) -> None:
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
 
 
-def import_verb(args) -> None:
+def import_verb(args: argparse.Namespace) -> None:
     """`biotac import-data`; raises ValueError or FileNotFoundError for what cannot be."""
     from .importers import import_recordings
     from .store import TactileSet
@@ -68,7 +70,7 @@ def import_verb(args) -> None:
         print(f"{count} interactions, {data.nstep} time steps, objects {objects}; in {args.out}")
 
 
-def export_verb(args) -> None:
+def export_verb(args: argparse.Namespace) -> None:
     """`biotac export-data`; raises ValueError or FileNotFoundError for what cannot be."""
     from .lerobot import VERSION, export_lerobot
     from .store import TactileSet

@@ -5,7 +5,7 @@ import numpy as np
 __all__ = ["benjamini_hochberg", "max_t", "sign_flip", "wilson"]
 
 
-def sign_flip(gain, draws=4000, seed=0) -> float:
+def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
     """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of
     them."""
     gain = np.asarray(gain, float)
@@ -18,7 +18,7 @@ def sign_flip(gain, draws=4000, seed=0) -> float:
     return float(np.mean((sign * gain).mean(1) >= gain.mean() - 1e-15))
 
 
-def max_t(statistic, draws=2000, seed=0):
+def max_t(statistic: np.ndarray, draws: int = 2000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Family-wise p of many cells by sign flips of whole units (Andreella and Finos 2026; max-T of Westfall
     and Young).
 
@@ -40,7 +40,7 @@ def max_t(statistic, draws=2000, seed=0):
     return t, np.array([np.mean(largest >= abs(v) - 1e-12) for v in t])
 
 
-def benjamini_hochberg(p):
+def benjamini_hochberg(p: np.ndarray) -> np.ndarray:
     """Adjusted p-values (false discovery rate) of p (n,)."""
     p = np.asarray(p, float)
     order = np.argsort(p)
@@ -50,7 +50,7 @@ def benjamini_hochberg(p):
     return out
 
 
-def wilson(hits, total, z=1.96):
+def wilson(hits: int, total: int, z: float = 1.96) -> tuple[float, float]:
     """95 % interval of a share."""
     if not total:
         return 0.0, 1.0

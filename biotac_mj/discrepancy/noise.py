@@ -5,7 +5,7 @@ import numpy as np
 __all__ = ["noise_level"]
 
 
-def noise_level(counts, repeated=None, least=0.05):
+def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: float = 0.05) -> np.ndarray:
     """(c,) standard deviation of the white noise of samples (n, c) [counts]: second differences of the
     quietest quarter of the record."""
     x = counts if repeated is None else counts[~repeated]

@@ -1,13 +1,14 @@
 """Numbers of a report as JSON has them."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 __all__ = ["plain_values"]
 
 
-def plain_values(x):
+def plain_values(x: Any) -> Any:
     if isinstance(x, dict):
         return {str(k): plain_values(v) for k, v in x.items()}
     if isinstance(x, (list, tuple)):

@@ -1,11 +1,12 @@
 """`biotac diagnose`."""
 
+import argparse
 import pathlib
 
 __all__ = ["diagnose_verb"]
 
 
-def diagnose_verb(args):
+def diagnose_verb(args: argparse.Namespace) -> None:
     """Runs the verb: plain recordings with --electrodes, else the full workflow on a data file."""
     if args.electrodes and args.data:
         raise ValueError("give either DATA (an HDF5 file with --sensor) or --electrodes, not both")

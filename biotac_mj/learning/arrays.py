@@ -1,9 +1,11 @@
 """A data set as the tensors that training works on."""
 
 import dataclasses
+import pathlib
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from ..sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
 
@@ -40,10 +42,10 @@ class Arrays:
     path: str = ""
 
     @property
-    def device(self):
+    def device(self) -> torch.device:
         return self.field.device
 
-    def rows(self, interactions, labelled=False) -> torch.Tensor:
+    def rows(self, interactions: ArrayLike, labelled: bool = False) -> torch.Tensor:
         """Rows of these interactions; with `labelled` only rows with measured counts, without each
         interaction's tare row.
 
@@ -66,11 +68,11 @@ class Arrays:
             )
         return rows
 
-    def change(self, rows):
+    def change(self, rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) tared measured counts of rows."""
         return self.counts[rows] - self.tare[rows]
 
-    def log_change(self, rows):
+    def log_change(self, rows: torch.Tensor) -> torch.Tensor:
         """(k, 19) d ln Z of rows against their tare."""
         value = log_impedance(self.counts[rows].double().cpu().numpy()) - log_impedance(
             self.tare[rows].double().cpu().numpy()
@@ -78,7 +80,9 @@ class Arrays:
         return torch.as_tensor(value, dtype=torch.float32, device=self.device)
 
 
-def load_arrays(path, device="cpu", limit=None) -> Arrays:
+def load_arrays(
+    path: pathlib.Path | str, device: torch.device | str = "cpu", limit: int | None = None
+) -> Arrays:
     """Reads a set (docs/data.md).
 
     Args:

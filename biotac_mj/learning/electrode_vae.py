@@ -1,6 +1,8 @@
 """The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored, and a variant that starts as
 principal components."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 
@@ -9,7 +11,7 @@ from ..sensor.channels import NELECTRODE
 __all__ = ["ElectrodeVAE", "mlp"]
 
 
-def mlp(widths, dropout=0.0) -> nn.Sequential:
+def mlp(widths: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
     """Fully connected layers with ELU between them (none after the last); dropout after each hidden layer."""
     layers = []
     for i, (a, b) in enumerate(zip(widths, widths[1:])):
@@ -32,7 +34,13 @@ class ElectrodeVAE(nn.Module):
         PCA's error. None is the paper's network.
     """
 
-    def __init__(self, channels=NELECTRODE, hidden=(256, 128, 64), latent=8, linear=None):
+    def __init__(
+        self,
+        channels: int = NELECTRODE,
+        hidden: Sequence[int] = (256, 128, 64),
+        latent: int = 8,
+        linear: torch.Tensor | None = None,
+    ):
         super().__init__()
         self.latent = latent
         self.encoder = mlp([channels, *hidden, 2 * latent])
@@ -53,18 +61,18 @@ class ElectrodeVAE(nn.Module):
                 for last in (self.encoder[-1], self.decoder[-1]):
                     last.weight.mul_(0.1), last.bias.zero_()
 
-    def encode(self, x):
+    def encode(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log variance of the code, (n, latent) each, of x (n, channels)."""
         mean, log_variance = self.encoder(x).chunk(2, -1)
         if self.skip_in is not None:
             mean = mean + self.skip_in(x)
         return mean, log_variance.clamp(-14, 4)
 
-    def decode(self, z):
+    def decode(self, z: torch.Tensor) -> torch.Tensor:
         """(n, channels) of codes z (n, latent)."""
         return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)
 
-    def forward(self, x):
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
         variance."""
         mean, log_variance = self.encode(x)

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import pathlib
 import time
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ import torch
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
 from ..files import replacing
 from ..sensor.channels import FULL_SCALE
-from .arrays import load_arrays
+from .arrays import Arrays, load_arrays
 from .config import LearningConfig
 from .features import Pod
 from .force import ridge
@@ -36,17 +37,17 @@ FORWARD = {
 
 
 def train_all(
-    path,
-    out,
-    seeds=(0, 1, 2, 3, 4),
-    splits=("trajectory", "ring_7mm"),
-    config=None,
-    device="cpu",
-    paper=True,
-    only=None,
-    limit=None,
-    progress=True,
-):
+    path: pathlib.Path | str,
+    out: pathlib.Path | str,
+    seeds: Iterable[int] = (0, 1, 2, 3, 4),
+    splits: Iterable[str] = ("trajectory", "ring_7mm"),
+    config: LearningConfig | None = None,
+    device: torch.device | str = "cpu",
+    paper: bool = True,
+    only: Iterable[str] | None = None,
+    limit: int | None = None,
+    progress: bool = True,
+) -> None:
     """Trains and predicts for all splits and seeds; what is there already is kept, so an interrupted run goes
     on.
 
@@ -94,7 +95,18 @@ def train_all(
             )
 
 
-def train_split(arrays, features, path, split, seed, config, out, names, paper=True, step=None):
+def train_split(
+    arrays: Arrays,
+    features: Features,
+    path: pathlib.Path | str,
+    split: str,
+    seed: int,
+    config: LearningConfig,
+    out: pathlib.Path,
+    names: list[str],
+    paper: bool = True,
+    step: Callable[[str], object] | None = None,
+) -> None:
     """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
     and last SPLIT-SEED.json."""
     division = _division(path, split, seed, len(arrays.objects))

@@ -1,13 +1,18 @@
 """What a field of displacements says about the electrodes: principal components, film and strain over each
 electrode, the mirror image."""
 
+import typing
+
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 from torch import nn
 
 from ..sensor.channels import NELECTRODE
+
+if typing.TYPE_CHECKING:
+    from ..geometry.skin_geometry import SkinGeometry
 
 __all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix"]
 
@@ -28,14 +33,16 @@ class Pod(nn.Module):
       basis: (3 nvert, modes) orthonormal. scale: (modes,) root mean square of each component.
     """
 
-    def __init__(self, nvert, modes=128):
+    def __init__(self, nvert: int, modes: int = 128):
         super().__init__()
         self.nvert = nvert
         self.register_buffer("basis", torch.zeros(3 * nvert, modes))
         self.register_buffer("scale", torch.ones(modes))
 
     @classmethod
-    def fit(cls, field, rows, modes=128, most=16000, seed=0):
+    def fit(
+        cls, field: torch.Tensor, rows: torch.Tensor, modes: int = 128, most: int = 16000, seed: int = 0
+    ) -> "Pod":
         """Fits to rows of a field (n, nvert, 3) [mm], at most `most` of them, by a randomised
         decomposition."""
         generator = torch.Generator().manual_seed(seed)
@@ -49,11 +56,11 @@ class Pod(nn.Module):
         out.basis.copy_(v[:, :modes]), out.scale.copy_(s[:modes] / len(rows) ** 0.5 + 1e-9)
         return out
 
-    def forward(self, u):
+    def forward(self, u: torch.Tensor) -> torch.Tensor:
         """(n, modes) components, each of unit variance in training, of u (n, nvert, 3) [mm]."""
         return u.flatten(1).to(self.basis.dtype) @ self.basis / self.scale
 
-    def decode(self, x):
+    def decode(self, x: torch.Tensor) -> torch.Tensor:
         """(n, nvert, 3) [mm] of components."""
         return ((x * self.scale) @ self.basis.T).view(len(x), self.nvert, 3)
 
@@ -75,7 +82,7 @@ class FilmFeatures(nn.Module):
 
     count = 5 * len(_RADII) + 6 + 5
 
-    def __init__(self, geometry):
+    def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
         from ..sensor.core_surface import CoreSurface
         from ..sensor.film import _CORE_RADIUS, EXCITATION
@@ -146,7 +153,7 @@ class FilmFeatures(nn.Module):
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
         self.register_buffer("node", torch.as_tensor(node), persistent=False)
 
-    def forward(self, u):
+    def forward(self, u: torch.Tensor) -> torch.Tensor:
         """(n, 19, count) of u (n, nvert, 3) [mm]."""
         inner = u[:, self.node].float()
         n = len(u)
@@ -165,7 +172,7 @@ class FilmFeatures(nn.Module):
         return torch.cat([local, linear, whole], 2)
 
 
-def mirror_matrix(geometry):
+def mirror_matrix(geometry: "SkinGeometry") -> csr_matrix:
     """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0, by the shape functions of
     the tetrahedra there."""
     vert, tets = geometry.vert, geometry.tets

@@ -4,6 +4,7 @@ electrode was fitted."""
 import itertools
 import json
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ _SCATTER = np.geomspace(0.01, 0.64, 7)  # of gains, from touch to touch and betw
 _WITHIN, _BETWEEN, _COMMON = 0.1, 0.05, 0.2  # probable scatters, and that of the common gain around 1
 
 
-def adapt(predicted, measured, owner, slope) -> np.ndarray:
+def adapt(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Gains (19,) that bring predicted d ln Z (n, 19) of a new sensor's touches to measured ones; 1 where the
     touches do not ask for any.
 
@@ -99,7 +100,15 @@ def _posterior(gain, noise):
     return result
 
 
-def evaluate_new_sensor(path, weights, out, touches=(0, 1, 5, 20), draws=10, seed=0, device="cpu") -> dict:
+def evaluate_new_sensor(
+    path: pathlib.Path | str,
+    weights: pathlib.Path | str,
+    out: pathlib.Path | str,
+    touches: Sequence[int] = (0, 1, 5, 20),
+    draws: int = 10,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+) -> dict:
     """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains were fitted
     to k of its touches.
 

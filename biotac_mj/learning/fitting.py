@@ -8,6 +8,7 @@ replayed.
 import contextlib
 import copy
 import math
+from collections.abc import Callable, Iterator
 
 import torch
 
@@ -17,7 +18,7 @@ _WARM = 5  # steps before one is recorded
 
 
 @contextlib.contextmanager
-def fast_products():
+def fast_products() -> Iterator[None]:
     """TF32 for matrix products on a GPU: good enough inside a network, not for features and components, whose
     small parts it would blur."""
     before = torch.get_float32_matmul_precision()
@@ -28,26 +29,26 @@ def fast_products():
         torch.set_float32_matmul_precision(before)
 
 
-def root_mean_square(error):
+def root_mean_square(error: torch.Tensor) -> torch.Tensor:
     """Mean over samples of the RMS over the last axis: the paper's loss, and what its median counts."""
     return (error.square().mean(-1) + 1e-10).sqrt().mean()
 
 
 def cycle(
-    module,
-    loss,
-    rows,
-    batch,
-    steps,
-    learning_rate,
-    validate=None,
-    checks=12,
-    weight_decay=0.0,
-    decay=None,
-    seed=0,
-    graph=True,
-    progress=None,
-):
+    module: torch.nn.Module,
+    loss: Callable[[torch.Tensor], torch.Tensor],
+    rows: torch.Tensor,
+    batch: int,
+    steps: int,
+    learning_rate: float,
+    validate: Callable[[], float] | None = None,
+    checks: int = 12,
+    weight_decay: float = 0.0,
+    decay: float | None = None,
+    seed: int = 0,
+    graph: bool = True,
+    progress: Callable[[], object] | None = None,
+) -> float | None:
     """Trains in place.
 
     Args:

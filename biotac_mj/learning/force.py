@@ -9,6 +9,7 @@ the training part. A small network then learns what the ridge leaves, where it h
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,19 +24,19 @@ _RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
 _WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
 
 
-def causal_average(x, tau):
+def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
     """Exponential average of x (n, k) over the past, time constant tau [rows]; it starts at the first row."""
     a = 1 - np.exp(-1 / tau)
     return lfilter([a], [1, a - 1], x, axis=0, zi=x[:1] * (1 - a))[0]
 
 
-def walk_forward(n, folds=4, first=0.4):
+def walk_forward(n: int, folds: int = 4, first: float = 0.4) -> list[tuple[slice, slice]]:
     """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it."""
     edge = np.rint(np.linspace(first, 1, folds + 1) * n).astype(int)
     return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
 
 
-def ridge(x, y, strength):
+def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
     """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y
     (n, m)."""
     mean, scale = x.mean(0), x.std(0)
@@ -48,7 +49,7 @@ def ridge(x, y, strength):
     return weight, y.mean(0) - mean @ weight
 
 
-def shared_gain(log_z, force, tau):
+def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
     """Amplitude a of the gain a (1 - exp(-t / tau)) that all electrodes have in common in ln Z besides what
     the force explains.
 
@@ -136,7 +137,14 @@ class ForceModel:
       trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
     """
 
-    def __init__(self, prediction, chosen, network, trials, gain):
+    def __init__(
+        self,
+        prediction: np.ndarray,
+        chosen: list[list[str]],
+        network: list[bool],
+        trials: dict[str, list[float]],
+        gain: float,
+    ):
         self.prediction, self.chosen, self.network, self.trials, self.gain = (
             prediction,
             chosen,
@@ -146,7 +154,14 @@ class ForceModel:
         )
 
 
-def fit_force(counts, force, ntrain, seed=0, network=True, progress=None) -> ForceModel:
+def fit_force(
+    counts: np.ndarray,
+    force: np.ndarray,
+    ntrain: int,
+    seed: int = 0,
+    network: bool = True,
+    progress: Callable[[], object] | None = None,
+) -> ForceModel:
     """Fits on rows 0..ntrain-1 and predicts every row.
 
     Args:

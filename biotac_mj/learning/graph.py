@@ -2,9 +2,11 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.sparse import spmatrix
 from torch import nn
 
 __all__ = ["ChebConv", "SparseMatrix", "sparse_product"]
@@ -29,7 +31,7 @@ class SparseMatrix(nn.Module):
     """A constant sparse matrix that moves with its module; not among the parameters or the saved weights: it
     follows from the mesh."""
 
-    def __init__(self, matrix, symmetric=False):
+    def __init__(self, matrix: spmatrix, symmetric: bool = False):
         super().__init__()
         self.shape = matrix.shape
         for name, m in (("forward_", matrix), ("backward_", matrix if symmetric else matrix.T)):
@@ -54,12 +56,12 @@ class SparseMatrix(nn.Module):
             self._made = key, pair
         return self._made[1]
 
-    def forward(self, x):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(n, ...) = matrix @ x (m, ...)."""
         return sparse_product(self._matrices(), x)
 
 
-def sparse_product(pair, x):
+def sparse_product(pair: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
     """matrix @ x for pair = (matrix, its transpose), x (m, ...); the leading axis is the graph's."""
     flat = x.reshape(x.shape[0], -1)
     return _Product.apply(flat, *pair).reshape(-1, *x.shape[1:])
@@ -81,7 +83,16 @@ class ChebConv(nn.Module):
       up: SparseMatrix (n, m) that brings the input from a coarser graph; None: it is given on this one.
     """
 
-    def __init__(self, laplacian, inputs, outputs, order=6, bias=True, keep=None, up=None):
+    def __init__(
+        self,
+        laplacian: "SparseMatrix",
+        inputs: int,
+        outputs: int,
+        order: int = 6,
+        bias: bool = True,
+        keep: np.ndarray | None = None,
+        up: "SparseMatrix | None" = None,
+    ):
         super().__init__()
         self.laplacian, self.up = laplacian, up
         self.weight = nn.Parameter(torch.empty(order, inputs, outputs))
@@ -90,7 +101,7 @@ class ChebConv(nn.Module):
         self.register_buffer("keep", None if keep is None else torch.as_tensor(keep), persistent=False)
         self._dense = None
 
-    def forward(self, x):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(n or m, batch, outputs) of x (n or m, batch, inputs)."""
         if x.is_cuda and (self.keep is not None or self.up is not None):
             y = self.dense(x)
@@ -100,7 +111,7 @@ class ChebConv(nn.Module):
             y = self._at_kept(self._clenshaw(x)) if narrower else self._forward_recurrence(x)
         return y if self.bias is None else y + self.bias
 
-    def dense(self, x):
+    def dense(self, x: torch.Tensor) -> torch.Tensor:
         """The same, less the bias, by the dense matrices."""
         order, inputs, outputs = self.weight.shape
         matrix = self._matrix(x)

@@ -20,12 +20,12 @@ class PodHead(nn.Module):
       damp: (modes,) factors of the components: of unit variance all, the last ones are mostly noise.
     """
 
-    def __init__(self, modes, width=128, dropout=0.1):
+    def __init__(self, modes: int, width: int = 128, dropout: float = 0.1):
         super().__init__()
         self.register_buffer("damp", torch.ones(modes))
         self.net = mlp([modes, 2 * width, width, NELECTRODE], dropout)
 
-    def forward(self, local, pod):
+    def forward(self, local: torch.Tensor | None, pod: torch.Tensor) -> torch.Tensor:
         """local is not used; pod (n, modes)."""
         return self.net(pod * self.damp) - steady(self.net, torch.zeros_like(pod[:1]))
 
@@ -40,7 +40,7 @@ class LocalHead(nn.Module):
       features: per electrode. modes: components of the mesh that the residual sees. width: of its layers.
     """
 
-    def __init__(self, features, modes, width=128, dropout=0.1):
+    def __init__(self, features: int, modes: int, width: int = 128, dropout: float = 0.1):
         super().__init__()
         self.register_buffer("scale", torch.ones(features))
         self.register_buffer("damp", torch.ones(modes))
@@ -51,7 +51,7 @@ class LocalHead(nn.Module):
         with torch.no_grad():
             self.residual[-1].weight.mul_(0.1)
 
-    def forward(self, local, pod):
+    def forward(self, local: torch.Tensor, pod: torch.Tensor) -> torch.Tensor:
         """(n, 19) of local (n, 19, features) and pod (n, modes)."""
         x = local / self.scale
         own = (x * self.own).sum(-1)
@@ -70,14 +70,16 @@ def _plain(net, x):
     return net(x)
 
 
-def steady(net, x):
+def steady(net: nn.Sequential, x: torch.Tensor) -> torch.Tensor:
     """The network without its dropout: what a head gives at rest must not shake while it is trained."""
     for layer in net:
         x = x if isinstance(layer, nn.Dropout) else layer(x)
     return x
 
 
-def next_average(average, value, dt, tau):
+def next_average(
+    average: torch.Tensor, value: torch.Tensor, dt: float | torch.Tensor, tau: tuple[float, ...]
+) -> torch.Tensor:
     """Causal exponential average after one more step of dt [s]; time constants tau, a tuple [s].
 
     Args:
@@ -91,7 +93,9 @@ def next_average(average, value, dt, tau):
     )
 
 
-def averages(value, first, time, tau):
+def averages(
+    value: torch.Tensor, first: torch.Tensor, time: torch.Tensor, tau: tuple[float, ...]
+) -> torch.Tensor:
     """(n, ..., len(tau) * k) of values (n, ..., k) at rows of many interactions: value minus its causal
     averages, which begin at zero.
 

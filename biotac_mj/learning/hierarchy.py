@@ -8,6 +8,7 @@ meaning inside a volume.)
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, identity
@@ -33,13 +34,13 @@ class Level:
     up: csr_matrix | None = None
 
 
-def edges_of(elem) -> np.ndarray:
+def edges_of(elem: np.ndarray) -> np.ndarray:
     """(nedge, 2) sorted unique edges of tetrahedra (n, 4)."""
     pairs = np.concatenate([elem[:, [i, j]] for i in range(4) for j in range(i)])
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-def scaled_laplacian(adjacency) -> csr_matrix:
+def scaled_laplacian(adjacency: csr_matrix) -> csr_matrix:
     """L - 1, the argument of the Chebyshev polynomials: L = 1 - D^-1/2 A D^-1/2, and 2 is taken as its
     largest eigenvalue."""
     degree = np.asarray(adjacency.sum(1)).ravel()
@@ -48,7 +49,9 @@ def scaled_laplacian(adjacency) -> csr_matrix:
     return (-scaled).astype(np.float64)
 
 
-def build_hierarchy(vert, elem, factors=(4, 4, 4, 2)) -> list[Level]:
+def build_hierarchy(
+    vert: np.ndarray, elem: np.ndarray, factors: Sequence[float] = (4, 4, 4, 2)
+) -> list[Level]:
     """Levels of a mesh, the finest first; len(factors) + 1 of them.
 
     Args:

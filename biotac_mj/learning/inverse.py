@@ -1,7 +1,11 @@
 """From electrodes back to the skin: displacements, contact forces and the patch that touches."""
 
+import typing
+from collections.abc import Callable
+
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import nn
 
 from ..sensor.channels import NELECTRODE, log_impedance
@@ -9,6 +13,11 @@ from .electrode_vae import mlp
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
 from .heads import steady
+
+if typing.TYPE_CHECKING:
+    from .arrays import Arrays
+    from .config import LearningConfig
+    from .features import Pod
 
 __all__ = ["InverseHead", "contact_centre", "field_errors", "log_change_of", "patch_overlap", "train_inverse"]
 
@@ -24,7 +33,7 @@ class InverseHead(nn.Module):
         dropout: of the network.
     """
 
-    def __init__(self, pod, force_modes, nouter, width=256, dropout=0.2):
+    def __init__(self, pod: "Pod", force_modes: int, nouter: int, width: int = 256, dropout: float = 0.2):
         super().__init__()
         self.pod = pod
         self.modes = pod.basis.shape[1]
@@ -33,13 +42,13 @@ class InverseHead(nn.Module):
         self.register_buffer("scale", torch.ones(NELECTRODE))
         self.net = mlp([NELECTRODE, width, width, self.modes + force_modes], dropout)
 
-    def codes(self, log_change):
+    def codes(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Components of displacement (n, modes), per root mean square of the first, and of force, of d ln Z
         (n, 19)."""
         out = self.net(log_change / self.scale) - steady(self.net, torch.zeros_like(log_change[:1]))
         return out.split([self.modes, self.force_basis.shape[1]], 1)
 
-    def forward(self, log_change):
+    def forward(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Displacements (n, nvert, 3) [mm] and norm of the contact force (n, nouter) [N], at least 0."""
         u, f = self.codes(log_change)
         field = (u * self.pod.scale[0]) @ self.pod.basis.T
@@ -48,7 +57,16 @@ class InverseHead(nn.Module):
         )
 
 
-def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, progress=None) -> InverseHead:
+def train_inverse(
+    arrays: "Arrays",
+    train: np.ndarray,
+    validation: np.ndarray,
+    config: "LearningConfig",
+    pod: tuple,
+    seed: int = 0,
+    teach: bool = False,
+    progress: Callable[[], object] | None = None,
+) -> InverseHead:
     """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or
     None).
 
@@ -119,7 +137,7 @@ def train_inverse(arrays, train, validation, config, pod, seed=0, teach=False, p
     return head
 
 
-def field_errors(got, truth) -> dict:
+def field_errors(got: torch.Tensor, truth: torch.Tensor) -> dict:
     """Errors [mm] of fields (n, nvert, 3) [mm], each (n,): mean of all nodes, of those displaced by more than
     50 um, of the largest displacement."""
     size = truth.norm(dim=2)
@@ -132,7 +150,7 @@ def field_errors(got, truth) -> dict:
     }
 
 
-def contact_centre(force, place):
+def contact_centre(force: np.ndarray, place: np.ndarray) -> np.ndarray:
     """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), place
     (nouter, 3) [m] of the nodes."""
     force = np.asarray(force, float)
@@ -142,7 +160,7 @@ def contact_centre(force, place):
         return np.where(total > 1e-6, weight @ place / total, np.nan)
 
 
-def patch_overlap(got, truth):
+def patch_overlap(got: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(n,) intersection over union of the nodes above PATCH of their largest force; NaN where nothing
     touches."""
     a = got > PATCH * got.max(1, keepdims=True)
@@ -151,7 +169,7 @@ def patch_overlap(got, truth):
     return np.where(truth.max(1) > 1e-6, (a & b).sum(1) / np.maximum(union, 1), np.nan)
 
 
-def log_change_of(counts, tare):
+def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:
     """d ln Z (n, 19) of raw counts (n, 19) against the counts at rest, tare (19,) or (n, 19).
 
     Raises:

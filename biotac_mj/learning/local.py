@@ -1,6 +1,10 @@
 """The better models: principal components or local film features, d ln Z as the target, the simulation's film
 as a teacher."""
 
+import typing
+from collections.abc import Callable
+
+import numpy as np
 import torch
 
 from ..sensor.channels import FULL_SCALE, log_impedance
@@ -9,10 +13,15 @@ from .fitting import cycle, root_mean_square
 from .graph import SparseMatrix
 from .heads import LocalHead, PodHead, averages
 
+if typing.TYPE_CHECKING:
+    from .arrays import Arrays
+    from .config import LearningConfig
+    from .features import Pod
+
 __all__ = ["Features", "counts_change", "train_head"]
 
 
-def counts_change(log_change, tare):
+def counts_change(log_change: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
     """Change of counts (n, 19) from d ln Z (n, 19) and the counts at rest, `tare` (n, 19)."""
     tare = tare.clamp(0.5, FULL_SCALE - 0.5)
     return FULL_SCALE / (1 + (FULL_SCALE / tare - 1) * log_change.exp()) - tare
@@ -29,7 +38,7 @@ class Features:
         mirrored touches, or None.
     """
 
-    def __init__(self, arrays, config):
+    def __init__(self, arrays: "Arrays", config: "LearningConfig"):
         self.arrays, self.config = arrays, config
         self.film = FilmFeatures(arrays.geometry).to(arrays.device)
         self.local = self._local(lambda u: u)
@@ -38,7 +47,7 @@ class Features:
             self.matrix = SparseMatrix(mirror_matrix(arrays.geometry)).to(arrays.device)
             self.mirrored = self._local(self.mirror)
 
-    def mirror(self, u):
+    def mirror(self, u: torch.Tensor) -> torch.Tensor:
         """Fields (n, nvert, 3) of the touches mirrored in the plane z = 0."""
         return self.matrix(u.float().transpose(0, 1).contiguous()).transpose(0, 1) * torch.tensor(
             [1.0, 1.0, -1.0], device=u.device
@@ -55,26 +64,26 @@ class Features:
         )
 
     @torch.no_grad()
-    def components(self, pod, mirrored=False):
+    def components(self, pod: "Pod", mirrored: bool = False) -> torch.Tensor:
         """(n, modes) components of all rows."""
         change = self.mirror if mirrored else lambda u: u.float()
         return torch.cat([pod(change(u)) for u in self.arrays.field.split(512)])
 
 
 def train_head(
-    features,
-    train,
-    validation,
-    config,
-    kind="local",
-    window=True,
-    teach=True,
-    mirror=True,
-    log=True,
-    seed=0,
-    pod=None,
-    progress=None,
-):
+    features: Features,
+    train: np.ndarray,
+    validation: np.ndarray,
+    config: "LearningConfig",
+    kind: str = "local",
+    window: bool = True,
+    teach: bool = True,
+    mirror: bool = True,
+    log: bool = True,
+    seed: int = 0,
+    pod: tuple | None = None,
+    progress: Callable[[], object] | None = None,
+) -> Callable[[torch.Tensor], torch.Tensor]:
     """Trains one head.
 
     Args:

@@ -1,10 +1,16 @@
 """The mesh VAE of Narang et al. (ICRA 2021): COMA's graph convolutions on the tetrahedral skin, down to a
 code of 128."""
 
+import typing
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 
 from .graph import ChebConv, SparseMatrix
+
+if typing.TYPE_CHECKING:
+    from .hierarchy import Level
 
 __all__ = ["MeshVAE"]
 
@@ -24,7 +30,14 @@ class MeshVAE(nn.Module):
     """
 
     def __init__(
-        self, levels, first=128, channels=(128, 128, 256, 64), last=64, hidden=512, latent=128, order=6
+        self,
+        levels: "list[Level]",
+        first: int = 128,
+        channels: Sequence[int] = (128, 128, 256, 64),
+        last: int = 64,
+        hidden: int = 512,
+        latent: int = 128,
+        order: int = 6,
     ):
         super().__init__()
         if len(levels) != len(channels) + 1:
@@ -59,7 +72,7 @@ class MeshVAE(nn.Module):
         )
         self.last = last
 
-    def encode(self, u):
+    def encode(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log variance of the code, (batch, latent) each.
 
         Args:
@@ -71,14 +84,14 @@ class MeshVAE(nn.Module):
         mean, log_variance = self.encode_dense(x.transpose(0, 1).flatten(1)).chunk(2, -1)
         return mean, log_variance.clamp(-14, 4)
 
-    def decode(self, z):
+    def decode(self, z: torch.Tensor) -> torch.Tensor:
         """(batch, nvert, 3) of codes z (batch, latent)."""
         x = self.decode_dense(z).view(len(z), self.coarsest, self.last).transpose(0, 1)
         for conv in self.decode_convs[:-1]:
             x = nn.functional.elu(conv(x))
         return self.decode_convs[-1](x).transpose(0, 1)
 
-    def forward(self, u):
+    def forward(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Reconstruction from a sampled code in training, from its mean otherwise; with mean and log
         variance."""
         mean, log_variance = self.encode(u)

@@ -1,6 +1,9 @@
 """The paper's way (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes,
 PointNet++ beside them."""
 
+import typing
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import nn
@@ -10,6 +13,10 @@ from .fitting import cycle, fast_products, root_mean_square
 from .hierarchy import build_hierarchy
 from .mesh_vae import MeshVAE
 from .pointnet import PointNet
+
+if typing.TYPE_CHECKING:
+    from .arrays import Arrays
+    from .config import LearningConfig
 
 __all__ = ["LatentProjection", "train_latent_projection", "train_pointnet"]
 
@@ -21,23 +28,30 @@ class LatentProjection(nn.Module):
       mesh: MeshVAE. electrode: ElectrodeVAE. config: LearningConfig.
     """
 
-    def __init__(self, mesh, electrode, config):
+    def __init__(self, mesh: MeshVAE, electrode: ElectrodeVAE, config: "LearningConfig"):
         super().__init__()
         self.mesh, self.electrode = mesh, electrode
         self.to_electrode = mlp([mesh.latent, *config.forward_hidden, electrode.latent], config.dropout)
         self.to_mesh = mlp([electrode.latent, *config.inverse_hidden, mesh.latent], config.dropout)
 
-    def forward(self, u):
+    def forward(self, u: torch.Tensor) -> torch.Tensor:
         """(n, 19) tared counts / 2048 of u (n, nvert, 3), displacements / mesh_scale."""
         return self.electrode.decode(self.to_electrode(self.mesh.encode(u)[0]))
 
-    def inverse(self, y):
+    def inverse(self, y: torch.Tensor) -> torch.Tensor:
         """(n, nvert, 3) displacements / mesh_scale of y (n, 19), tared counts / 2048."""
         return self.mesh.decode(self.to_mesh(self.electrode.encode(y)[0]))
 
 
 @fast_products()
-def train_latent_projection(arrays, train, validation, config, seed=0, progress=None) -> LatentProjection:
+def train_latent_projection(
+    arrays: "Arrays",
+    train: np.ndarray,
+    validation: np.ndarray,
+    config: "LearningConfig",
+    seed: int = 0,
+    progress: Callable[[], object] | None = None,
+) -> LatentProjection:
     """Trains both VAEs, freezes them, trains the projections.
 
     Args:
@@ -141,7 +155,14 @@ def train_latent_projection(arrays, train, validation, config, seed=0, progress=
 
 
 @fast_products()
-def train_pointnet(arrays, train, validation, config, seed=0, progress=None) -> PointNet:
+def train_pointnet(
+    arrays: "Arrays",
+    train: np.ndarray,
+    validation: np.ndarray,
+    config: "LearningConfig",
+    seed: int = 0,
+    progress: Callable[[], object] | None = None,
+) -> PointNet:
     """Trains the baseline on labelled interactions alone; input displacements / mesh_scale, output tared
     counts / 2048."""
     torch.manual_seed(seed)

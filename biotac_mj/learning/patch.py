@@ -3,6 +3,7 @@ in the paper's figure."""
 
 import json
 import pathlib
+import typing
 
 import numpy as np
 import torch
@@ -14,10 +15,18 @@ from ..sensor.channels import ELECTRODES
 from .inverse import PATCH, contact_centre, log_change_of
 from .weights import load_inverse, shipped
 
+if typing.TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+
+    from ..geometry.skin_geometry import SkinGeometry
+
 __all__ = ["contact_patch", "draw_skin", "estimate"]
 
 
-def estimate(counts, tare, geometry, weights=None):
+def estimate(
+    counts: np.ndarray, tare: np.ndarray, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Displacements and contact force of raw counts.
 
     Args:
@@ -37,7 +46,14 @@ def estimate(counts, tare, geometry, weights=None):
     return 1e-3 * field.double().numpy(), force.double().numpy()
 
 
-def contact_patch(source, out="out/contact", tare=1, row=-1, skin="default", weights=None) -> dict:
+def contact_patch(
+    source: pathlib.Path | str,
+    out: pathlib.Path | str = "out/contact",
+    tare: int = 1,
+    row: int = -1,
+    skin: str = "default",
+    weights: pathlib.Path | str | None = None,
+) -> dict:
     """Estimates every row of a recording, draws one; writes contact.png and contact.json into `out`.
 
     Args:
@@ -103,7 +119,15 @@ def _node_area(geometry, outer):
     return np.bincount(np.searchsorted(outer, geometry.outer_face).ravel(), np.repeat(third, 3), len(outer))
 
 
-def draw_skin(axis, vert, face, value, limit, title, cmap="viridis"):
+def draw_skin(
+    axis: "Axes",
+    vert: np.ndarray,
+    face: np.ndarray,
+    value: np.ndarray,
+    limit: float,
+    title: str,
+    cmap: str = "viridis",
+) -> "ScalarMappable":
     """Draws a surface seen from the pad's side (along +y): faces coloured by the mean of nodal values,
     shaded, far ones first.
 

@@ -3,6 +3,8 @@
 The points keep their neighbours (the skin bends by a few millimetres, no more), so sampling and grouping are
 done once on the rest shape (Qi et al., 2017, choose them for every cloud)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -14,7 +16,7 @@ from .electrode_vae import mlp
 __all__ = ["PointNet", "farthest_points"]
 
 
-def farthest_points(point, count) -> np.ndarray:
+def farthest_points(point: np.ndarray, count: int) -> np.ndarray:
     """(count,) of points (n, 3), each the farthest from those before; the first is 0."""
     keep = [0]
     nearest = np.linalg.norm(point - point[0], axis=1)
@@ -32,7 +34,15 @@ class PointNet(nn.Module):
       outputs: 19. points: of the levels. neighbours: in each group. dropout: in the head.
     """
 
-    def __init__(self, vert, free, outputs=NELECTRODE, points=(128, 32, 8), neighbours=16, dropout=0.3):
+    def __init__(
+        self,
+        vert: np.ndarray,
+        free: np.ndarray,
+        outputs: int = NELECTRODE,
+        points: Sequence[int] = (128, 32, 8),
+        neighbours: int = 16,
+        dropout: float = 0.3,
+    ):
         super().__init__()
         vert, free = np.asarray(vert, float), np.asarray(free)
         if len(free) < points[0]:
@@ -65,7 +75,7 @@ class PointNet(nn.Module):
         self.whole = nn.Sequential(mlp([width + 3, 256, 256]), nn.ELU())
         self.head = mlp([256, 256, 128, outputs], dropout)
 
-    def forward(self, u):
+    def forward(self, u: torch.Tensor) -> torch.Tensor:
         """(batch, outputs) of u (batch, nvert, 3), displacements divided by their scale."""
         x = u[:, self.sample]
         for i, stage in enumerate(self.stages):

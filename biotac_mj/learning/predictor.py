@@ -1,5 +1,8 @@
 """The forward model as it is used: deformed skin -> d ln Z -> impedances and counts, one sensor or many."""
 
+import typing
+
+import numpy as np
 import torch
 from torch import nn
 
@@ -7,6 +10,9 @@ from ..sensor.channels import NELECTRODE
 from .features import FilmFeatures, Pod
 from .heads import LocalHead, PodHead, next_average
 from .local import counts_change
+
+if typing.TYPE_CHECKING:
+    from ..geometry.skin_geometry import SkinGeometry
 
 __all__ = ["ForwardModel"]
 
@@ -21,7 +27,7 @@ class ForwardModel(nn.Module):
       window: time constants [s] of the causal averages; () for a model without memory.
     """
 
-    def __init__(self, geometry, meta, modes):
+    def __init__(self, geometry: "SkinGeometry", meta: dict, modes: int):
         super().__init__()
         self.meta, self.window = meta, tuple(meta["window"])
         self.nvert = geometry.nvert
@@ -37,12 +43,14 @@ class ForwardModel(nn.Module):
         self.members = nn.ModuleList(make() for _ in range(meta["members"]))
 
     @property
-    def memory(self):
+    def memory(self) -> tuple[int, int, int]:
         """Shape of what a window remembers for one sensor: (len(window), 19, features)."""
         return (len(self.window), NELECTRODE, FilmFeatures.count)
 
     @torch.no_grad()
-    def log_change(self, displacement, average=None, dt=0.0):
+    def log_change(
+        self, displacement: torch.Tensor, average: torch.Tensor | None = None, dt: float | torch.Tensor = 0.0
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """d ln Z against the rest.
 
         Args:
@@ -79,7 +87,7 @@ class ForwardModel(nn.Module):
             local = torch.cat(parts, -1)
         return torch.stack([m(local, pod) for m in self.members]).mean(0), average
 
-    def counts(self, displacement, tare):
+    def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
         """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
         (n, 19)."""
         tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)

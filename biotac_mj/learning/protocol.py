@@ -2,6 +2,7 @@
 paper's unit is counts / 2048."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import wilcoxon
 
 from ..sensor.channels import NELECTRODE
@@ -9,7 +10,9 @@ from ..sensor.channels import NELECTRODE
 __all__ = ["conformal_width", "coverage_curve", "interaction_errors", "paired_test", "quartiles"]
 
 
-def interaction_errors(predicted, truth, owner):
+def interaction_errors(
+    predicted: ArrayLike, truth: ArrayLike, owner: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """RMS over the electrodes of each row, its mean over the rows of each interaction.
 
     Args:
@@ -44,20 +47,20 @@ def interaction_errors(predicted, truth, owner):
     return which, np.bincount(index, rms) / np.bincount(index)
 
 
-def quartiles(values):
+def quartiles(values: ArrayLike) -> tuple[float, float, float]:
     """Median, lower and upper quartile as floats."""
     q25, q50, q75 = np.percentile(values, [25, 50, 75])
     return float(q50), float(q25), float(q75)
 
 
-def coverage_curve(predicted, truth, levels):
+def coverage_curve(predicted: ArrayLike, truth: ArrayLike, levels: ArrayLike) -> np.ndarray:
     """(len(levels),) share of all (row, electrode) pairs whose absolute error is at most each level
     [counts]."""
     error = np.sort(np.abs(np.asarray(predicted, float) - truth).ravel())
     return np.searchsorted(error, levels, side="right") / len(error)
 
 
-def paired_test(a, b) -> dict:
+def paired_test(a: ArrayLike, b: ArrayLike) -> dict:
     """Wilcoxon's signed-rank test of paired errors a, b (k,) of the same interactions, two-sided.
 
     Returns:
@@ -78,7 +81,7 @@ def paired_test(a, b) -> dict:
     }
 
 
-def conformal_width(error, owner, alpha=0.1):
+def conformal_width(error: np.ndarray, owner: ArrayLike, alpha: float = 0.1) -> np.ndarray:
     """Half widths (19,) [counts] of intervals that cover a new interaction's rows with probability 1 - alpha
     on average.
 

@@ -21,13 +21,13 @@ _GAIN = 0.05
 
 
 def evaluate_recording(
-    electrodes,
-    force=None,
-    out="out/evaluate/recording.json",
-    fraction=0.7,
-    seed=0,
-    network=True,
-    progress=True,
+    electrodes: pathlib.Path | str,
+    force: pathlib.Path | str | None = None,
+    out: pathlib.Path | str = "out/evaluate/recording.json",
+    fraction: float = 0.7,
+    seed: int = 0,
+    network: bool = True,
+    progress: bool = True,
 ) -> dict:
     """Evaluates one recording; writes `out` (JSON, described in docs/learning.md) and a plot beside it.
 

@@ -1,6 +1,7 @@
 """A sensor's log as text: 19 columns of electrode counts, and perhaps 3 of force beside it."""
 
 import dataclasses
+import pathlib
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Recording:
     saturated: np.ndarray
 
 
-def load_recording(electrodes, force=None) -> Recording:
+def load_recording(electrodes: pathlib.Path | str, force: pathlib.Path | str | None = None) -> Recording:
     """Reads a log.
 
     Args:

@@ -23,7 +23,7 @@ _REFERENCES = ("tare", "linear", "physics", "physics_gain", "electrode_vae", "lo
 _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
-def evaluate_models(folder, out=None) -> dict:
+def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None = None) -> dict:
     """Reads a folder of `biotac train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures
     beside it.
 
@@ -64,7 +64,7 @@ def evaluate_models(folder, out=None) -> dict:
     return result
 
 
-def table(result) -> str:
+def table(result: dict) -> str:
     """What `evaluate_models` found, as text."""
     lines = []
     for split, found in result["splits"].items():

@@ -2,6 +2,8 @@
 electrodes."""
 
 import functools
+import pathlib
+import typing
 
 import numpy as np
 import torch
@@ -9,6 +11,12 @@ import torch
 from ..sensor.acquisition import Acquisition
 from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, impedance_from_counts
 from .weights import load_forward, shipped, window_of
+
+if typing.TYPE_CHECKING:
+    import warp as wp
+
+    from ..geometry.skin_geometry import SkinGeometry
+    from .predictor import ForwardModel
 
 __all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkReadings"]
 
@@ -30,13 +38,13 @@ class NetworkReadings:
 
     def __init__(
         self,
-        geometry,
-        weights=None,
-        seed=0,
-        noise=True,
-        sensor="1",
-        film_every_step=False,
-        temperature=REST_TEMPERATURE,
+        geometry: "SkinGeometry",
+        weights: pathlib.Path | str | None = None,
+        seed: int = 0,
+        noise: bool = True,
+        sensor: str = "1",
+        film_every_step: bool = False,
+        temperature: float = REST_TEMPERATURE,
     ):
         if sensor not in REST_COUNTS:
             raise ValueError(f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
@@ -48,20 +56,22 @@ class NetworkReadings:
         self.nstate = Acquisition.nstate + 1 + int(np.prod(self._memory))
 
     @functools.cached_property
-    def model(self):
+    def model(self) -> "ForwardModel":
         return load_forward(self._weights, self._geometry)
 
     def _parts(self, state):
         n = Acquisition.nstate
         return state[:n], state[n : n + 1], state[n + 1 :]
 
-    def reset(self, state, pressure=0.0, time=0.0):
+    def reset(self, state: np.ndarray, pressure: float = 0.0, time: float = 0.0) -> None:
         """Writes the skin at rest into state (nstate,)."""
         acquisition, last, memory = self._parts(state)
         self.acquisition.reset(acquisition, self._rest, pressure, self.temperature, time)
         last[:], memory[:] = time, 0
 
-    def advance(self, state, time, dt, vert_xpos, pressure):
+    def advance(
+        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+    ) -> None:
         """Samples (time, time + dt]; arguments and errors as `PhysicsReadings.advance`."""
         acquisition, last, memory = self._parts(state)
         impedance = None
@@ -85,7 +95,7 @@ class NetworkReadings:
             if memory.size:
                 memory[:] = after.numpy().ravel()
 
-    def readings(self, state):
+    def readings(self, state: np.ndarray) -> dict:
         """dict of counts, as `PhysicsReadings.readings`."""
         return self.acquisition.readings(self._parts(state)[0])
 
@@ -94,22 +104,24 @@ class LearnedReadings:
     """`NetworkReadings` behind the coupling's `Readings` protocol; `config.options["readings"]` goes to
     it."""
 
-    def __init__(self, config, geometry):
+    def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         self._network = NetworkReadings(
             geometry, seed=config.seed, **dict(config.options.get("readings", {}))
         )
         self.nstate = self._network.nstate
 
     @functools.cached_property
-    def rest(self):
+    def rest(self) -> dict:
         state = np.zeros(self.nstate)
         self._network.reset(state)
         return self._network.readings(state)
 
-    def reset(self, state):
+    def reset(self, state: np.ndarray) -> None:
         self._network.reset(state)
 
-    def advance(self, state, time, dt, vert_xpos, pressure):
+    def advance(
+        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+    ) -> dict:
         self._network.advance(state, time, dt, vert_xpos, pressure)
         return self._network.readings(state)
 
@@ -128,7 +140,15 @@ class LearnedBatchFilm:
       impedance: (nworld, 19) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (19,); nbytes.
     """
 
-    def __init__(self, geometry, nworld, device="cpu", weights=None, sensor="1", dt=0.01):
+    def __init__(
+        self,
+        geometry: "SkinGeometry",
+        nworld: int,
+        device: str = "cpu",
+        weights: pathlib.Path | str | None = None,
+        sensor: str = "1",
+        dt: float = 0.01,
+    ):
         import warp as wp
 
         self.device, self._dt = wp.get_device(device), dt
@@ -146,7 +166,7 @@ class LearnedBatchFilm:
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
 
     @torch.no_grad()
-    def solve_film(self, x, due):
+    def solve_film(self, x: "wp.array", due: "wp.array") -> None:
         """New impedances of the worlds that are due; x (nvert, nworld) wp.array of vec3d [m], due (nworld,)
         wp.array of int."""
         import contextlib

@@ -17,7 +17,7 @@ _DIRECTION = {
 }
 
 
-def ship(folder, result, target) -> list[pathlib.Path]:
+def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -> list[pathlib.Path]:
     """Copies the weights of the trajectory split (all objects seen) and writes a card beside each.
 
     Args:

@@ -2,11 +2,12 @@
 beside it."""
 
 import argparse
+from collections.abc import Callable
 
 __all__ = ["add_verbs"]
 
 
-def add_verbs(verbs, verb):
+def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
     """Adds the three to argparse's subparsers; verb(verbs, name, run, text) makes one."""
     _add_train(verbs, verb)
     _add_evaluate(verbs, verb)

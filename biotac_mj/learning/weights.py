@@ -3,12 +3,21 @@
 import hashlib
 import json
 import pathlib
+import typing
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
 from ..files import replacing
 from ..sensor.channels import ELECTRODES, NELECTRODE
+
+if typing.TYPE_CHECKING:
+    from ..geometry.skin_geometry import SkinGeometry
+    from .config import LearningConfig
+    from .features import Pod
+    from .inverse import InverseHead
+    from .predictor import ForwardModel
 
 __all__ = [
     "describe",
@@ -24,12 +33,12 @@ __all__ = [
 _FORMAT = "biotac_mj.learning.weights/1"
 
 
-def mesh_key(geometry) -> str:
+def mesh_key(geometry: "SkinGeometry") -> str:
     """Fingerprint of a skin's rest nodes, rounded to a micrometre."""
     return hashlib.sha256(np.rint(geometry.vert * 1e6).astype(np.int32).tobytes()).hexdigest()[:16]
 
 
-def shipped(name="forward") -> pathlib.Path:
+def shipped(name: str = "forward") -> pathlib.Path:
     """Path of weights that come with the package: "forward" or "inverse".
 
     Raises:
@@ -45,7 +54,15 @@ def shipped(name="forward") -> pathlib.Path:
     return path
 
 
-def save_forward(path, members, pod, config, kind, geometry, about):
+def save_forward(
+    path: pathlib.Path | str,
+    members: Sequence[Callable],
+    pod: "Pod",
+    config: "LearningConfig",
+    kind: dict,
+    geometry: "SkinGeometry",
+    about: dict,
+) -> None:
     """Writes an ensemble of `local.train_head`'s results (half precision; buffers that follow from the mesh
     are not in it)."""
     tensors = {"pod.basis": pod.basis, "pod.scale": pod.scale}
@@ -64,7 +81,9 @@ def save_forward(path, members, pod, config, kind, geometry, about):
     _save(path, tensors, geometry, meta)
 
 
-def save_inverse(path, head, geometry, about):
+def save_inverse(
+    path: pathlib.Path | str, head: "InverseHead", geometry: "SkinGeometry", about: dict
+) -> None:
     """Writes an `inverse.InverseHead`."""
     _save(
         path,
@@ -91,7 +110,7 @@ def _save(path, tensors, geometry, meta):
         save_file(tensors, str(temporary), {"biotac_mj": json.dumps(meta, sort_keys=True)})
 
 
-def describe(path) -> dict:
+def describe(path: pathlib.Path | str) -> dict:
     """What a file of weights says about itself: direction, skin, nvert, channels, kind ..."""
     return _read(path, ())[0]
 
@@ -136,7 +155,7 @@ def _load(path, geometry, direction):
     return meta, tensors
 
 
-def load_forward(path, geometry):
+def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel":
     """A `predictor.ForwardModel` of weights.
 
     Raises:
@@ -155,7 +174,7 @@ def load_forward(path, geometry):
     return model.eval()
 
 
-def window_of(path) -> tuple:
+def window_of(path: pathlib.Path | str) -> tuple:
     """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has
     none."""
     from .features import FilmFeatures
@@ -164,7 +183,7 @@ def window_of(path) -> tuple:
     return (len(meta["window"]), NELECTRODE, FilmFeatures.count) if meta.get("window") else (0,)
 
 
-def load_inverse(path, geometry):
+def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead":
     """An `inverse.InverseHead` of weights; raises as `load_forward`."""
     from .features import Pod
     from .inverse import InverseHead

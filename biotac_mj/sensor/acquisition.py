@@ -486,7 +486,7 @@ class BatchAcquisition:
         noise: bool = True,
         film_every_step: bool = False,
         temperature: float = channels.REST_TEMPERATURE,
-        device="cpu",
+        device: str = "cpu",
     ):
         state = np.zeros(NSTATE)
         Acquisition().reset(state, rest, temperature=temperature)

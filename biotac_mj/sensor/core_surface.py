@@ -124,7 +124,7 @@ class CoreSurface:
       core: the struct that `nearest_on_core` takes.
     """
 
-    def __init__(self, vert: ArrayLike, face: ArrayLike, device="cpu"):
+    def __init__(self, vert: ArrayLike, face: ArrayLike, device: str = "cpu"):
         vert, face = np.asarray(vert, dtype=float), np.asarray(face)
         corner = vert[face]
         cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

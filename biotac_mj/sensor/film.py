@@ -23,7 +23,7 @@ import threading
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.special import j1
 
@@ -276,7 +276,7 @@ class BatchFilm:
       nbytes: device memory of all worlds.
     """
 
-    def __init__(self, film: FilmConduction, nworld: int, device="cpu"):
+    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu"):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
         pattern, n = film._pattern, len(film.node)
         nblock, reach = pattern.nblock, pattern.reach
@@ -415,7 +415,7 @@ class _Pattern:
         self.entry = np.stack([(block * (self.reach + 1) + down) * TILE + row % TILE, column % TILE], axis=1)
 
 
-def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike):
+def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike) -> csr_matrix:
     """P1 finite-element matrix of div(s grad u) on a triangulated surface.
 
     Args:

@@ -32,11 +32,11 @@ class PhysicsReadings:
     def __init__(
         self,
         geometry: SkinGeometry,
-        seed=0,
-        noise=True,
-        sensor="1",
-        film_every_step=False,
-        temperature=REST_TEMPERATURE,
+        seed: int = 0,
+        noise: bool = True,
+        sensor: str = "1",
+        film_every_step: bool = False,
+        temperature: float = REST_TEMPERATURE,
         film: FilmConduction | None = None,
     ):
         self.film = FilmConduction(geometry, sensor=sensor) if film is None else film
@@ -45,13 +45,17 @@ class PhysicsReadings:
         self.nstate = self.acquisition.nstate
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
-    def reset(self, state, vert_xpos=None, pressure=0.0, time=0.0):
+    def reset(
+        self, state: np.ndarray, vert_xpos: np.ndarray | None = None, pressure: float = 0.0, time: float = 0.0
+    ) -> None:
         """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state
         (nstate,)."""
         impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         self.acquisition.reset(state, impedance, pressure, self.temperature, time)
 
-    def advance(self, state, time, dt, vert_xpos, pressure):
+    def advance(
+        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+    ) -> None:
         """Samples the step (time, time + dt].
 
         Args:
@@ -72,12 +76,12 @@ class PhysicsReadings:
             )
         self.acquisition.advance(state, time, dt, impedance, pressure, self.temperature)
 
-    def readings(self, state):
+    def readings(self, state: np.ndarray) -> dict:
         """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""
         return self.acquisition.readings(state)
 
 
-def record(readings, time, vert_xpos, pressure):
+def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, pressure: np.ndarray) -> dict:
     """Counts over a stored motion; impedance and pressure are linear between its samples.
 
     Args:

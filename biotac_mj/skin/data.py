@@ -1,18 +1,26 @@
 """SkinData: everything about a skin that changes, for every world."""
 
+import typing
+
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .contact.law import WorldLaws
 from .liquid import Liquid
-from .model import SkinModel, stiffness_of_contact
+from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
 from .program import Launcher
 from .rubber.element_kernels import ElementForces
+from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
-from .types import mat33, real, vec3
+from .types import Precision, mat33, real, vec3
+
+if typing.TYPE_CHECKING:
+    from .geoms import GeomSet
+    from .precondition import Preconditioner
 
 __all__ = ["ContactState", "SkinData"]
 
@@ -20,7 +28,7 @@ __all__ = ["ContactState", "SkinData"]
 class ContactState:
     """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote."""
 
-    def __init__(self, surface, nsample, nvert, nworld, lawful=False):
+    def __init__(self, surface: Surface, nsample: int, nvert: int, nworld: int, lawful: bool = False):
         nface = len(surface.face)
         samples = (nface * nsample, nworld)
         self.surface = surface
@@ -39,7 +47,7 @@ class ContactState:
         self.clearance = wp.zeros((nface, nworld), dtype=real)
         self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
 
-    def reset(self):
+    def reset(self) -> None:
         self.clearance.zero_()
         for array in (self.anchor_geom, self.trial_geom, self.bond):
             array.fill_(-1)
@@ -96,7 +104,14 @@ class SkinData:
     # fine skins
     contact_capacity = None
 
-    def __init__(self, model: SkinModel, nworld: int = 1, material=None, modulus=None, preconditioner=None):
+    def __init__(
+        self,
+        model: SkinModel,
+        nworld: int = 1,
+        material: list[Material] | None = None,
+        modulus: np.ndarray | None = None,
+        preconditioner: str | None = None,
+    ):
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
             raise ValueError(f"pass one {model.material.law} material for each of the {nworld} worlds")
@@ -158,7 +173,7 @@ class SkinData:
         return 4 if self.nworld < 32 else 8 if self.nworld < 256 else 32
 
     @property
-    def preconditioner(self):
+    def preconditioner(self) -> "Preconditioner":
         """A `precondition.Preconditioner`."""
         if self._preconditioner is None:
             surfaces, m = (self.outer, self.core), self.model
@@ -170,7 +185,7 @@ class SkinData:
         return self._preconditioner
 
     @property
-    def precision(self):
+    def precision(self) -> Precision:
         """Of directions, a `types.Precision`."""
         return self._chosen.precision
 
@@ -212,7 +227,7 @@ class SkinData:
         for name in ("reason", "nonconverged", "iterations", "error"):
             getattr(self.worlds, name).zero_()
 
-    def set_external(self, force) -> None:
+    def set_external(self, force: ArrayLike | None) -> None:
         """Loads the nodes in every step from now on, until `reset`.
 
         Args:
@@ -237,7 +252,7 @@ class SkinData:
             self.external = wp.zeros_like(self.x)
         self.external.assign(np.ascontiguousarray(np.swapaxes(force, 0, 1)))
 
-    def set_liquid(self, bulk_modulus=None, fill_volume=None) -> None:
+    def set_liquid(self, bulk_modulus: ArrayLike | None = None, fill_volume: ArrayLike | None = None) -> None:
         """Gives each world its liquid, from the next step on and through `reset`.
 
         Args:
@@ -313,7 +328,7 @@ class SkinData:
     def reaction(self) -> np.ndarray:
         return -self.force.numpy()[self.model.fixed].sum(0)
 
-    def tangent(self, geoms) -> np.ndarray:
+    def tangent(self, geoms: "GeomSet") -> np.ndarray:
         """Stiffness (nworld, ngroup, 6, 6) against rigid motions of each group of geoms about the BioTac
         frame's origin, after a step."""
         shape = (geoms.ngroup, self.nworld)
@@ -332,7 +347,14 @@ class SkinData:
 
     # --- saved and set again: a single world ---
 
-    def load(self, x, increment, motion, contacts, pressure=0.0) -> None:
+    def load(
+        self,
+        x: np.ndarray,
+        increment: np.ndarray,
+        motion: np.ndarray,
+        contacts: np.ndarray,
+        pressure: float = 0.0,
+    ) -> None:
         """Sets the state of a single world; the inverse of reading it.
 
         Args:
@@ -361,7 +383,7 @@ class SkinData:
             touched[contacts[:, 1].astype(int)] = 1
             touched_by.assign(touched)
 
-    def load_motion(self, velocity, core_pos, core_mat) -> None:
+    def load_motion(self, velocity: np.ndarray, core_pos: np.ndarray, core_mat: np.ndarray) -> None:
         """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the
         core's pose (3,), (3, 3) when the last step ended."""
         self.velocity.assign(np.ascontiguousarray(velocity[:, None]))

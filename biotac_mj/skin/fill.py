@@ -20,7 +20,7 @@ __all__ = ["rest_state"]
 _UNDERWAY, _ARRIVED = 1e-2, 1e-5
 
 
-def rest_state(model) -> Rest:
+def rest_state(model: skin_model.SkinModel) -> Rest:
     """The balance of skin and liquid without touching geoms.
 
     Raises:

@@ -1,7 +1,10 @@
 """The geoms that touch a skin: what MuJoCo says of them, on the skin's device."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .contact.faces import Geoms
 from .contact.shapes import GEOM_TYPES, DistanceGrid, pack_grids
@@ -29,7 +32,15 @@ class GeomSet:
     """
 
     def __init__(
-        self, types, sizes, friction=None, groups=None, rounding=None, grids=(), nworld=1, device="cpu"
+        self,
+        types: Sequence[str],
+        sizes: Sequence,
+        friction: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        rounding: ArrayLike | None = None,
+        grids: Sequence[DistanceGrid] = (),
+        nworld: int = 1,
+        device: wp.DeviceLike = "cpu",
     ):
         count = len(types)
         for kind in types:
@@ -88,12 +99,12 @@ class GeomSet:
         self.struct = struct
         self._posed = False
 
-    def advance(self):
+    def advance(self) -> None:
         """Makes the poses of this step those of the last one."""
         wp.copy(self.struct.pos_last, self.struct.pos)
         wp.copy(self.struct.mat_last, self.struct.mat)
 
-    def set_pose(self, pos, mat=None):
+    def set_pose(self, pos: ArrayLike, mat: ArrayLike | None = None) -> None:
         """Poses of the geoms in the BioTac frame.
 
         Args:
@@ -110,7 +121,7 @@ class GeomSet:
             self._posed = True
             self.advance()
 
-    def set_friction(self, friction):
+    def set_friction(self, friction: ArrayLike) -> None:
         """Coulomb coefficients (ngeom,) or (nworld, ngeom)."""
         self._assign(self.struct.friction, friction, (), "friction coefficients")
 

@@ -17,11 +17,13 @@ not matter that pressure is counted on them as well.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from .newton.worlds import total_of
+from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
 __all__ = [
@@ -253,7 +255,7 @@ class Liquid:
       gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
 
-    def __init__(self, model, nworld: int, worlds):
+    def __init__(self, model: Any, nworld: int, worlds: Worlds):
         self._model, self._worlds, self.nworld = model, worlds, nworld
         self.bulk_modulus, self.extra = np.full(nworld, model.options.bulk_modulus), np.zeros(nworld)
         self.reset()
@@ -279,7 +281,7 @@ class Liquid:
         return self._worlds.last_pressure.numpy().copy()
 
     @last_pressure.setter
-    def last_pressure(self, value):
+    def last_pressure(self, value: ArrayLike) -> None:
         self._write("last_pressure", value)
 
     def reset(self) -> None:
@@ -291,7 +293,7 @@ class Liquid:
         self._write("pressure", pressure)
         self._write("volume", rest.volume)
 
-    def fill(self, natural_volume) -> None:
+    def fill(self, natural_volume: ArrayLike) -> None:
         """Takes as much liquid as has this volume without pressure [m^3]."""
         # an incompressible liquid: the pressure of the last step is what the next starts from, and this
         # stiffness only finds the change
@@ -301,13 +303,13 @@ class Liquid:
         self._write("kappa", kappa)
         self._write("holds", (np.asarray(kappa) == 0) | np.isinf(K))
 
-    def keep_pressure(self, pressure) -> None:
+    def keep_pressure(self, pressure: ArrayLike) -> None:
         """Takes liquid in and out so that its pressure above the surroundings stays this [Pa]."""
         self._write("kappa", 0.0)
         self._write("holds", 1)
         self._write("last_pressure", pressure)
 
-    def set(self, bulk_modulus=None, fill_volume=None) -> None:
+    def set(self, bulk_modulus: ArrayLike | None = None, fill_volume: ArrayLike | None = None) -> None:
         """See `SkinData.set_liquid`."""
         if not self._model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")

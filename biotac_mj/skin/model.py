@@ -3,9 +3,12 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
@@ -149,7 +152,7 @@ class Surface:
     face_np: np.ndarray
 
     @classmethod
-    def create(cls, vert, face, device):
+    def create(cls, vert: np.ndarray, face: np.ndarray, device: wp.DeviceLike) -> "Surface":
         edge = vert[face[:, 1:]] - vert[face[:, :1]]
         area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
         start, slot = incidence(len(vert), face)
@@ -193,12 +196,12 @@ class SkinModel:
     def __init__(
         self,
         geometry: SkinGeometry,
-        material_choice="default",
+        material_choice: str | Material = "default",
         options: SkinOptions | None = None,
-        device="cpu",
-        fixed=None,
-        core_faces=None,
-        modulus=None,
+        device: wp.DeviceLike = "cpu",
+        fixed: np.ndarray | None = None,
+        core_faces: np.ndarray | None = None,
+        modulus: ArrayLike | Callable | None = None,
     ):
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
@@ -341,11 +344,11 @@ class SkinModel:
         return self._rest
 
     @rest.setter
-    def rest(self, value: liquid.Rest):
+    def rest(self, value: liquid.Rest) -> None:
         self._rest = value
 
     @functools.cached_property
-    def stiffness(self):
+    def stiffness(self) -> sp.csc_matrix:
         """(3 nfree, 3 nfree) at rest, without the liquid, sparse [N/m]."""
         return self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
@@ -359,7 +362,7 @@ class SkinModel:
         """Inverse of the rest stiffness of the free nodes as a matrix."""
         return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > 0.45)
 
-    def factor_at(self, vert_xpos) -> SparseFactor:
+    def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
         """The factor of the skin in a deformed shape: of its stiffness had it been made so, always positive
         definite. On the CPU.
 
@@ -377,7 +380,7 @@ class SkinModel:
         stiffness = there.rest_stiffness(self.material.mu, self.material.lame)
         return self.factor_of(self._of_free(stiffness))
 
-    def factor_of(self, stiffness) -> SparseFactor:
+    def factor_of(self, stiffness: sp.csc_matrix) -> SparseFactor:
         """Sparse factor of a stiffness with the pattern of the skin's, over the free coordinates."""
         made = SparseFactor(stiffness, self.free, self.geometry.vert, self._elimination)
         self._elimination = made.elimination

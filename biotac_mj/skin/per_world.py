@@ -38,7 +38,9 @@ def make_room(
     return options, np.ones(nelem) if modulus is None and "modulus" in values else modulus
 
 
-def make_worlds(model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None):
+def make_worlds(
+    model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None
+) -> SkinData:
     """SkinData of worlds that differ.
 
     Args:

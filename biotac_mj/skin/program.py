@@ -6,7 +6,7 @@ packing a launch's arguments takes Warp longer than many of the kernels run.
 """
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import warp as wp
 
@@ -16,14 +16,28 @@ __all__ = ["Launcher", "Program"]
 class Launcher:
     """Launches at once, on one device."""
 
-    def __init__(self, device):
+    def __init__(self, device: wp.DeviceLike):
         self.device = wp.get_device(device)
 
-    def launch(self, kernel, dim, inputs, outputs=(), block_dim: int = 256) -> None:
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence,
+        outputs: Sequence = (),
+        block_dim: int = 256,
+    ) -> None:
         """A kernel over dim."""
         wp.launch(kernel, dim, inputs, list(outputs), device=self.device, block_dim=block_dim)
 
-    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim: int = 128) -> None:
+    def launch_blocks(
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence,
+        outputs: Sequence = (),
+        block_dim: int = 128,
+    ) -> None:
         """A block of threads for each item of dim."""
         wp.launch_tiled(
             kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device
@@ -33,7 +47,9 @@ class Launcher:
         """body again and again while flag[0] is not zero."""
         wp.capture_while(flag, body)
 
-    def branch(self, flag: wp.array, body: Callable[[], None], otherwise=None) -> None:
+    def branch(
+        self, flag: wp.array, body: Callable[[], None], otherwise: Callable[[], None] | None = None
+    ) -> None:
         """body if flag[0] is not zero, else `otherwise`."""
         wp.capture_if(flag, body, otherwise)
 
@@ -54,7 +70,7 @@ class Program(Launcher):
     What the arrays hold may change between runs; which arrays, and numbers given as such, may not.
     """
 
-    def __init__(self, device, record: Callable[["Program"], None]):
+    def __init__(self, device: wp.DeviceLike, record: Callable[["Program"], None]):
         super().__init__(device)
         self._record, self._commands, self._open = record, None, None
         self._arguments = []  # kept, so that their memory stays theirs
@@ -75,7 +91,14 @@ class Program(Launcher):
         commands, self._open = self._open, outer
         return commands
 
-    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence,
+        outputs: Sequence = (),
+        block_dim: int = 256,
+    ) -> None:
         if self.device.is_cuda:
             super().launch(kernel, dim, inputs, outputs, block_dim)
         elif all(dim) if isinstance(dim, (tuple, list)) else dim:
@@ -83,7 +106,14 @@ class Program(Launcher):
             self._open.append(command.launch)
             self._arguments.append((inputs, outputs))
 
-    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim=128):
+    def launch_blocks(
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence,
+        outputs: Sequence = (),
+        block_dim: int = 128,
+    ) -> None:
         if self.device.is_cuda:
             super().launch_blocks(kernel, dim, inputs, outputs, block_dim)
         else:
@@ -99,7 +129,7 @@ class Program(Launcher):
             self._open.append(command.launch)
             self._arguments.append((inputs, outputs))
 
-    def loop(self, flag, body):
+    def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
         if self.device.is_cuda:
             super().loop(flag, body)
             return
@@ -112,7 +142,9 @@ class Program(Launcher):
 
         self._open.append(repeat)
 
-    def branch(self, flag, body, otherwise=None):
+    def branch(
+        self, flag: wp.array, body: Callable[[], None], otherwise: Callable[[], None] | None = None
+    ) -> None:
         if self.device.is_cuda:
             super().branch(flag, body, otherwise)
             return
@@ -125,7 +157,7 @@ class Program(Launcher):
 
         self._open.append(choose)
 
-    def call(self, function):
+    def call(self, function: Callable[[], None]) -> None:
         if self.device.is_cuda:
             super().call(function)
         self._open.append(function)

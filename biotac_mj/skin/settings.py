@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..geometry.skin_geometry import SkinGeometry
 from .contact.law import ContactLaw
@@ -26,7 +27,11 @@ class Settings(NamedTuple):
     modulus: np.ndarray | Callable | None
 
 
-def read_settings(material=None, options: dict | None = None, **defaults: object) -> Settings:
+def read_settings(
+    material: Material | dict | str | pathlib.Path | None = None,
+    options: dict | None = None,
+    **defaults: object,
+) -> Settings:
     """Settings of a skin.
 
     Args:
@@ -49,7 +54,7 @@ def read_settings(material=None, options: dict | None = None, **defaults: object
     return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
 
 
-def read_material(choice) -> Material:
+def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:
     """A preset's name, a dict of Material's fields, JSON of one (a text, or a file, maybe one that `biotac
     calibrate` wrote), a Material or None (the default), as a Material.
 
@@ -69,7 +74,7 @@ def read_material(choice) -> Material:
     return Material(**_known(fields.get("material", fields), Material, "material"))
 
 
-def read_modulus(choice) -> np.ndarray | Callable | None:
+def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np.ndarray | Callable | None:
     """Factors on Young's modulus: (nelem,) numbers, a .npy file of them, a function of positions, or None.
 
     Raises:
@@ -89,7 +94,7 @@ def read_modulus(choice) -> np.ndarray | Callable | None:
         ) from None
 
 
-def read_dict(choice, what: str) -> dict:
+def read_dict(choice: dict | str | pathlib.Path | None, what: str) -> dict:
     """A dict, a JSON text of one ("{...}") or a file of it, as a dict; None is empty.
 
     Raises:

@@ -54,8 +54,8 @@ def step(
     data: SkinData,
     geoms: GeomSet,
     dt: float | np.ndarray | None = None,
-    core_pos=None,
-    core_mat=None,
+    core_pos: np.ndarray | None = None,
+    core_mat: np.ndarray | None = None,
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 

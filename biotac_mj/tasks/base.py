@@ -4,11 +4,12 @@
 import abc
 
 import numpy as np
-from dm_control import composer
+from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
 from .biotac import PRIVILEGED, TACTILE, BioTac
+from .robots import Gantry, Gripper
 
 __all__ = ["AWAY", "TouchTask", "arena"]
 
@@ -17,7 +18,7 @@ CONTROL_TIMESTEP = 0.01  # [s] one frame of the sensor
 _OBSERVE = {"tactile": TACTILE, "privileged": TACTILE + PRIVILEGED, "none": ()}
 
 
-def arena():
+def arena() -> composer.Arena:
     """A lit scene with a camera on the finger and nothing to touch."""
     out = composer.Arena()
     root = out.mjcf_model
@@ -68,7 +69,14 @@ class TouchTask(composer.Task, abc.ABC):
     estimated: tuple
     seconds = 4.0  # an episode
 
-    def __init__(self, machine, mounts, observe="tactile", physics_timestep=5e-3, biotac=None):
+    def __init__(
+        self,
+        machine: Gantry | Gripper,
+        mounts: list,
+        observe: str = "tactile",
+        physics_timestep: float = 5e-3,
+        biotac: dict | None = None,
+    ):
         if observe not in _OBSERVE:
             raise ValueError(f"unknown preset observe={observe!r}: choose one of {', '.join(_OBSERVE)}")
         self._arena, self.machine = arena(), machine
@@ -88,31 +96,33 @@ class TouchTask(composer.Task, abc.ABC):
         self._task_observables[name].enabled = True
 
     @property
-    def root_entity(self):
+    def root_entity(self) -> composer.Arena:
         return self._arena
 
     @property
-    def task_observables(self):
+    def task_observables(self) -> dict:
         return self._task_observables
 
-    def action_spec(self, physics):
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
         return specs.BoundedArray(
             (len(self.machine.axes),), np.float64, -1.0, 1.0, name="\t".join(self.machine.axes)
         )
 
-    def before_step(self, physics, action, random_state):
+    def before_step(
+        self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
+    ) -> None:
         self.machine.command(physics, action)
 
-    def contact_force(self, physics, index=0):
+    def contact_force(self, physics: mjcf.Physics, index: int = 0) -> np.ndarray:
         """(3,) force on a BioTac in its frame [N]."""
         return self.biotacs[index].read(physics, "contact_force")[:3]
 
     @abc.abstractmethod
-    def hidden(self, physics) -> np.ndarray:
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         """(nbiotac, nestimated) true values of `estimated`, which no touch-only controller may read."""
 
     @abc.abstractmethod
-    def initialize_episode(self, physics, random_state): ...
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None: ...
 
     @abc.abstractmethod
-    def get_reward(self, physics): ...
+    def get_reward(self, physics: mjcf.Physics) -> float: ...

@@ -2,6 +2,7 @@
 delay and noise."""
 
 import dataclasses
+from collections.abc import Callable, Iterable
 
 import mujoco
 import numpy as np
@@ -27,19 +28,25 @@ class Reading(observable.Generic):
       noise: f(values, random_state) -> values; None leaves them as they are.
     """
 
-    def __init__(self, read, rate=_RATE, lag=0.0, noise=None):
+    def __init__(
+        self,
+        read: Callable[[mjcf.Physics], np.ndarray],
+        rate: float | None = _RATE,
+        lag: float = 0.0,
+        noise: Callable | None = None,
+    ):
         super().__init__(read)
         self.rate, self.lag, self.corruptor = rate, lag, noise
 
     @property
-    def noise(self):
+    def noise(self) -> Callable | None:
         return self.corruptor
 
     @noise.setter
-    def noise(self, value):
+    def noise(self, value: Callable | None) -> None:
         self.corruptor = value
 
-    def resolve(self, timestep):
+    def resolve(self, timestep: float) -> None:
         """Sets dm_control's `update_interval` and `delay` for a physics time step [s]."""
         self.update_interval = 1 if self.rate is None else max(1, round(1 / (self.rate * timestep)))
         self.delay = round(self.lag / timestep)
@@ -118,28 +125,28 @@ class BioTac(composer.Entity):
         return BioTacObservables(self)
 
     @property
-    def mjcf_model(self):
+    def mjcf_model(self) -> mjcf.RootElement:
         return self._mjcf_root
 
     @property
-    def core(self):
+    def core(self) -> mjcf.Element:
         """The body whose frame is the BioTac frame."""
         return self._mjcf_root.find("body", "core")
 
     @property
-    def noise(self):
+    def noise(self) -> bool:
         return self._noise
 
     @property
-    def outer(self):
+    def outer(self) -> np.ndarray:
         """(nouter,) indices of the skin's nodes that the world can touch."""
         return self._outer
 
-    def after_compile(self, physics, random_state):
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         for reading in self.observables.readings():
             reading.resolve(physics.timestep())
 
-    def read(self, physics, channel) -> np.ndarray:
+    def read(self, physics: mjcf.Physics, channel: str) -> np.ndarray:
         """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m],
         status; see `Handle.read`."""
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
@@ -150,7 +157,7 @@ class BioTac(composer.Entity):
 
         return REST_COUNTS[self.handle.config.options["readings"].get("sensor", "1")].copy()
 
-    def vert_xpos(self, physics) -> np.ndarray:
+    def vert_xpos(self, physics: mjcf.Physics) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
         from ..coupling.attachment import Handle
 
@@ -158,7 +165,7 @@ class BioTac(composer.Entity):
             physics.model.ptr, physics.data.ptr
         )
 
-    def contact_patch(self, physics) -> np.ndarray:
+    def contact_patch(self, physics: mjcf.Physics) -> np.ndarray:
         """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to
         the line of the total contact force, and the outward direction there (against the force); zeros below
         1 mN."""
@@ -177,11 +184,11 @@ class BioTacObservables(composer.Observables):
     """electrodes (19,), pac (22,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and
     contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
 
-    def readings(self):
+    def readings(self) -> list[Reading]:
         """All of them, as `Reading`s."""
         return [self.get_observable(name) for name in TACTILE + PRIVILEGED]
 
-    def enable(self, names):
+    def enable(self, names: Iterable[str]) -> None:
         """Enables a preset (TACTILE, PRIVILEGED) or any of the names, and nothing else.
 
         Raises:
@@ -200,35 +207,35 @@ class BioTacObservables(composer.Observables):
         return Reading(lambda physics: entity.read(physics, name), noise=noise if entity.noise else None)
 
     @composer.observable
-    def electrodes(self):
+    def electrodes(self) -> Reading:
         return self._channel("electrodes", _electrode_noise)
 
     @composer.observable
-    def pac(self):
+    def pac(self) -> Reading:
         return self._channel("pac", _other_noise)
 
     @composer.observable
-    def pdc(self):
+    def pdc(self) -> Reading:
         return self._channel("pdc", _other_noise)
 
     @composer.observable
-    def tac(self):
+    def tac(self) -> Reading:
         return self._channel("tac", _other_noise)
 
     @composer.observable
-    def tdc(self):
+    def tdc(self) -> Reading:
         return self._channel("tdc", _other_noise)
 
     @composer.observable
-    def contact_force(self):
+    def contact_force(self) -> Reading:
         return self._channel("contact_force", None)
 
     @composer.observable
-    def contact_patch(self):
+    def contact_patch(self) -> Reading:
         return Reading(self._entity.contact_patch)
 
     @composer.observable
-    def skin(self):
+    def skin(self) -> Reading:
         entity = self._entity
         return Reading(lambda physics: entity.vert_xpos(physics)[entity.outer])
 

@@ -38,7 +38,7 @@ _SECONDS = {"follow_edge": 0.9}
 _TIMES = {"follow_edge": 5}
 
 
-def record(domain, task, seed, biotac=None):
+def record(domain: str, task: str, seed: int, biotac: dict | None = None) -> tuple[np.ndarray, np.ndarray]:
     """One episode: touch (n, 20) while something touches, and the hidden values (n, k) with it, one row per
     BioTac and frame."""
     env = _environment(domain, task, json.dumps(biotac))
@@ -65,7 +65,7 @@ def _environment(domain, task, biotac):
     )
 
 
-def record_explore(seed, name, biotac=None):
+def record_explore(seed: int, name: str, biotac: dict | None = None) -> np.ndarray:
     """The presses (100,) of one exploration of an object."""
     env = suite.load("finger", "explore", task_kwargs={"random": seed, "objects": [name], "biotac": biotac})
     controller = make_controller("explore")
@@ -135,7 +135,7 @@ def _add(path, found):
     temporary.rename(path)
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument(
         "--estimators",

@@ -2,6 +2,7 @@
 on it."""
 
 import numpy as np
+from dm_control import mjcf
 from dm_control.utils import rewards
 
 from .base import AWAY, TouchTask
@@ -28,7 +29,7 @@ class FollowEdge(TouchTask):
     estimated = ("offset", "turn", "force")
     seconds = 5.0
 
-    def __init__(self, **settings):
+    def __init__(self, **settings: object):
         gantry = Gantry(yaw=True)
         rounding = {_name(radius): _EDGE for radius in _RADII}
         super().__init__(
@@ -50,7 +51,7 @@ class FollowEdge(TouchTask):
             self._discs.append(disc)
         self._center, self._radius = np.zeros(2), _RADII[0]
 
-    def initialize_episode(self, physics, random_state):
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         chosen = random_state.randint(len(_RADII))
         self._radius = _RADII[chosen]
         offset, turn = random_state.uniform(-2e-3, 2e-3), random_state.uniform(-0.25, 0.25)
@@ -77,11 +78,11 @@ class FollowEdge(TouchTask):
             tangent,
         )
 
-    def hidden(self, physics):
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         offset, turn, _ = self._pose(physics)  # offset: how far the rim is to the finger's left
         return np.array([[offset, turn, self.contact_force(physics)[1]]])
 
-    def get_reward(self, physics):
+    def get_reward(self, physics: mjcf.Physics) -> float:
         offset, _, tangent = self._pose(physics)
         velocity = physics.bind(self.machine.joints[:2]).qvel
         on_rim = rewards.tolerance(offset, (-0.7e-3, 0.7e-3), 2.3e-3, "linear", 0.0)

@@ -36,7 +36,16 @@ class BioTacEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
 
-    def __init__(self, domain, task, observe="tactile", render_mode=None, width=480, height=360, **settings):
+    def __init__(
+        self,
+        domain: str,
+        task: str,
+        observe: str = "tactile",
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 360,
+        **settings: object,
+    ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         self.render_mode, self._size = render_mode, (height, width)
@@ -55,23 +64,23 @@ class BioTacEnv(gymnasium.Env):
             }
         )
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)
         if seed is not None:
             self.suite.random_state.seed(seed)
         return self._observation(self.suite.reset()), {}
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
         step = self.suite.step(np.asarray(action, dtype=np.float64))
         ended = step.last() and step.discount == 0.0
         return self._observation(step), float(step.reward), bool(ended), bool(step.last() and not ended), {}
 
-    def render(self):
+    def render(self) -> np.ndarray | None:
         if self.render_mode is None:
             return None
         return self.suite.physics.render(*self._size, camera_id="side")
 
-    def close(self):
+    def close(self) -> None:
         if self.suite is not None:
             self.suite.close()
             self.suite = None
@@ -80,7 +89,7 @@ class BioTacEnv(gymnasium.Env):
         return {name: np.asarray(step.observation[name], np.float32) for name in self.observation_space}
 
 
-def register():
+def register() -> list[str]:
     """Registers all tasks with Gymnasium; once is enough, more do no harm. Returns their ids."""
     for name, (domain, task) in IDS.items():
         if name not in gymnasium.registry:

@@ -1,8 +1,11 @@
 """Explore an object and say which of seventeen it is: the paper's eight indenters, six pegs, a table's
 surface, edge and corner."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
+from dm_control import mjcf
 from dm_env import specs
 
 from ..data.objects import OBJECTS, make_object
@@ -25,7 +28,7 @@ class Explore(TouchTask):
     estimated = ("force",)
     seconds = 4.0
 
-    def __init__(self, objects=OBJECTS, **settings):
+    def __init__(self, objects: Sequence[str] = OBJECTS, **settings: object):
         """objects: names of those that are laid down; beliefs are always about all 17. Raises ValueError for
         unknown ones."""
         for name in objects:
@@ -43,16 +46,18 @@ class Explore(TouchTask):
         self.chosen = 0
         self._belief = np.full(len(OBJECTS), 1 / len(OBJECTS))
 
-    def action_spec(self, physics):
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
         names = self.machine.axes + list(OBJECTS)
         return specs.BoundedArray((len(names),), np.float64, -1.0, 1.0, name="\t".join(names))
 
-    def before_step(self, physics, action, random_state):
+    def before_step(
+        self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
+    ) -> None:
         self.machine.command(physics, action[:3])
         weight = np.clip(action[3:], -1, 1) + 1
         self._belief = weight / weight.sum() if weight.sum() > 0 else np.full(len(OBJECTS), 1 / len(OBJECTS))
 
-    def initialize_episode(self, physics, random_state):
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self.chosen = self.choices[random_state.randint(len(self.choices))]
         height, angle = -_PAD - random_state.uniform(1e-3, 3e-3), random_state.uniform(-_TURN, _TURN)
         place = np.array([CENTER, 0.0]) + random_state.uniform(-_OFF, _OFF, size=2)
@@ -63,10 +68,10 @@ class Explore(TouchTask):
         self.machine.place(physics, np.zeros(3))
         self._belief[:] = 1 / len(OBJECTS)
 
-    def hidden(self, physics):
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         return self.contact_force(physics)[None, 1:2]
 
-    def get_reward(self, physics):
+    def get_reward(self, physics: mjcf.Physics) -> float:
         return float(self._belief[self.chosen])
 
 

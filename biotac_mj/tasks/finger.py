@@ -1,8 +1,13 @@
 """Tasks of one finger on a gantry."""
 
+import typing
+
 from dm_control.utils import containers
 
 from .suite import environment
+
+if typing.TYPE_CHECKING:
+    from dm_control import composer
 
 __all__ = ["SUITE", "explore", "follow_edge", "press", "roll_ball"]
 
@@ -10,7 +15,7 @@ SUITE = containers.TaggedTasks()
 
 
 @SUITE.add("benchmarking", "easy")
-def press(**settings):
+def press(**settings: object) -> "composer.Environment":
     """Press to a target force."""
     from .press import Press
 
@@ -18,7 +23,7 @@ def press(**settings):
 
 
 @SUITE.add("benchmarking")
-def follow_edge(**settings):
+def follow_edge(**settings: object) -> "composer.Environment":
     """Follow the rim of a plate."""
     from .edge import FollowEdge
 
@@ -26,7 +31,7 @@ def follow_edge(**settings):
 
 
 @SUITE.add("benchmarking")
-def roll_ball(**settings):
+def roll_ball(**settings: object) -> "composer.Environment":
     """Roll a ball to a target."""
     from .roll import RollBall
 
@@ -34,7 +39,7 @@ def roll_ball(**settings):
 
 
 @SUITE.add("benchmarking", "hard")
-def explore(**settings):
+def explore(**settings: object) -> "composer.Environment":
     """Tell which of seventeen objects lies under the finger."""
     from .explore import Explore
 

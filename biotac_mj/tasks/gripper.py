@@ -1,8 +1,13 @@
 """Tasks of two fingertips on a parallel gripper."""
 
+import typing
+
 from dm_control.utils import containers
 
 from .suite import environment
+
+if typing.TYPE_CHECKING:
+    from dm_control import composer
 
 __all__ = ["SUITE", "hold", "lift"]
 
@@ -10,7 +15,7 @@ SUITE = containers.TaggedTasks()
 
 
 @SUITE.add("benchmarking")
-def hold(**settings):
+def hold(**settings: object) -> "composer.Environment":
     """Hold an object whose weight changes."""
     from .hold import Hold
 
@@ -18,7 +23,7 @@ def hold(**settings):
 
 
 @SUITE.add("benchmarking")
-def lift(**settings):
+def lift(**settings: object) -> "composer.Environment":
     """Lift an object of unknown mass."""
     from .hold import Lift
 

@@ -2,11 +2,16 @@
 name."""
 
 import dataclasses
+import typing
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
 
 from ..geometry.rigid import quaternion
+
+if typing.TYPE_CHECKING:
+    from ..coupling.attachment import Handle
 
 __all__ = ["HANDS", "Mount", "attach_to_hand"]
 
@@ -93,15 +98,15 @@ HANDS = {
 
 
 def attach_to_hand(
-    spec,
-    hand="shadow_hand",
-    fingers=None,
-    variant="replace",
-    prefix="biotac_",
-    self_touch=False,
-    slots=None,
-    **settings,
-):
+    spec: mujoco.MjSpec,
+    hand: str | dict[str, Mount] = "shadow_hand",
+    fingers: Iterable[str] | None = None,
+    variant: str = "replace",
+    prefix: str = "biotac_",
+    self_touch: bool = False,
+    slots: int | None = None,
+    **settings: object,
+) -> dict[str, "Handle"]:
     """Puts BioTacs onto the fingertips of a hand.
 
     Args:

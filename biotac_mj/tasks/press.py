@@ -2,6 +2,7 @@
 not."""
 
 import numpy as np
+from dm_control import mjcf
 from dm_control.utils import rewards
 
 from .base import AWAY, TouchTask
@@ -21,7 +22,7 @@ class Press(TouchTask):
     estimated = ("force",)
     seconds = 3.0
 
-    def __init__(self, **settings):
+    def __init__(self, **settings: object):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         self._plate = self._arena.mjcf_model.worldbody.add("body", name="plate", mocap=True, pos=AWAY)
@@ -36,11 +37,11 @@ class Press(TouchTask):
         self._targets = np.zeros(2)
         self._observe("target", lambda physics: np.array([self.target(physics)]))
 
-    def target(self, physics) -> float:
+    def target(self, physics: mjcf.Physics) -> float:
         """The wanted force [N]."""
         return self._targets[int(physics.data.time > self.seconds / 2)]
 
-    def initialize_episode(self, physics, random_state):
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self._targets = random_state.uniform(*_FORCES, size=2)
         angle = random_state.uniform(-_TILT, _TILT, size=2)
         plate = physics.bind(self._plate)
@@ -48,10 +49,10 @@ class Press(TouchTask):
         plate.mocap_quat = np.array([1, *(angle / 2), 0]) / np.linalg.norm([1, *(angle / 2)])
         self.machine.place(physics, np.append(random_state.uniform(-5e-3, 5e-3, size=2), 0.0))
 
-    def hidden(self, physics):
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         return self.contact_force(physics)[None, 1:2]
 
-    def get_reward(self, physics):
+    def get_reward(self, physics: mjcf.Physics) -> float:
         target = self.target(physics)
         return float(
             rewards.tolerance(

@@ -62,28 +62,28 @@ class _Machine(composer.Entity):
         return body
 
     @property
-    def mjcf_model(self):
+    def mjcf_model(self) -> mjcf.RootElement:
         return self._root
 
     @property
-    def joints(self):
+    def joints(self) -> list[mjcf.Element]:
         return self._joints
 
     @property
-    def actuators(self):
+    def actuators(self) -> list[mjcf.Element]:
         return self._actuators
 
     @property
-    def axes(self):
+    def axes(self) -> list[str]:
         """Names of what a command moves."""
         return [a.name for a in self._actuators]
 
     @property
-    def speed(self):
+    def speed(self) -> np.ndarray:
         """(naxis,) what a command of 1 means [m/s], [rad/s]."""
         return np.array(self._speed[: len(self.axes)])
 
-    def command(self, physics, action):
+    def command(self, physics: mjcf.Physics, action: np.ndarray) -> None:
         """Sets the velocities of the axes: action (naxis,) in [-1, 1]."""
         # not through a binding: it would make dm_control recompute the whole step, skin included, before the
         # next reading
@@ -91,13 +91,13 @@ class _Machine(composer.Entity):
             self._speed
         )
 
-    def place(self, physics, position):
+    def place(self, physics: mjcf.Physics, position: np.ndarray) -> None:
         """Puts the axes at position (naxis,) [m], [rad], at rest, and the servos with them."""
         physics.bind(self._joints).qpos = position
         physics.bind(self._joints).qvel = 0.0
         physics.bind(self._actuators).act = position
 
-    def position(self, physics):
+    def position(self, physics: mjcf.Physics) -> np.ndarray:
         """(naxis,) [m], [rad]."""
         return np.array(physics.bind(self._joints).qpos)
 
@@ -147,9 +147,9 @@ class Gripper(_Machine):
             )
 
     @property
-    def axes(self):
+    def axes(self) -> list[str]:
         return ["lift", "grip"] if len(self._actuators) == 3 else ["grip"]
 
-    def command(self, physics, action):
+    def command(self, physics: mjcf.Physics, action: np.ndarray) -> None:
         """action: (lift, grip) or (grip,) in [-1, 1]; a grip of 1 closes."""
         super().command(physics, np.append(action, action[-1]))

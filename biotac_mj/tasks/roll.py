@@ -1,6 +1,7 @@
 """Roll a sphere between fingertip and table to a place that is told; where the sphere is must be felt."""
 
 import numpy as np
+from dm_control import mjcf
 from dm_control.utils import rewards
 
 from .base import AWAY, TouchTask
@@ -20,7 +21,7 @@ class RollBall(TouchTask):
     estimated = ("ball_x", "ball_y", "force")
     seconds = 4.0
 
-    def __init__(self, **settings):
+    def __init__(self, **settings: object):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
@@ -52,7 +53,7 @@ class RollBall(TouchTask):
         world.add("body", name="target", mocap=True).add("geom", **mark)
         self._observe("target", lambda physics: self._target.copy())
 
-    def initialize_episode(self, physics, random_state):
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         start = np.array([_CENTER, 0.0]) + random_state.uniform(-1, 1, size=2) * _START
         # along the finger: across it the pad is too round and too narrow to roll a ball far
         self._target = start + np.array(
@@ -67,17 +68,17 @@ class RollBall(TouchTask):
         physics.bind(self._arena.mjcf_model.find("body", "target")).mocap_pos = np.append(self._target, floor)
         self.machine.place(physics, np.array([0.0, 0.0, 2e-3]))
 
-    def ball(self, physics):
+    def ball(self, physics: mjcf.Physics) -> np.ndarray:
         """(2,) place of the ball on the table [m]."""
         return np.array(physics.bind(self._joint).qpos[:2])
 
-    def hidden(self, physics):
+    def hidden(self, physics: mjcf.Physics) -> np.ndarray:
         # where the ball is under the finger
         return np.append(
             self.ball(physics) - self.machine.position(physics)[:2], self.contact_force(physics)[1]
         )[None]
 
-    def get_reward(self, physics):
+    def get_reward(self, physics: mjcf.Physics) -> float:
         return float(
             rewards.tolerance(
                 np.linalg.norm(self.ball(physics) - self._target), (0, 5e-4), 3.5e-3, "linear", 0.0

@@ -5,10 +5,17 @@ A controller never sees the simulation's hidden state. What it believes about fo
 `touch.Estimator`, a regression calibrated on other episodes (`calibrate`), or, in the calibration itself,
 from the truth handed to `act`."""
 
+import pathlib
+import typing
+
 import numpy as np
 
 from ..data.objects import OBJECTS
 from .touch import Touch, check_fitted_on, load_calibration, load_estimator
+
+if typing.TYPE_CHECKING:
+    from dm_control import composer
+    from dm_env import specs
 
 __all__ = ["SCRIPTED", "Random", "make_controller"]
 
@@ -25,15 +32,15 @@ class Scripted:
     estimator = stored = None
 
     @property
-    def fit(self):
+    def fit(self) -> str:
         """Name of its estimator."""
         return self.calibration or self.task
 
-    def reset(self):
+    def reset(self) -> None:
         """Before an episode."""
         self.touch, self.frame = Touch(), 0
 
-    def act(self, observation, truth=None) -> np.ndarray:
+    def act(self, observation: dict, truth: np.ndarray | None = None) -> np.ndarray:
         """The action for an observation."""
         self.felt = self.touch.update(observation)
         self.frame += 1
@@ -46,10 +53,10 @@ class Scripted:
             self.control(observation, truth, touching) if self.touch.tared else self.wait(observation), -1, 1
         )
 
-    def wait(self, observation):
+    def wait(self, observation: dict) -> np.ndarray:
         return np.zeros(3)
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         raise NotImplementedError
 
 
@@ -58,7 +65,7 @@ class Press(Scripted):
 
     task = "press"
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         error = estimate[0, 0] - observation["target"][0]
         return np.array([0, 0, 0.25 * error if touching else -0.4])
 
@@ -68,10 +75,10 @@ class FollowEdge(Scripted):
 
     task = "follow_edge"
 
-    def wait(self, observation):
+    def wait(self, observation: dict) -> np.ndarray:
         return np.zeros(4)
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         offset, turn, force = estimate[0]
         if not touching:
             return np.array([0, 0, -0.4, 0])
@@ -88,7 +95,7 @@ class RollBall(Scripted):
 
     task = "roll_ball"
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         ball, force = observation["position"][:2] + estimate[0, :2], estimate[0, 2]
         if not touching:
             return np.array([0, 0, -0.3])
@@ -108,12 +115,12 @@ class Explore(Scripted):
     # frames at depth before the reading; frames after which a stiff thing is taken as it is
     settle, patience = (4, 25)
 
-    def reset(self):
+    def reset(self) -> None:
         super().reset()
         self.stage, self.first, self.count, self.pressed, self.felt_at = "search", None, 0, 0, []
         self.belief = np.zeros(len(OBJECTS))
 
-    def act(self, observation, truth=None):
+    def act(self, observation: dict, truth: np.ndarray | None = None) -> np.ndarray:
         self.felt = self.touch.update(observation)
         self.frame += 1
         motion = self._move(observation["position"]) if self.touch.tared else np.zeros(3)
@@ -151,7 +158,7 @@ class Explore(Scripted):
         self.stage = "press" if there else "shift"
         return motion
 
-    def decide(self):
+    def decide(self) -> None:
         """Linear discriminant analysis of the presses."""
         stored = load_calibration() if self.stored is None else self.stored
         score = np.ravel(self.felt_at) @ stored["explore/weight"] + stored["explore/bias"]
@@ -167,13 +174,13 @@ class Hold(Scripted):
     # grip before there is a load [N]; what it needs times a share, and more [N]; haste
     least, share, spare, gain = (1.0, 1.5, 0.35, 1.5)
 
-    def wait(self, observation):
+    def wait(self, observation: dict) -> np.ndarray:
         return np.zeros(1)
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         return np.array([self.grip(estimate, touching)])
 
-    def grip(self, estimate, touching):
+    def grip(self, estimate: np.ndarray, touching: bool) -> float:
         if not touching:
             return 0.4
         grip, load = estimate[:, 0].mean(), max(0.0, estimate[:, 1].sum())
@@ -190,14 +197,14 @@ class Lift(Hold):
     least, share, spare, gain = 0.35, 1.3, 0.15, 0.7  # the load comes slowly here
     goal = 0.0315  # [m] of the gripper
 
-    def wait(self, observation):
+    def wait(self, observation: dict) -> np.ndarray:
         return np.zeros(2)
 
-    def reset(self):
+    def reset(self) -> None:
         super().reset()
         self.ready = self.slipping = False
 
-    def control(self, observation, estimate, touching):
+    def control(self, observation: dict, estimate: np.ndarray, touching: bool) -> np.ndarray:
         grip = self.grip(estimate, touching)
         self.ready = self.ready or (touching and estimate[:, 0].mean() > 0.9 * self.least)
         height = observation["position"][0]
@@ -210,20 +217,22 @@ class Lift(Hold):
 class Random:
     """Uniform in the action's bounds."""
 
-    def __init__(self, spec, seed=0):
+    def __init__(self, spec: "specs.BoundedArray", seed: int = 0):
         self.spec, self.rng = spec, np.random.RandomState(seed)
 
-    def reset(self):
+    def reset(self) -> None:
         """Nothing to forget."""
 
-    def act(self, observation):
+    def act(self, observation: dict) -> np.ndarray:
         return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 
 SCRIPTED = {c.task: c for c in (Press, FollowEdge, RollBall, Explore, Hold, Lift)}
 
 
-def make_controller(task, env=None, calibration=None) -> Scripted:
+def make_controller(
+    task: str, env: "composer.Environment | None" = None, calibration: pathlib.Path | str | None = None
+) -> Scripted:
     """The scripted controller of a task.
 
     Args:

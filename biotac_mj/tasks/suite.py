@@ -1,13 +1,27 @@
 """`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
 
 import importlib
+import typing
+
+import numpy as np
+
+if typing.TYPE_CHECKING:
+    from dm_control import composer
+
+    from .base import TouchTask
 
 __all__ = ["DOMAINS", "environment", "load", "tasks"]
 
 DOMAINS = ("finger", "gripper")
 
 
-def environment(task, environment_kwargs=None, random=None, time_limit=None, **settings):
+def environment(
+    task: "type[TouchTask]",
+    environment_kwargs: dict | None = None,
+    random: "int | np.random.RandomState | None" = None,
+    time_limit: float | None = None,
+    **settings: object,
+) -> "composer.Environment":
     """A composer.Environment of a TouchTask class.
 
     Args:
@@ -48,7 +62,9 @@ def tasks() -> list[tuple[str, str]]:
     return [(domain, task) for domain in DOMAINS for task in _domain(domain).SUITE]
 
 
-def load(domain_name, task_name, task_kwargs=None, environment_kwargs=None):
+def load(
+    domain_name: str, task_name: str, task_kwargs: dict | None = None, environment_kwargs: dict | None = None
+) -> "composer.Environment":
     """An environment: `load("finger", "press", task_kwargs={"random": 0})`.
 
     Args:

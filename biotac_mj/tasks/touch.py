@@ -6,11 +6,16 @@ import functools
 import hashlib
 import importlib.resources
 import json
+import typing
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
+
+if typing.TYPE_CHECKING:
+    from ..coupling.config import Config
 
 __all__ = [
     "CalibrationWarning",
@@ -38,10 +43,10 @@ class Touch:
         self._frames, self._rest, self._value = [], None, None
 
     @property
-    def tared(self):
+    def tared(self) -> bool:
         return self._rest is not None
 
-    def update(self, observation) -> np.ndarray:
+    def update(self, observation: dict) -> np.ndarray:
         """(nbiotac, 20) changes from rest: of ln Z of the electrodes in tenths, of PDC in hundreds of counts.
 
         Raises:
@@ -96,7 +101,13 @@ class Estimator:
         return (_features(touch) / self.scale) @ self.weight
 
     @classmethod
-    def fit(cls, touch, hidden, episode, ridges=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)):
+    def fit(
+        cls,
+        touch: np.ndarray,
+        hidden: np.ndarray,
+        episode: np.ndarray,
+        ridges: Sequence[float] = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0),
+    ) -> "Estimator":
         """From samples touch (n, 20), hidden (n, k) of episodes (n,); the ridge that predicts every fourth
         episode best is taken.
 
@@ -126,7 +137,7 @@ class CalibrationWarning(UserWarning):
     """An estimator is used with a BioTac unlike that which it was fitted on."""
 
 
-def fitted_on(config) -> dict:
+def fitted_on(config: "Config") -> dict:
     """What an estimator belongs to, of a BioTac's `coupling.Config`: digest of its skin, tier, material,
     liquid, friction, readings."""
     from ..geometry import load_skin
@@ -146,7 +157,7 @@ def fitted_on(config) -> dict:
     }
 
 
-def check_fitted_on(name, stored, config):
+def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
     """Warns (CalibrationWarning) where the estimator `name` of a calibration was fitted on another BioTac
     than that of a `Config`."""
     now, text = fitted_on(config), stored.get(f"{name}/fitted_on")
@@ -166,7 +177,7 @@ def check_fitted_on(name, stored, config):
 
 
 @functools.cache
-def load_calibration(path=None) -> dict:
+def load_calibration(path: str | None = None) -> dict:
     """Arrays of a file made by `python -m biotac_mj.tasks.calibrate`; None takes the package's,
     `biotac_mj/tasks/calibration.npz`."""
     if path is None:
@@ -176,7 +187,7 @@ def load_calibration(path=None) -> dict:
         return {name: file[name] for name in file.files}
 
 
-def load_estimator(task, stored=None) -> Estimator:
+def load_estimator(task: str, stored: dict | None = None) -> Estimator:
     """The calibrated estimator of a task (of "grip" for hold and lift), of a calibration or the package's.
 
     Raises:

@@ -1,9 +1,12 @@
 """Before and after, on the part kept aside: of each finding by the number that shows it, and of the whole
 model in counts and newtons."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..noise import noise_level
+from .effects.effect import Finding
 from .effects.hum import Hum
 from .effects.loads import ForceEffect
 from .effects.noises import CrossTalk, LowPass, _lag_one, quiet, windows
@@ -13,7 +16,7 @@ from .views import VIEWS, Amended, Choice, choose, cross_residual, whole_line
 __all__ = ["gap", "statistics"]
 
 
-def statistics(session) -> list:
+def statistics(session: Session) -> list:
     """Fills `statistic` and `verified` of every finding; returns those that the part kept aside
     contradicts."""
     for finding in session.findings:
@@ -132,7 +135,7 @@ def _force_error(session):
     return float("nan") if view is None else float(np.exp(0.5 * view.errors().mean()))
 
 
-def gap(session, findings, late=()) -> dict:
+def gap(session: Session, findings: Sequence[Finding], late: Sequence[Finding] = ()) -> dict:
     """Views of the whole model before and after, on the part kept aside: RMS, of electrodes also one by one
     [counts].
 

@@ -8,13 +8,16 @@ what has to be explained, and adds at most one number per component. Both sides 
 which takes the electrodes' noise out of the comparison. Memory has a direction in time: an effect must beat
 itself run backwards."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from ...sensor.channels import log_impedance
 from ..evidence import sign_flip
 from .effects.effect import Finding
-from .effects.loads import Hysteresis, Latency, LoadLowPass, Relaxation, play
+from .effects.loads import ForceEffect, Hysteresis, Latency, LoadLowPass, Relaxation, play
 
 __all__ = ["BETWEEN", "ForceView", "find_between"]
 
@@ -44,7 +47,15 @@ class ForceView:
       chain: effects between force and electrodes that are known, list of (effect, theta).
     """
 
-    def __init__(self, counts, force, rows, usable, rate, chain=()):
+    def __init__(
+        self,
+        counts: np.ndarray,
+        force: np.ndarray,
+        rows: np.ndarray,
+        usable: np.ndarray,
+        rate: float,
+        chain: Sequence[tuple] = (),
+    ):
         self.rows, self.rate, self.chain = np.flatnonzero(rows), rate, list(chain)
         z = log_impedance(counts[np.ix_(self.rows, usable)])
         z = z - z.mean(0)
@@ -60,16 +71,16 @@ class ForceView:
     def _smooth(self, x):
         return gaussian_filter1d(x, _SMOOTH * self.rate, axis=0, mode="nearest")
 
-    def errors(self, chain=()):
+    def errors(self, chain: Sequence[tuple] = ()) -> np.ndarray:
         """(blocks, 3) logarithm of the mean square error of each block left out, with effects besides those
         known."""
         return self._score(*self._features([*self.chain, *chain]))[0]
 
-    def explained(self):
+    def explained(self) -> float:
         """Share of the force's variance that the electrodes predict, median over its components."""
         return float(np.median(1 - np.exp(self.errors()).mean(0) / np.maximum(self.target.var(0), 1e-12)))
 
-    def table(self, effect, thetas, chain=()):
+    def table(self, effect: ForceEffect, thetas: list[dict], chain: Sequence[tuple] = ()) -> np.ndarray:
         """(thetas, blocks) mean log error over the components, for each theta of an effect beside a chain."""
         chain, name = [*self.chain, *chain], effect.linear
         if name is None:
@@ -102,13 +113,13 @@ class ForceView:
             else theta
         )
 
-    def loop(self, x, theta):
+    def loop(self, x: np.ndarray, theta: dict) -> np.ndarray:
         """(rows, 3) elastic part of a play operator on what the electrodes say of the force."""
         said = self.predict(x)[0]
         width = theta["width"] if "width" in theta else theta["share"] * said.std(0)
         return _sided(lambda s, rate, t: play(s, width), said, self.rate, theta)
 
-    def predict(self, x, loop=None):
+    def predict(self, x: np.ndarray, loop: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """(rows, 3) force by columns (rows, q), each block from the others [N], a loop's part left out, and
         the loop's factor (3,)."""
         A = np.concatenate([np.ones((len(x), 1)), x, *([] if loop is None else [loop])], axis=1)
@@ -156,7 +167,7 @@ class ForceView:
         return out
 
 
-def find_between(session) -> list:
+def find_between(session: Any) -> list:
     """Findings between force and electrodes: the set of effects that predicts the force best on blocks left
     out, each one needed in it."""
     view = session.force_view()

@@ -123,7 +123,12 @@ class Recording:
         return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
 
 
-def read_recording(electrodes, force=None, tdc=None, rate=None) -> Recording:
+def read_recording(
+    electrodes: pathlib.Path | str,
+    force: pathlib.Path | str | None = None,
+    tdc: pathlib.Path | str | None = None,
+    rate: float | None = None,
+) -> Recording:
     """Reads text files of numbers (`data.columns`).
 
     Args:

@@ -167,7 +167,7 @@ def _amendments(view):
     )
 
 
-def write_report(diagnosis: RecordingDiagnosis, folder) -> list:
+def write_report(diagnosis: RecordingDiagnosis, folder: pathlib.Path | str) -> list:
     """Writes verdict.json, report.html and the figures; returns the paths."""
     folder = pathlib.Path(folder)
     figures = [("overview.png", _overview), ("channels.png", _channels)]

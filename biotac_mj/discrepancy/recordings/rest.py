@@ -14,7 +14,7 @@ __all__ = ["cells", "remainder"]
 _PARTS = 10
 
 
-def cells(session) -> list:
+def cells(session: Session) -> list:
     """Cells (channel or "all together") x tenth of the record in which the unamended recording departs from
     its own level, family-wise 5 %."""
     raw = Session(session.recording, session.fit)
@@ -51,7 +51,7 @@ def cells(session) -> list:
     return sorted(out, key=lambda c: -abs(c["z"]))
 
 
-def remainder(session) -> dict:
+def remainder(session: Session) -> dict:
     """Describes what the amended model leaves: dict with `significant`, `text` and shares."""
     out = _remainder(session)
     if session.unnamed:

@@ -7,11 +7,13 @@ recording and looks again.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import tqdm
 
 from .effects.drifts import CountGain, CountOffset, SharedGain, Thermal, TimeShaped
+from .effects.effect import RecordedEffect
 from .effects.electrode_drifts import Drift, GainChange
 from .effects.faults import Freeze, Quantise, Saturate, Spikes, Stuck, Swap
 from .effects.hum import Hum
@@ -79,7 +81,10 @@ class RecordingDiagnosis:
 
 
 def diagnose_recording(
-    recording: Recording, locked: float | None = None, effects=(), progress: bool = False
+    recording: Recording,
+    locked: float | None = None,
+    effects: Sequence[RecordedEffect] = (),
+    progress: bool = False,
 ) -> RecordingDiagnosis:
     """Finds what the model misses in one recording.
 

@@ -1,10 +1,15 @@
 """What the search on a plain recording knows: the recording less what was found so far."""
 
+import typing
+
 import numpy as np
 
 from .load_search import ForceView
 from .recording import Recording
 from .timeline import Timeline
+
+if typing.TYPE_CHECKING:
+    from .effects.effect import Finding
 
 __all__ = ["Session"]
 
@@ -16,7 +21,7 @@ class Session:
       recording; fit: (n,) bool, rows that may be used; counts (n, 19); masked (n, 19) bool; findings.
     """
 
-    def __init__(self, recording: Recording, fit):
+    def __init__(self, recording: Recording, fit: np.ndarray):
         self.recording, self.fit = recording, fit
         self.counts = recording.electrodes.copy()
         self.masked = np.zeros(self.counts.shape, bool)
@@ -27,7 +32,7 @@ class Session:
         self.unnamed = []  # what was seen and given up: texts
         self.events = {}  # (electrode, second) -> counts: left the others and came back, no effect
 
-    def give_up(self, findings, text):
+    def give_up(self, findings: "list[Finding]", text: str) -> None:
         """Takes findings back: what they describe belongs to something that has no name here."""
         keep = [f for f in self.findings if f not in findings]
         self.findings, self.counts, self.force = [], self.recording.electrodes.copy(), self.recording.force
@@ -36,7 +41,7 @@ class Session:
         for finding in keep:
             self.accept(finding)
 
-    def force_view(self):
+    def force_view(self) -> ForceView | None:
         """ForceView of the corrected counts, or None where force and electrodes are not related."""
         if self.force is None or self.force[self.fit].std(0).max() < 0.02:
             return None
@@ -45,7 +50,7 @@ class Session:
             self._view = view if view is not None and view.explained() > 0.3 else False
         return self._view or None
 
-    def force_view_of(self, rows):
+    def force_view_of(self, rows: np.ndarray) -> ForceView | None:
         """ForceView of contiguous rows (n,) bool with what was found between force and electrodes, or None
         with too few electrodes."""
         usable = np.flatnonzero(~(self.masked[rows].mean(0) > 0.02))
@@ -56,7 +61,7 @@ class Session:
             else None
         )
 
-    def timeline(self, rows=None, counts=None) -> Timeline:
+    def timeline(self, rows: slice | None = None, counts: np.ndarray | None = None) -> Timeline:
         """Bins of the rows to fit, or of others (a slice, contiguous)."""
         if counts is not None:
             return self._make(self._slice(self.fit) if rows is None else rows, counts)
@@ -67,7 +72,7 @@ class Session:
         return self._timelines[key]
 
     @property
-    def known_jumps(self):
+    def known_jumps(self) -> list[float]:
         """Times [s] of the jumps found so far, swaps among them."""
         steps = [
             f
@@ -76,7 +81,7 @@ class Session:
         ]
         return [t for f in steps for t in (f.start, f.end) if 0 < t < self.recording.time[-1]]
 
-    def accept(self, finding):
+    def accept(self, finding: "Finding") -> None:
         """Takes a finding out of the counts."""
         self.findings.append(finding)
         self._take_out(finding)

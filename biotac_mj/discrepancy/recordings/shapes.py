@@ -3,6 +3,7 @@ is not white."""
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class ShapeFit:
     interval: dict
 
 
-def evaluate_shape(kind, t, onset, tau, end):
+def evaluate_shape(kind: str, t: np.ndarray, onset: float, tau: float, end: float) -> np.ndarray:
     """(n,) the unit shape at times t (n,) [s]."""
     since = np.maximum(t - onset, 0)
     if kind == "step":
@@ -77,7 +78,7 @@ def evaluate_shape(kind, t, onset, tau, end):
     return 1 - np.exp(-since / tau)
 
 
-def correlation_length(residual):
+def correlation_length(residual: np.ndarray) -> float:
     """Samples per independent sample: 1 + 2 sum of autocorrelations up to the first that is not positive."""
     x = residual - residual.mean()
     n, power = len(x), float(x @ x)
@@ -91,7 +92,13 @@ def correlation_length(residual):
 
 
 def fit_shapes(
-    t, x, kinds=("exponential", "ramp", "step", "pulse"), onsets=None, tests=1, floor=0.0, through=None
+    t: np.ndarray,
+    x: np.ndarray,
+    kinds: Sequence[str] = ("exponential", "ramp", "step", "pulse"),
+    onsets: np.ndarray | None = None,
+    tests: int = 1,
+    floor: float = 0.0,
+    through: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> ShapeFit | None:
     """The best shape, or None where the constant does as well.
 

@@ -7,6 +7,8 @@ p' S^-1 (y - mean) / (p' S^-1 p) is the estimate that the load disturbs least (t
 Capon, Proc. IEEE 57, 1969). With p = e_k it is the residual of predicting electrode k from the other 18, with
 p = 1 the shared gain. Unloaded, S is the noise and a(t) a plain average: one formula for both."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from ...sensor.channels import log_impedance
@@ -35,7 +37,9 @@ class Timeline:
       covariance: (c, c) of fast changes; loaded: whether the skin was loaded.
     """
 
-    def __init__(self, recording: Recording, counts=None, masked=None):
+    def __init__(
+        self, recording: Recording, counts: np.ndarray | None = None, masked: np.ndarray | None = None
+    ):
         counts = recording.electrodes if counts is None else counts
         n = len(counts)
         seconds = n / recording.rate
@@ -106,13 +110,13 @@ class Timeline:
         x = x[energy <= np.quantile(energy, 0.98)].reshape(-1, x.shape[2])
         return x.T @ x / len(x) * span / (span - 2) + np.diag(self.noise**2)
 
-    def amplitude(self, pattern):
+    def amplitude(self, pattern: np.ndarray) -> tuple[np.ndarray, float]:
         """(m,) of a pattern (c,), about its mean, and the standard deviation that fast changes give it."""
         q = np.linalg.solve(self.covariance, pattern)
         scale = pattern @ q
         return (self.value - self.value.mean(0)) @ q / scale, 1 / np.sqrt(scale)
 
-    def jumps(self, known=(), seconds=0.6):
+    def jumps(self, known: Sequence[float] = (), seconds: float = 0.6) -> tuple[np.ndarray, np.ndarray, int]:
         """Changes of level within a bin: rows (q,) of bins, change (q, c) of means over `seconds` before and
         after [ln Z], bins on a side.
 
@@ -129,7 +133,7 @@ class Timeline:
         # bin `at` itself may be cut in two
         return (at, (total[at + w + 1] - total[at + 1] - total[at] + total[at - w]) / w, w)
 
-    def jump_at(self, row, known=(), seconds=6.0):
+    def jump_at(self, row: int, known: Sequence[float] = (), seconds: float = 6.0) -> np.ndarray:
         """(c,) change of level at bin `row`, a straight line on either side taken into account [ln Z]."""
         w = int(round(seconds / self.period))
         first, last = max(row - w, 0), min(row + w + 1, len(self.time))
@@ -145,7 +149,7 @@ class Timeline:
             return np.zeros(self.value.shape[1])
         return np.linalg.lstsq(design, self.value[rows], rcond=None)[0][2]
 
-    def explained_by_others(self, k):
+    def explained_by_others(self, k: int) -> Callable[[np.ndarray], np.ndarray]:
         """A function that takes out of (m,) or (m, q) what the other electrodes can say about electrode
         `used[k]`; loaded only.
 

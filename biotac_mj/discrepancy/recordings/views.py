@@ -7,6 +7,8 @@ fitted decide: what develops over time is fitted again on the first rows alone a
 as the whole will be on the part kept aside, of which no row is looked at."""
 
 import dataclasses
+import typing
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,6 +18,10 @@ from .effects.electrode_drifts import GainChange
 from .effects.loads import ForceEffect, force_features
 from .effects.noises import LowPass
 from .session import Session
+
+if typing.TYPE_CHECKING:
+    from .effects.effect import Finding
+    from .timeline import Timeline
 
 __all__ = ["Amended", "Choice", "VIEWS", "choose", "cross_residual", "options", "whole_line"]
 
@@ -38,7 +44,7 @@ class Choice:
     time: str = "carried on"
     force: bool = True
 
-    def text(self, findings):
+    def text(self, findings: "Sequence[Finding]") -> str:
         """Which of the findings enter, in words."""
         late = " (held at its last fitted level)" if self.time == "held" else ""
         moving = [f.effect.name + late for f in findings if over_time(f) and self.time != "none"]
@@ -46,7 +52,7 @@ class Choice:
         return ", ".join([*moving, *between]) or "nothing"
 
 
-def over_time(finding):
+def over_time(finding: "Finding") -> bool:
     return isinstance(finding.effect, (TimeShaped, GainChange))
 
 
@@ -57,7 +63,7 @@ class Amended:
       counts: (n, 19); force: (n, 3) as the electrodes follow it [N], or None; session: of the same rows.
     """
 
-    def __init__(self, session, findings, choice: Choice):
+    def __init__(self, session: Session, findings: "Sequence[Finding]", choice: Choice):
         recording = session.recording
         self.time = recording.time
         self.late = np.minimum(self.time, self.time[session.fit][-1]) if choice.time == "held" else self.time
@@ -82,14 +88,14 @@ class Amended:
     def _clock(self, finding):
         return self.late if over_time(finding) else self.time
 
-    def measured_counts(self, counts):
+    def measured_counts(self, counts: np.ndarray) -> np.ndarray:
         """Counts (n, 19) with the findings put back."""
         for f in reversed(self.used):
             if not isinstance(f.effect, (ForceEffect, LowPass)):
                 counts = f.apply(counts, self._clock(f))
         return counts
 
-    def measured_force(self, force):
+    def measured_force(self, force: np.ndarray) -> np.ndarray:
         """The force sensor's (n, 3) [N], of the force that the electrodes follow."""
         for f in reversed(self.used):
             if isinstance(f.effect, ForceEffect):
@@ -100,7 +106,7 @@ class Amended:
 # --- the views: Amended -> prediction, measured numbers (n or bins, components), time of the rows [s]
 
 
-def electrodes_from_force(a):
+def electrodes_from_force(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (
         a.measured_counts(_from_force(a.force, a.counts, a.session.fit)),
         a.session.recording.electrodes,
@@ -108,12 +114,12 @@ def electrodes_from_force(a):
     )
 
 
-def electrodes_at_rest(a):
+def electrodes_at_rest(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     level = counts_from_log_impedance(log_impedance(a.counts[a.session.fit]).mean(0))
     return a.measured_counts(np.tile(level, (len(a.counts), 1))), a.session.recording.electrodes, a.time
 
 
-def force_from_electrodes(a):
+def force_from_electrodes(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear in ln Z, ridge."""
     z, fit = log_impedance(a.counts), a.session.fit
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
@@ -124,7 +130,7 @@ def force_from_electrodes(a):
     return a.measured_force(A @ w), a.session.recording.force, a.time
 
 
-def each_from_the_others(a):
+def each_from_the_others(a: "Amended") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     line, deviation, _ = whole_line(a.session)
     e = np.median(a.session.recording.electrodes, axis=0)[line.used]
     residual = np.zeros((len(line.time), 19))  # zero of electrodes that are masked for the most part
@@ -138,7 +144,7 @@ VIEWS = {
 }  # fmt: skip
 
 
-def squares(view, amended, rows):
+def squares(view: str, amended: "Amended", rows: np.ndarray) -> np.ndarray:
     """(components,) mean square error of a view on rows (n,) bool, of every force component or electrode;
     masked samples do not count."""
     said, measured, time = VIEWS[view](amended)
@@ -157,7 +163,7 @@ def squares(view, amended, rows):
 # --- trials  ---
 
 
-def options(view, findings) -> list:
+def options(view: str, findings: "Sequence[Finding]") -> list:
     """The Choices that differ in a view, what was found first."""
     times = ("carried on", "held", "none") if any(over_time(f) for f in findings) else ("carried on",)
     forces = (
@@ -168,7 +174,7 @@ def options(view, findings) -> list:
     return [Choice(t, f) for f in forces for t in times]
 
 
-def choose(session, findings, views) -> dict:
+def choose(session: Session, findings: "Sequence[Finding]", views: Sequence[str]) -> dict:
     """view -> (Choice of each component or of all, {option's text: mean log error against none
     (components,)}), by trials.
 
@@ -240,7 +246,7 @@ def _fitted_again(session, findings, fit):
 # --- what the views need  ---
 
 
-def whole_line(session):
+def whole_line(session: Session) -> "tuple[Timeline, np.ndarray, np.ndarray]":
     """Timeline of the whole record with the covariance of the part fitted: (timeline, deviation (m, c), rows
     fitted (m,))."""
     from .recording import Recording
@@ -258,7 +264,7 @@ def whole_line(session):
     return line, line.value - line.value[inside].mean(0), inside
 
 
-def cross_residual(line, deviation):
+def cross_residual(line: "Timeline", deviation: np.ndarray) -> np.ndarray:
     """(m, c) of every electrode against what the others predict [ln Z]."""
     P = np.linalg.inv(line.covariance)
     return deviation @ P / np.diag(P)

@@ -2,6 +2,8 @@
 further beams; at the end each has to be needed."""
 
 import dataclasses
+import typing
+from collections.abc import Callable
 
 import numpy as np
 
@@ -9,6 +11,9 @@ from ..evidence import benjamini_hochberg, sign_flip
 from .fitting import Fit, evidence, fit_effects, mean_square
 from .screening import screen
 from .thresholds import THRESHOLDS
+
+if typing.TYPE_CHECKING:
+    from .whitening import Comparison
 
 __all__ = ["Candidate", "compose"]
 
@@ -48,7 +53,14 @@ class Candidate:
         return {"id": self.effect.id, **{k: getattr(self, k) for k in keys}, "theta": theta}
 
 
-def compose(comparison, null, usable, chosen, seed, tick=lambda: None):
+def compose(
+    comparison: "Comparison",
+    null: Fit,
+    usable: list,
+    chosen: np.ndarray,
+    seed: int,
+    tick: Callable[[], object] = lambda: None,
+) -> tuple[Fit, list, list]:
     """The composition that trajectories left out like best.
 
     Returns:

@@ -2,11 +2,15 @@
 evidence by trajectory."""
 
 import dataclasses
+import typing
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from .nuisance import HIGH, LOW, PRIOR, Nuisance
+
+if typing.TYPE_CHECKING:
+    from .whitening import Comparison
 
 __all__ = ["Fit", "evidence", "fit_effects", "mean_square"]
 
@@ -29,13 +33,13 @@ class Fit:
     covariance: np.ndarray
     cost: float
 
-    def residuals(self, comparison, exact=False):
+    def residuals(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.residuals(self.effects, self.nuisance, exact)
 
-    def raw(self, comparison, exact=False):
+    def raw(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.raw(self.effects, self.nuisance, exact)
 
-    def interval(self, k):
+    def interval(self, k: int) -> tuple[float, float]:
         """95 % interval of free parameter k, from the covariance by trajectory and what the effect says of
         its law."""
         effect, name = self.names[k]
@@ -45,18 +49,20 @@ class Fit:
         return value - half, value + half
 
 
-def mean_square(residuals) -> np.ndarray:
+def mean_square(residuals: list) -> np.ndarray:
     """(trajectories,) c_i = |r|^2 / n."""
     return np.array([float((r**2).mean()) for r in residuals])
 
 
-def evidence(residuals) -> np.ndarray:
+def evidence(residuals: list) -> np.ndarray:
     """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share their
     causes [nats]."""
     return np.array([-0.5 * len(r) * np.log(max(float((r**2).mean()), 0.05)) for r in residuals])
 
 
-def fit_effects(comparison, effects, keep=None, start=None) -> Fit:
+def fit_effects(
+    comparison: "Comparison", effects: list, keep: np.ndarray | None = None, start: Fit | None = None
+) -> Fit:
     """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
 
     Args:

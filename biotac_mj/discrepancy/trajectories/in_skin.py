@@ -8,6 +8,7 @@ It takes the place of a Simulator wherever the skin is solved anew (`exact`); wi
 
 import dataclasses
 import typing
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,10 +17,24 @@ from ...effects.in_skin import memory_of
 from ...skin.settings import read_settings
 from .simulator import Simulator, _impedance, placed
 
+if typing.TYPE_CHECKING:
+    from ...effects.effect import Run
+    from ...sensor.film import FilmConduction
+    from ...skin.model import SkinModel
+    from .simulator import Fields
+    from .trajectory import Trajectory
+
 __all__ = ["InSkinSimulator", "solve_with_memory"]
 
 
-def solve_with_memory(model, film, trajectories, poses=None, progress=None, loss=0.0) -> list:
+def solve_with_memory(
+    model: "SkinModel",
+    film: "FilmConduction",
+    trajectories: "list[Trajectory]",
+    poses: list | None = None,
+    progress: Callable[[], object] | None = None,
+    loss: float = 0.0,
+) -> list:
     """Walks trajectories in their order through a skin that remembers.
 
     Overstress and slip are forgotten between trajectories, the largest energy of every point is not.
@@ -91,7 +106,15 @@ class InSkinSimulator(Simulator):
                 f"the {self.tier} tier is elastic: constitutive effects inside the elements need tier='full'"
             )
 
-    def run(self, trajectories, fields=None, exact=True, effects=None, *more, **kw):
+    def run(
+        self,
+        trajectories: "list[Trajectory]",
+        fields: "Fields | None" = None,
+        exact: bool | list = True,
+        effects: list | None = None,
+        *more: typing.Any,
+        **kw: typing.Any,
+    ) -> "list[Run]":
         """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
@@ -114,7 +137,13 @@ class _Remembering(Simulator):
     """Solves the skin with what is `inside`; nothing is cached, since the past decides."""
 
     def solve(
-        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+        self,
+        trajectories: "list[Trajectory]",
+        offset: list | None = None,
+        log_radius: list | None = None,
+        log_friction: float = 0.0,
+        bubble: float = 0.0,
+        progress: Callable[[], object] | None = None,
     ) -> list:
         poses = [
             placed(

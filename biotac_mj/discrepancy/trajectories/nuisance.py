@@ -36,7 +36,7 @@ class Nuisance:
         """(4,)"""
         return np.array(dataclasses.astuple(self))
 
-    def moved(self, **by) -> "Nuisance":
+    def moved(self, **by: float) -> "Nuisance":
         """A copy with some of it changed by so much."""
         return dataclasses.replace(self, **{k: getattr(self, k) + v for k, v in by.items()})
 
@@ -54,7 +54,7 @@ def _neighbourhood(length=4.0):
     return near / near.sum(1, keepdims=True)
 
 
-def widen(log_z, rest_log_z, footprint):
+def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float) -> np.ndarray:
     """(n, 19) ln Z with the change from rest (19,) spread over the neighbourhood."""
     change = log_z - rest_log_z
     return log_z + footprint * (change @ _neighbourhood().T - change)

@@ -1,6 +1,7 @@
 """The report of the full workflow: report.html with figures, verdict.json, sensor_amended.yaml, and the
 summary for the terminal."""
 
+import argparse
 import html
 import json
 import pathlib
@@ -21,7 +22,7 @@ from .workflow import THRESHOLDS, Report, diagnose, threshold_hash
 __all__ = ["diagnose_data", "summary", "verdict_dict", "write_report"]
 
 
-def diagnose_data(args) -> None:
+def diagnose_data(args: argparse.Namespace) -> None:
     """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`."""
     out = pathlib.Path(args.out)
     data = read_trajectories(args.data)
@@ -106,7 +107,7 @@ def summary(report: Report) -> str:
     return "\n".join(lines)
 
 
-def write_report(report: Report, sim: Simulator, folder) -> list:
+def write_report(report: Report, sim: Simulator, folder: pathlib.Path | str) -> list:
     """Writes report.html, verdict.json, sensor_amended.yaml and the figures; returns the paths."""
     folder = pathlib.Path(folder)
     pictures = []

@@ -1,17 +1,26 @@
 """Linearised signatures: the screen of the catalogue, what one effect can mimic of another, and the
 experiment that tells them apart."""
 
+import typing
+
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
 from .fitting import mean_square
+
+if typing.TYPE_CHECKING:
+    from ...effects.effect import Effect
+    from .fitting import Fit
+    from .whitening import Comparison
 
 __all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen"]
 
 _STEPS = {"log_modulus": 0.05, "log_friction": 0.1, "footprint": 0.02, "mesh": 0.2}
 
 
-def columns(comparison, current, effect, shape, base, chosen):
+def columns(
+    comparison: "Comparison", current: "Fit", effect: "Effect", shape: dict, base: list, chosen: np.ndarray
+) -> np.ndarray:
     """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a
     realistic size."""
     out = []
@@ -30,7 +39,7 @@ def _sizes(effect):
         yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
 
 
-def nuisance_space(comparison, current, base, chosen):
+def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
     """(rows, 4) orthonormal: what the nuisance parameters can mimic."""
     out = []
     for name, by in _STEPS.items():
@@ -40,7 +49,7 @@ def nuisance_space(comparison, current, base, chosen):
     return q[:, np.abs(np.diag(r)) > 1e-9]
 
 
-def screen(comparison, current, effects, chosen):
+def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.ndarray) -> list[tuple]:
     """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
     start), best first."""
     base = current.residuals(comparison)
@@ -90,7 +99,9 @@ def screen(comparison, current, effects, chosen):
     return sorted(best.values(), key=lambda o: -o[0])
 
 
-def isolability(comparison, current, usable, found, chosen):
+def isolability(
+    comparison: "Comparison", current: "Fit", usable: list, found: list, chosen: np.ndarray
+) -> dict:
     """M[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats that i
     makes at a realistic size."""
     base = current.residuals(comparison)
@@ -119,7 +130,7 @@ def isolability(comparison, current, usable, found, chosen):
     return {"ids": ids, "matrix": M.tolist(), "nats": size, "notes": notes}
 
 
-def next_experiment(effects, isolability):
+def next_experiment(effects: list, isolability: dict) -> str:
     pairs = [(e, t) for e in effects for t in e["ties"]]
     if not pairs:
         pairs = [

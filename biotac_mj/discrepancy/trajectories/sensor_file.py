@@ -1,6 +1,7 @@
 """A sensor's YAML read back as a simulator."""
 
 import pathlib
+from collections.abc import Sequence
 
 from ...effects.catalogue import by_id
 from ...effects.effect import STAGES
@@ -10,7 +11,7 @@ from .simulator import SCHEMA, Simulator
 __all__ = ["load_simulator"]
 
 
-def load_simulator(path, extra=()) -> Simulator:
+def load_simulator(path: pathlib.Path | str, extra: Sequence = ()) -> Simulator:
     """A Simulator from YAML; `extra` are your own effects.
 
     Raises:

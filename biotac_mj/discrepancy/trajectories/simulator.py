@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import pathlib
 import typing
+from collections.abc import Callable
 
 import numpy as np
 import tqdm
@@ -17,7 +18,10 @@ import tqdm
 from ...effects.effect import STAGES, Run
 from ...files import replacing
 from ...skin.settings import plain, read_material, read_settings
-from .nuisance import KNOWN, OTHER_MESH, widen
+from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
+
+if typing.TYPE_CHECKING:
+    from .trajectory import Trajectory
 
 __all__ = ["SCHEMA", "Fields", "Simulator", "placed"]
 
@@ -54,7 +58,7 @@ class Simulator:
     options: dict = dataclasses.field(default_factory=dict)
     constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
 
-    def with_effects(self, effects, modulus=None) -> "Simulator":
+    def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
         """A copy with these effects added."""
         other = copy.copy(self)
         other.effects = [*self.effects, *effects]
@@ -64,7 +68,13 @@ class Simulator:
     # --- the skin  ---
 
     def solve(
-        self, trajectories, offset=None, log_radius=None, log_friction=0.0, bubble=0.0, progress=None
+        self,
+        trajectories: "list[Trajectory]",
+        offset: list | None = None,
+        log_radius: list | None = None,
+        log_friction: float = 0.0,
+        bubble: float = 0.0,
+        progress: Callable[[], object] | None = None,
     ) -> list:
         """Per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
         19); kept in `cache`.
@@ -169,7 +179,7 @@ class Simulator:
             )
         return model, store["film"]
 
-    def fields(self, trajectories, progress=True) -> "Fields":
+    def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
         """The skin along the trajectories and its differences: 8 solutions of the data set, kept in
         `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
@@ -214,7 +224,14 @@ class Simulator:
     # --- all stages  ---
 
     def run(
-        self, trajectories, fields=None, exact=True, effects=None, modulus=None, offsets=None, nuisance=KNOWN
+        self,
+        trajectories: "list[Trajectory]",
+        fields: "Fields | None" = None,
+        exact: bool | list = True,
+        effects: list | None = None,
+        modulus: float | None = None,
+        offsets: list | None = None,
+        nuisance: Nuisance = KNOWN,
     ) -> list[Run]:
         """What the sensor would read, without noise and rounding.
 
@@ -318,7 +335,7 @@ class Simulator:
 
     # --- YAML  ---
 
-    def save(self, path) -> None:
+    def save(self, path: pathlib.Path | str) -> None:
         """Writes the stages and effects as YAML."""
         import yaml
 
@@ -366,7 +383,7 @@ class Fields:
     trajectories: list
 
 
-def placed(t, shift=None, grow=0.0):
+def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
     """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
     by exp(grow), its tip kept."""
     tool, pos = t.tool, t.pos + (0.0 if shift is None else shift)

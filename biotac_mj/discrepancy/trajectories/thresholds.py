@@ -38,7 +38,7 @@ def threshold_hash() -> str:
     return hashlib.sha256(json.dumps([THRESHOLDS, CONFIDENCE], sort_keys=True).encode()).hexdigest()[:12]
 
 
-def confidence(nats, closed, left, lead, ties) -> float:
+def confidence(nats: float, closed: float, left: float, lead: float, ties: int) -> float:
     """Probability that a name is the right one.
 
     Args:
@@ -49,6 +49,6 @@ def confidence(nats, closed, left, lead, ties) -> float:
     return float(1 / (1 + np.exp(-np.dot(CONFIDENCE, terms(nats, closed, left, lead, ties)))))
 
 
-def terms(nats, closed, left, lead, ties) -> list:
+def terms(nats: float, closed: float, left: float, lead: float, ties: int) -> list:
     """What CONFIDENCE weighs."""
     return [1.0, np.log1p(max(nats, 0.0)), closed, max(left, 0.0), min(max(lead, 0.0), 10.0), float(ties > 0)]

@@ -101,7 +101,7 @@ class Trajectory:
         return (self.pos - self.pos[0]) @ self.heading
 
 
-def read_trajectories(path) -> list[Trajectory]:
+def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
     """Labelled interactions of a data set (docs/data.md); `parameters` may hold "clock" [s] of the session.
 
     Raises:
@@ -153,7 +153,7 @@ def read_trajectories(path) -> list[Trajectory]:
     return out
 
 
-def write_trajectories(path, trajectories) -> None:
+def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory]) -> None:
     """Writes one HDF5 file that `biotac diagnose` and `read_trajectories` read; what was not measured is
     stored as nan."""
     from scipy.spatial.transform import Rotation
@@ -190,7 +190,7 @@ def write_trajectories(path, trajectories) -> None:
     write_shard(pathlib.Path(path), rows)
 
 
-def measurement_noise(trajectories) -> dict:
+def measurement_noise(trajectories: list[Trajectory]) -> dict:
     """Standard deviations: electrodes (19,) [counts], pdc [counts], force (3,) [N].
 
     From second differences of rows while the object rests, in air or held; where there are too few of them,

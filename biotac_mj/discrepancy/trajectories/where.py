@@ -1,13 +1,20 @@
 """Where the residual stands out, and what a remainder that has no name depends on."""
 
+import typing
+
 import numpy as np
 
 from ..evidence import max_t
 
+if typing.TYPE_CHECKING:
+    from .fitting import Fit
+    from .trajectory import Trajectory
+    from .whitening import Comparison
+
 __all__ = ["channel_groups", "conditions", "depends_on", "phases", "where"]
 
 
-def phases(t) -> dict:
+def phases(t: "Trajectory") -> dict:
     """Boolean rows of free, approach, hold, slide, unload."""
     speed = np.gradient(t.depth, t.time)
     across = np.linalg.norm(np.gradient(t.pos, t.time, axis=0) - np.outer(speed, t.heading), axis=1)
@@ -23,7 +30,7 @@ def phases(t) -> dict:
     }
 
 
-def conditions(trajectories) -> dict:
+def conditions(trajectories: "list[Trajectory]") -> dict:
     """name -> per trajectory (boolean rows, weight): phases, load, tool, place, session's clock and
     temperature.
 
@@ -60,7 +67,7 @@ def conditions(trajectories) -> dict:
     return out
 
 
-def channel_groups(comparison) -> dict:
+def channel_groups(comparison: "Comparison") -> dict:
     """name -> slice of the residual's columns: every electrode, PDC, force."""
     return {
         **{f"e{k + 1}": slice(k, k + 1) for k in range(19)},
@@ -68,7 +75,7 @@ def channel_groups(comparison) -> dict:
     }
 
 
-def where(comparison, null, chosen):
+def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dict]:
     """Cells channel x condition that stand out; family-wise p by sign flips of whole trajectories.
 
     All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times
@@ -111,7 +118,7 @@ def _features(t):
     }
 
 
-def depends_on(comparison, current, chosen):
+def depends_on(comparison: "Comparison", current: "Fit", chosen: np.ndarray) -> str:
     """What the remainder depends on: held-out share that features explain, and what permuting each of them
     costs."""
     white = current.residuals(comparison)

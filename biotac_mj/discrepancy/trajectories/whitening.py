@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from .nuisance import KNOWN
+from .nuisance import KNOWN, Nuisance
 from .simulator import Fields, Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
@@ -87,26 +87,26 @@ class Comparison:
             u, s, _ = np.linalg.svd(J, full_matrices=False)
             self._basis.append((u, 1 - 1 / np.sqrt(1 + s**2)))
 
-    def predict(self, runs) -> list:
+    def predict(self, runs: list) -> list:
         """Per trajectory (n, width) about rest."""
         rest = np.mean([r.counts[0] for r in runs], axis=0)
         rest_pdc = np.mean([r.pdc[0] for r in runs])
         return [self._stack(r.counts - rest, r.pdc - rest_pdc, r.force) for r in runs]
 
-    def whiten(self, i, residual) -> np.ndarray:
+    def whiten(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) with unit covariance under noise, resolution and repeatability."""
         r = (residual / self.sigma).ravel()
         u, shrink = self._basis[i]
         return (r - u @ (shrink * (u.T @ r))).reshape(residual.shape)
 
-    def residuals(self, effects, nuisance=KNOWN, exact=False) -> list:
+    def residuals(self, effects: list | None, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
         """Whitened residuals of every trajectory."""
         runs = self.sim.run(
             self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance
         )
         return [self.whiten(i, m - p) for i, (m, p) in enumerate(zip(self.measured, self.predict(runs)))]
 
-    def raw(self, effects, nuisance=KNOWN, exact=False) -> list:
+    def raw(self, effects: list | None, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
         """Residuals (n, width) in counts, counts and newtons."""
         runs = self.sim.run(
             self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance

@@ -2,6 +2,8 @@
 and what cannot be known."""
 
 import dataclasses
+import typing
+from collections.abc import Sequence
 
 import numpy as np
 import tqdm
@@ -16,6 +18,10 @@ from .thresholds import THRESHOLDS, confidence, threshold_hash
 from .trajectory import FEWEST, measurement_noise
 from .where import depends_on, phases, where
 from .whitening import REPEATABILITY, Comparison
+
+if typing.TYPE_CHECKING:
+    from .simulator import Fields
+    from .trajectory import Trajectory
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
 
@@ -62,14 +68,14 @@ class Report:
 
 def diagnose(
     sim: Simulator,
-    data,
+    data: "list[Trajectory]",
     *,
-    effects=CATALOGUE,
-    repeatability=REPEATABILITY,
-    locked=0.25,
-    seed=0,
-    progress=True,
-    fields=None,
+    effects: Sequence = CATALOGUE,
+    repeatability: float = REPEATABILITY,
+    locked: float = 0.25,
+    seed: int = 0,
+    progress: bool = True,
+    fields: "Fields | None" = None,
 ) -> Report:
     """Compares a simulator with measured trajectories and names what it misses.
 

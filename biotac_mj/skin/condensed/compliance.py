@@ -12,6 +12,7 @@ is made, and its factor, only where something is not in the cache."""
 import functools
 import hashlib
 import pathlib
+import typing
 import zlib
 
 import numpy as np
@@ -20,6 +21,9 @@ import scipy.sparse as sp
 from ...threads import single_thread
 from ..cache import cache_folder, kept, replace_file, report_damage
 from .rest_tangent import rest_tangent
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 __all__ = ["SurfaceCompliance"]
 
@@ -84,7 +88,14 @@ class SurfaceCompliance:
       count: contact coordinates.
     """
 
-    def __init__(self, model, outer, inner, direction, cache: bool = True):
+    def __init__(
+        self,
+        model: "SkinModel",
+        outer: np.ndarray,
+        inner: np.ndarray,
+        direction: np.ndarray,
+        cache: bool = True,
+    ):
         self._model, self._outer, self._inner, self._direction = model, outer, inner, direction
         self.size, self.count = 3 * len(model.free), 3 * len(outer) + len(inner)
         self._position = np.full(model.nvert, -1)

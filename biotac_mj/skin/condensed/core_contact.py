@@ -5,6 +5,7 @@ The law is that of the full skin, sampled inside the faces; what differs is that
 along its own direction away from the core, and that the distance is trilinear in the core's grid."""
 
 import dataclasses
+import typing
 
 import numpy as np
 import warp as wp
@@ -12,6 +13,9 @@ import warp as wp
 from ..contact.faces import Geoms, face_samples
 from ..contact.shapes import distance_bound
 from ..types import real, vec3
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 __all__ = ["CoreContact", "Meeting"]
 
@@ -158,7 +162,7 @@ class CoreContact:
       node: (nnode,) free nodes. direction: (nnode, 3) away from the core.
     """
 
-    def __init__(self, model, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
+    def __init__(self, model: "SkinModel", rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
         free = np.zeros(model.nvert, bool)
         free[model.free] = True
         self._face = model.core_surface.face_np

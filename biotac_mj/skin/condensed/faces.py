@@ -4,6 +4,8 @@ wrenches.
 Few faces are at stake, so what counts is the number of launches: each kernel is one thread that does all of
 them, which also fixes the order of sums."""
 
+import typing
+
 import numpy as np
 import warp as wp
 
@@ -11,6 +13,9 @@ from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
 from ..contact.touch import contact_kernels
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 __all__ = ["CandidateFaces"]
 
@@ -214,7 +219,7 @@ class CandidateFaces:
         all of the last `evaluate`.
     """
 
-    def __init__(self, model, geoms: GeomSet, x: wp.array, x_last: wp.array, slot: wp.array):
+    def __init__(self, model: "SkinModel", geoms: GeomSet, x: wp.array, x_last: wp.array, slot: wp.array):
         self._model, self._geoms, self._x, self._last, self._slot_wp, self.slot = (
             model,
             geoms,

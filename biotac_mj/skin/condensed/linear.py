@@ -109,7 +109,7 @@ class Compliance:
             out -= (self._share * float(self._a @ p)) * self._a
         return out
 
-    def part(self, on: np.ndarray, dtype=float) -> np.ndarray:
+    def part(self, on: np.ndarray, dtype: type = float) -> np.ndarray:
         """W over the coordinates `on` (k,): (k, k)."""
         out = self._rest.take(on, 0).take(on, 1).astype(dtype, copy=False)
         out *= self._scale

@@ -1,6 +1,8 @@
 """Stiffness of a skin that rests on its filling, as a sparse matrix: what the condensed tier is linear
 about."""
 
+import typing
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -9,10 +11,13 @@ from ..geoms import GeomSet
 from ..step import prepare_step
 from ..types import vec3
 
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
+
 __all__ = ["rest_tangent"]
 
 
-def rest_tangent(model) -> sp.csc_matrix:
+def rest_tangent(model: "SkinModel") -> sp.csc_matrix:
     """Tangent of elastic forces and of the liquid's pressure at `model.rest`, over the free coordinates
     [N/m]; as if all of the skin were off its core, whose contact is not in it.
 

@@ -5,6 +5,7 @@ chosen. A few regions are kept: BioTacs of one model share a skin. Which one is 
 time."""
 
 import dataclasses
+import typing
 
 import numpy as np
 import warp as wp
@@ -13,6 +14,9 @@ from ..contact.faces import Geoms
 from ..contact.shapes import distance_bound
 from ..geoms import GeomSet
 from ..types import real, vec3
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 __all__ = ["NearSearch"]
 
@@ -111,7 +115,7 @@ class NearSearch:
       rest: (nvert, 3) nodes at rest [m]. x_wp, x: (nvert, 1) present nodes, as Warp array and as its view.
     """
 
-    def __init__(self, model, geoms: GeomSet, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
+    def __init__(self, model: "SkinModel", geoms: GeomSet, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
         self._model, self._geoms, self._rest, self._x = model, geoms, rest, x
         self._nface = len(model.outer.face)
 

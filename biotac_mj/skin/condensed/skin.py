@@ -12,6 +12,7 @@ What skin does differently from a linear one, s and c, is fitted to the full FEM
 """
 
 import math
+import typing
 import weakref
 
 import numpy as np
@@ -30,6 +31,9 @@ from .faces import CandidateFaces
 from .refusals import refuse
 from .search import NearSearch
 from .step import Memory, Outcome, Step
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 __all__ = ["CondensedSkin", "Memory", "Outcome"]
 
@@ -109,7 +113,7 @@ class CondensedSkin:
       ValueError: what the tier cannot do, see `refusals`.
     """
 
-    def __init__(self, model, geoms: GeomSet, cache: bool = True):
+    def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True):
         refuse(model.rubber_options, model.options, model.has_liquid, model.device.is_cuda)
         self.model, self.geoms = model, geoms
         self.correction = correction(model.material.law)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,15 @@ class Outcome:
 class Step:
     """One step of a CondensedSkin: candidates, Newton's method, results."""
 
-    def __init__(self, skin, memory: Memory, u: np.ndarray, geom_pos, geom_mat, motion: np.ndarray):
+    def __init__(
+        self,
+        skin: Any,
+        memory: Memory,
+        u: np.ndarray,
+        geom_pos: np.ndarray,
+        geom_mat: np.ndarray,
+        motion: np.ndarray,
+    ):
         self.skin, self.memory, self.u = skin, memory, u
         self.pose = geom_pos, geom_mat
         moved = np.abs(motion).max(initial=0.0)

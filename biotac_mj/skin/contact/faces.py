@@ -63,7 +63,7 @@ class Laws:
     node_push: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
 
 
-def empty_laws(device) -> Laws:
+def empty_laws(device: wp.DeviceLike) -> Laws:
     """Of a surface without a ContactLaw."""
     laws = Laws()
     for name, variable in Laws.vars.items():

@@ -17,12 +17,17 @@ area:
 
 import dataclasses
 import math
+import typing
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..types import real
 from .faces import Laws
+
+if typing.TYPE_CHECKING:
+    from ..geoms import GeomSet
 
 __all__ = ["ContactLaw", "WorldLaws", "contact_law"]
 
@@ -76,7 +81,7 @@ class ContactLaw:
             raise ValueError(f"adhesion_range is {self.adhesion_range}: pass a positive length in m, or None")
 
 
-def contact_law(choice) -> ContactLaw | None:
+def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:
     """A ContactLaw, a dict of its fields or None, as a ContactLaw or None.
 
     Raises:
@@ -105,7 +110,7 @@ class WorldLaws:
       range: (nworld,) at which adhesion ends [m].
     """
 
-    def __init__(self, model, materials: list, stiffness: np.ndarray):
+    def __init__(self, model: typing.Any, materials: list, stiffness: np.ndarray):
         nworld = len(materials)
         self.law, self.nworld, self.device = model.options.contact_law, nworld, model.device
         n, nvert = (nworld, model.nvert) if self.law else (0, 0)
@@ -133,7 +138,11 @@ class WorldLaws:
         return self.struct.reach.numpy().copy()
 
     def set(
-        self, friction_exponent=None, adhesion=None, friction_pressure=None, adhesion_hysteresis=None
+        self,
+        friction_exponent: ArrayLike | None = None,
+        adhesion: ArrayLike | None = None,
+        friction_pressure: ArrayLike | None = None,
+        adhesion_hysteresis: ArrayLike | None = None,
     ) -> None:
         """Gives each world its law, from the next step on.
 
@@ -189,7 +198,7 @@ class WorldLaws:
         ):
             array.assign(value)
 
-    def refuse_coarse_grids(self, geoms) -> None:
+    def refuse_coarse_grids(self, geoms: "GeomSet") -> None:
         """Refuses meshes whose distance is not exact as far as adhesion reaches (ValueError)."""
         if self.law is None:
             return

@@ -5,6 +5,7 @@ A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: 
 radius r, its faces stay."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -117,7 +118,7 @@ def _mesh(vert, face, device) -> wp.Mesh:
     )
 
 
-def pack_grids(grids, device):
+def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Grids, list]:
     """The grids as one Warp struct, and the meshes, which must live as long as the struct does."""
     grids = list(grids)
     meshes = [_mesh(g.vert, g.face, device) for g in grids]

@@ -1,9 +1,17 @@
 """Preconditioners of the skin's linear solves: a sparse factor on the CPU, a dense inverse on CUDA."""
 
+import typing
+from collections.abc import Callable
 from typing import Protocol
+
+import warp as wp
 
 from ..program import Launcher
 from ..types import Precision
+
+if typing.TYPE_CHECKING:
+    from ..geoms import GeomSet
+    from ..newton.worlds import Worlds
 
 __all__ = ["Preconditioner"]
 
@@ -21,7 +29,17 @@ class Preconditioner(Protocol):
     def begin_step(self, program: Launcher) -> None:
         """A step begins."""
 
-    def update(self, program: Launcher, st, worth, r, gradient, z_out, part_out, beside) -> None:
+    def update(
+        self,
+        program: Launcher,
+        st: "Worlds",
+        worth: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+        beside: Callable[..., None],
+    ) -> None:
         """Takes the tangents of contact and liquid, just evaluated, in the active worlds, and marks in
         `st.touched` where something touches; z is the approximate inverse of the new tangent times r.
 
@@ -34,16 +52,27 @@ class Preconditioner(Protocol):
           beside: launches functions that do not need each other's results.
         """
 
-    def apply(self, program: Launcher, st, part, r, gradient, z_out, part_out) -> None:
+    def apply(
+        self,
+        program: Launcher,
+        st: "Worlds",
+        part: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+    ) -> None:
         """The same for another r in the running worlds; `part` holds the square of r by chunks."""
 
-    def watch_products(self, program: Launcher, x) -> None:
+    def watch_products(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve at x [nvert, nworld]: may take the factor of this shape for the rest of the
         step."""
 
-    def renew(self, program: Launcher, x) -> None:
+    def renew(self, program: Launcher, x: wp.array) -> None:
         """Takes the factor of the shape x, if it can, for the rest of the step."""
 
-    def measure_tangents(self, program: Launcher, geoms, x, tangent_out) -> None:
+    def measure_tangents(
+        self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
+    ) -> None:
         """Stiffness of the skin against rigid motions of each touching body after a step [group, world], see
         `body_tangent`."""

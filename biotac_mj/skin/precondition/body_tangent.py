@@ -10,6 +10,8 @@ nodes from the linear solves of many worlds, and that is D - D C D; nodes that t
 of them.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -21,7 +23,14 @@ __all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
 wp.set_module_options({"enable_backward": False})
 
 
-def body_tangent(nodes, compliance, solver, blocks, x, nvert):
+def body_tangent(
+    nodes: np.ndarray,
+    compliance: np.ndarray,
+    solver: Callable[[np.ndarray], np.ndarray],
+    blocks: tuple,
+    x: np.ndarray,
+    nvert: int,
+) -> np.ndarray:
     """Stiffness of the skin against rigid motions of a body that touches it, 6 x 6 about the origin
     (translation, rotation vector).
 
@@ -53,7 +62,7 @@ def body_tangent(nodes, compliance, solver, blocks, x, nvert):
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def assemble(nodes, faces, blocks, nvert):
+def assemble(nodes: np.ndarray, faces: np.ndarray, blocks: np.ndarray, nvert: int) -> np.ndarray:
     """Contact stiffness (3m, 3m) over `nodes` from the blocks (n, 6, 3, 3) of faces (n, 3)."""
     position = np.full(nvert, len(nodes))
     position[nodes] = np.arange(len(nodes))

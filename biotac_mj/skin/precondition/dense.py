@@ -5,14 +5,22 @@ nodes (by their rows of the inverse for few worlds, by a product for many), then
 liquid that answer there, q = (I + D W)^-1 D u; these join the residual, and one product gives the result. G =
 (I + D W)^-1 D is made explicitly, so that applying it is one short product."""
 
+import typing
+from collections.abc import Callable, Sequence
+
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
+from ..newton.worlds import Worlds
 from ..program import Launcher
 from ..types import SINGLE, mat33, real
 from . import body_tangent, sides, small
 from . import symmetric_product as one
 from . import touched as touch
+
+if typing.TYPE_CHECKING:
+    from ..geoms import GeomSet
 
 __all__ = ["FEW", "THREADS_FEW", "DenseInverse", "DensePreconditioner"]
 
@@ -38,7 +46,7 @@ class DensePreconditioner:
 
     precision = SINGLE
 
-    def __init__(self, model, surfaces, st, chunk: int, capacity: int):
+    def __init__(self, model: typing.Any, surfaces: tuple, st: Worlds, chunk: int, capacity: int):
         nworld = st.softness.shape[0]
         self.m, self.nworld, self.chunk, self.capacity = model, nworld, chunk, capacity
         self.device = model.device
@@ -104,16 +112,26 @@ class DensePreconditioner:
     def begin_step(self, program: Launcher) -> None:
         """Nothing: the factor at rest serves every step."""
 
-    def watch_products(self, program: Launcher, x) -> None:
+    def watch_products(self, program: Launcher, x: wp.array) -> None:
         """Nothing: an inverse takes longer than the products that it would save."""
 
-    def renew(self, program: Launcher, x) -> None:
+    def renew(self, program: Launcher, x: wp.array) -> None:
         """Nothing, see `watch_products`."""
 
     def _launch(self, program, kernel, dim, inputs, outputs):
         program.launch(kernel, dim, inputs, outputs, THREADS_FEW if self.nworld <= FEW else 256)
 
-    def update(self, program: Launcher, st, worth, r, gradient, z_out, part_out, beside) -> None:
+    def update(
+        self,
+        program: Launcher,
+        st: Worlds,
+        worth: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+        beside: Callable[..., None],
+    ) -> None:
         """See `precondition.Preconditioner`."""
         on, m, w, inverse = st.active, self.capacity, self.nworld, self._inverse
         entries = [inverse.half, inverse.rest, inverse.scale]
@@ -193,7 +211,16 @@ class DensePreconditioner:
             make()
         self._balance(program, st, on, r, gradient, z_out, part_out)
 
-    def apply(self, program: Launcher, st, part, r, gradient, z_out, part_out) -> None:
+    def apply(
+        self,
+        program: Launcher,
+        st: Worlds,
+        part: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+    ) -> None:
         """z = approximate inverse of the tangent times r in the running worlds; `part` holds the square of r
         by chunks."""
         if self._alone:
@@ -376,7 +403,9 @@ class DensePreconditioner:
             [z_out, part_out],
         )
 
-    def measure_tangents(self, program: Launcher, geoms, x, tangent_out) -> None:
+    def measure_tangents(
+        self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
+    ) -> None:
         """See `precondition.Preconditioner`."""
         outer, rows = self._outer, (self.capacity, self.nworld)
         if self._row_group is None:
@@ -415,7 +444,7 @@ class DenseInverse:
         `sides.LOW`, empty where that is not kept.
     """
 
-    def __init__(self, stiffness, device, two: bool):
+    def __init__(self, stiffness: sp.csc_matrix, device: wp.Device, two: bool):
         if device.is_cuda:
             import torch
 
@@ -450,12 +479,14 @@ class DenseInverse:
             self._matrix, self._rest = half.astype(np.float32), rest.astype(np.float32)
         self._views = {}
 
-    def multiply(self, program: Launcher, side, answer, third) -> None:
+    def multiply(self, program: Launcher, side: wp.array, answer: wp.array, third: wp.array) -> None:
         """answer = inverse times side, (padded, 2 nworld) half -> single; third = remainder times its first
         columns."""
         self._multiply(program, (self._matrix, self._rest), side, (answer, third))
 
-    def multiply_rows(self, program: Launcher, rows, side, answer) -> None:
+    def multiply_rows(
+        self, program: Launcher, rows: Sequence[wp.array], side: wp.array, answer: wp.array
+    ) -> None:
         """The same for some rows of the inverse and of its remainder, given as arrays."""
         if program.device.is_cuda:
             self._multiply(program, [self._view(a) for a in rows], side, answer)

@@ -1,8 +1,12 @@
 """CUDA code for what Warp's kernels cannot say: threads of a block that work on one small matrix together."""
 
 import functools
+import typing
 
 import warp as wp
+
+if typing.TYPE_CHECKING:
+    from ..program import Launcher
 
 __all__ = ["invert"]
 
@@ -198,7 +202,9 @@ def _kernel(tiles):
     return invert_kernel
 
 
-def invert(program, extra, size, on, A, pivot, B):
+def invert(
+    program: "Launcher", extra: int, size: wp.array, on: wp.array, A: wp.array, pivot: wp.array, B: wp.array
+) -> None:
     """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
     overwrite A."""
     tiles = -(-A.shape[1] // _COLUMNS)

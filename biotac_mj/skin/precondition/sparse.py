@@ -10,15 +10,22 @@ identity gives
 """
 
 import contextlib
+import typing
+from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sp
+import warp as wp
 from scipy.linalg import lu_factor, lu_solve
 
-from ..newton.worlds import BALANCED
+from ..newton.worlds import BALANCED, Worlds
 from ..program import Launcher
 from ..types import DOUBLE
 from .body_tangent import assemble, body_tangent
 from .supernodal import Elimination, SupernodalFactor
+
+if typing.TYPE_CHECKING:
+    from ..geoms import GeomSet
 
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
@@ -33,7 +40,13 @@ class SparseFactor:
       elimination: of a matrix with the same pattern; None: made here, and kept as the attribute.
     """
 
-    def __init__(self, stiffness, free, vert, elimination=None):
+    def __init__(
+        self,
+        stiffness: sp.csc_matrix,
+        free: np.ndarray,
+        vert: np.ndarray,
+        elimination: Elimination | None = None,
+    ):
         self.elimination = elimination or Elimination(stiffness, vert[free])
         self._solver = SupernodalFactor(stiffness, self.elimination, free)
         self.size = stiffness.shape[0]
@@ -49,11 +62,11 @@ class SparseFactor:
             self._cluster[members], self._member[members] = number, np.arange(len(members))
         self._rows = {}
 
-    def solve(self, rhs):
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Inverse times rhs: (nvert, nworld, 3) -> the same shape, zero at fixed nodes."""
         return self._solver.solve(rhs)
 
-    def rows(self, nodes) -> np.ndarray:
+    def rows(self, nodes: np.ndarray) -> np.ndarray:
         """Rows of the inverse that belong to free nodes: (3 len(nodes), size) float32.
 
         A row is computed with the rest of its cluster of nodes, always the same one, so that it does not
@@ -71,7 +84,7 @@ class SparseFactor:
             out[here] = self._rows[cluster][self._member[local[here]]]
         return out.reshape(-1, self.size)
 
-    def dof(self, nodes) -> np.ndarray:
+    def dof(self, nodes: np.ndarray) -> np.ndarray:
         """Positions of the nodes' coordinates in a row (3 len(nodes),)."""
         return (3 * self._index[nodes][:, None] + np.arange(3)).ravel()
 
@@ -102,7 +115,7 @@ class SparsePreconditioner:
 
     precision = DOUBLE
 
-    def __init__(self, model, surfaces, st, chunk: int):
+    def __init__(self, model: typing.Any, surfaces: tuple, st: Worlds, chunk: int):
         self._model, self._surfaces = model, [s for s in surfaces if s]
         self._rest = self.factor = model.factor
         self._free = model.free
@@ -125,7 +138,7 @@ class SparsePreconditioner:
         self._products = 0
         self.factor, self._rows = self._rest, self._rest_rows
 
-    def watch_products(self, program: Launcher, x) -> None:
+    def watch_products(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve: renews the factor where solves take too long."""
         x = x.numpy()
 
@@ -137,7 +150,7 @@ class SparsePreconditioner:
         if self._renews:
             program.call(watch)
 
-    def renew(self, program: Launcher, x) -> None:
+    def renew(self, program: Launcher, x: wp.array) -> None:
         """Takes the factor of the shape x."""
         x = x.numpy()
         if self._renews:
@@ -154,7 +167,17 @@ class SparsePreconditioner:
 
     # --- solves ---
 
-    def update(self, program: Launcher, st, worth, r, gradient, z_out, part_out, beside) -> None:
+    def update(
+        self,
+        program: Launcher,
+        st: Worlds,
+        worth: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+        beside: Callable[..., None],
+    ) -> None:
         """See `precondition.Preconditioner`."""
         on, square, r, z, part = (a.numpy() for a in (st.active, worth, r, z_out, part_out))
         gradient = gradient.numpy() if len(gradient) else None
@@ -184,7 +207,16 @@ class SparsePreconditioner:
 
         program.call(update)
 
-    def apply(self, program: Launcher, st, part, r, gradient, z_out, part_out) -> None:
+    def apply(
+        self,
+        program: Launcher,
+        st: Worlds,
+        part: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+    ) -> None:
         """See `precondition.Preconditioner`."""
         on, r, z, out = (a.numpy() for a in (st.running, r, z_out, part_out))
 
@@ -252,7 +284,9 @@ class SparsePreconditioner:
 
     # --- tangents of touching bodies ---
 
-    def measure_tangents(self, program: Launcher, geoms, x, tangent_out) -> None:
+    def measure_tangents(
+        self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
+    ) -> None:
         """See `precondition.Preconditioner`."""
         outer, nvert = self._surfaces[0], len(self._is_free)
         face, x, out = outer.surface.face_np, x.numpy(), tangent_out.numpy()

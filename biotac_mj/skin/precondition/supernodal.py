@@ -135,7 +135,7 @@ class Elimination:
         (b,), and the groups below it.
     """
 
-    def __init__(self, matrix, points):
+    def __init__(self, matrix: sp.csc_matrix, points: np.ndarray):
         n = len(points)
         coo = matrix.tocoo()
         near = sp.coo_matrix(
@@ -172,7 +172,7 @@ class SupernodalFactor:
       ValueError: the matrix is not positive definite.
     """
 
-    def __init__(self, matrix, elimination: Elimination, nodes):
+    def __init__(self, matrix: sp.csc_matrix, elimination: Elimination, nodes: np.ndarray):
         self.size, self._rows = matrix.shape[0], nodes[elimination.order]
         where = (3 * elimination.order[:, None] + np.arange(3)).ravel()
         lower = sp.tril(matrix.tocsr()[where][:, where], format="csc")
@@ -213,7 +213,7 @@ class SupernodalFactor:
             wp.array(np.concatenate(panels), dtype=wp.float32, device="cpu"),
         ]
 
-    def solve(self, rhs):
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked
         at, and zero."""
         nrhs = rhs.shape[1]

@@ -142,7 +142,7 @@ class SymmetricProduct:
     """The inverse (`half` and its `rest`, see `dense`) times the two rows of a (2, padded)
     array."""
 
-    def __init__(self, half, rest):
+    def __init__(self, half: wp.array, rest: wp.array):
         self._half, self._rest, self.device = half, rest, half.device
         self._matrix = None
         if not self.device.is_cuda:
@@ -156,7 +156,7 @@ class SymmetricProduct:
             self._row, self._column = wp.array(row, dtype=int), wp.array(column, dtype=int)
             self._part = wp.zeros((2, blocks, half.shape[0]), dtype=float)
 
-    def multiply(self, program: Launcher, x, y) -> None:
+    def multiply(self, program: Launcher, x: wp.array, y: wp.array) -> None:
         """y = inverse times x, both (2, padded)."""
         if self._matrix is not None:
             a, b = x.numpy(), y.numpy()

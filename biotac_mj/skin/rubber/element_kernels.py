@@ -12,6 +12,7 @@ Elsewhere one thread has an element.
 
 import functools
 import types
+import typing
 
 import numpy as np
 import warp as wp
@@ -30,6 +31,9 @@ from .law import (
     stress_derivative,
 )
 from .points import Mesh, Rubber, deformation_of, point_functions
+
+if typing.TYPE_CHECKING:
+    from .tetrahedra import Tetrahedra
 
 __all__ = ["ElementForces"]
 
@@ -576,7 +580,9 @@ class ElementForces:
       corner_force, corner: what `push_corners` and `multiply_corners` wrote last [slot, world] [N].
     """
 
-    def __init__(self, elements, rubber: Rubber, options: tuple[str, ...], precision: Precision):
+    def __init__(
+        self, elements: "Tetrahedra", rubber: Rubber, options: tuple[str, ...], precision: Precision
+    ):
         self._elements, self._rubber, self.device = elements, rubber, elements.device
         self._nworld, self._count = len(rubber.mu), elements.nelem
         self.start, self.slot = elements.start, elements.slot
@@ -596,23 +602,23 @@ class ElementForces:
             self.corner_force = wp.zeros(corners, dtype=vec3)
             self.corner = wp.zeros(corners, dtype=precision.vec)
 
-    def push_corners(self, program: Launcher, x, on, inverted) -> None:
+    def push_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
         """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
         bear the deformation."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
 
-    def multiply_corners(self, program: Launcher, x, p, on) -> None:
+    def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
         """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
 
-    def refuse_inverted(self, program: Launcher, x, asked, failed) -> None:
+    def refuse_inverted(self, program: Launcher, x: wp.array, asked: wp.array, failed: wp.array) -> None:
         """Marks worlds with an inverted element at x."""
         dim = (self._count, self._elements.npoint, self._nworld)
         program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
 
-    def stress(self, x, rubber: Rubber) -> tuple[wp.array, wp.array]:
+    def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
         dim = (self._count, self._nworld)
         outputs = [
@@ -623,7 +629,7 @@ class ElementForces:
         wp.launch(self._kernels.cauchy, dim, inputs, outputs, device=self.device)
         return outputs[0], outputs[1]
 
-    def energy(self, x) -> np.ndarray:
+    def energy(self, x: wp.array) -> np.ndarray:
         """(nelem, nworld) elastic energy of each element by its law [J]."""
         out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
         inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]

@@ -152,7 +152,7 @@ PRESETS = {
 }
 
 
-def material(choice) -> Material:
+def material(choice: str | Material) -> Material:
     """A preset's name or a Material, as a Material; ValueError names the presets."""
     if isinstance(choice, Material):
         return choice

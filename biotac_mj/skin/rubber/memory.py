@@ -3,6 +3,7 @@ friction elements. See `points` for the equations."""
 
 import functools
 import types
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -167,7 +168,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
     return types.SimpleNamespace(commit=commit, forget=forget, recall=recall)
 
 
-def rubber_of_worlds(model, materials: list[Material], modulus: np.ndarray | None) -> Rubber:
+def rubber_of_worlds(model: Any, materials: list[Material], modulus: np.ndarray | None) -> Rubber:
     """The constants of `materials`, one for each world, as `Rubber` on the model's device, without memory.
 
     Args:
@@ -210,7 +211,7 @@ class RubberMemory:
       options: what the rubber has beyond its law, see `points.point_functions`.
     """
 
-    def __init__(self, model, rubber: Rubber, options: tuple[str, ...]):
+    def __init__(self, model: Any, rubber: Rubber, options: tuple[str, ...]):
         self._model, self.rubber, self.options = model, rubber, options
         elements, nworld = model.elements, len(rubber.mu)
         self.npoint, self._dim = elements.npoint * elements.nelem, (elements.nelem, elements.npoint, nworld)
@@ -244,7 +245,7 @@ class RubberMemory:
         """[point, world] largest energy densities so far [J/m^3]; empty where nothing is kept of them."""
         return self.rubber.worst.numpy().copy()
 
-    def bear(self, borne: np.ndarray, x) -> None:
+    def bear(self, borne: np.ndarray, x: wp.array) -> None:
         """Makes points that are at x after `forget` have borne as much, too."""
         if borne.size:
             self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))

@@ -64,7 +64,15 @@ class Tetrahedra:
       ValueError: a tetrahedron is inverted or degenerate, or a curved edge folds one.
     """
 
-    def __init__(self, vert, elem, law: int, device, modulus=None, contraction: float = CONTRACTION):
+    def __init__(
+        self,
+        vert: np.ndarray,
+        elem: np.ndarray,
+        law: int,
+        device: wp.DeviceLike,
+        modulus: np.ndarray | None = None,
+        contraction: float = CONTRACTION,
+    ):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
         self.corners = elem.shape[1]
         self._elem, self.modulus = elem, modulus

@@ -2,12 +2,17 @@
 changes in counts."""
 
 import abc
+import typing
 
 import numpy as np
 
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ..shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 from .effect import Finding, Parameter, RecordedEffect
+
+if typing.TYPE_CHECKING:
+    from ..recording import Recording
+    from ..timeline import Timeline
 
 __all__ = [
     "LENGTH",
@@ -34,12 +39,12 @@ class TimeShaped(RecordedEffect):
     unit = "counts"
     kinds = ("exponential", "ramp", "step")
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts_from_log_impedance(
             log_impedance(counts) + np.outer(self._level(time, theta), theta["pattern"])
         )
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts_from_log_impedance(
             log_impedance(counts) - np.outer(self._level(time, theta), theta["pattern"])
         )
@@ -108,17 +113,17 @@ class TimeShaped(RecordedEffect):
         found.theta["shape"] = shape
         return found
 
-    def statistic(self, session, line, finding):
+    def statistic(self, session: typing.Any, line: "Timeline", finding: Finding) -> tuple[np.ndarray, float]:
         """Root mean square of the pattern's amplitude about the level of the part fitted [ln Z]."""
         return line.amplitude(finding.theta["pattern"][line.used])
 
 
 class Common(TimeShaped):
     @abc.abstractmethod
-    def pattern(self, counts):
+    def pattern(self, counts: np.ndarray) -> np.ndarray:
         """(19,) change of ln Z of each electrode for an amplitude of one, at these counts."""
 
-    def find(self, session):
+    def find(self, session: typing.Any) -> list:
         line = session.timeline()
         pattern = self.pattern(
             np.exp(np.median(np.log(np.clip(session.counts[session.fit], 1, 4094)), axis=0))
@@ -241,7 +246,7 @@ class SharedGain(Common):
         "load": "a free segment at both ends of the record",
     }
 
-    def pattern(self, counts):
+    def pattern(self, counts: np.ndarray) -> np.ndarray:
         return np.ones(19)
 
 
@@ -258,11 +263,11 @@ class _InCounts(Common):
         found.theta["counts"] = -1 / float(mass.mean())
         return found
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         change = theta["counts"] * self._level(time, theta)[:, None]
         return np.clip(counts * (1 + change) if self.multiplies else counts + change, 0, 4095)
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         change = theta["counts"] * self._level(time, theta)[:, None]
         return np.clip(counts / np.maximum(1 + change, 0.05) if self.multiplies else counts - change, 0, 4095)
 
@@ -277,7 +282,7 @@ class CountOffset(_InCounts):
     }
     confusable = {"warmup": "electrodes with very different rest counts", "count_gain": "the same"}
 
-    def pattern(self, counts):
+    def pattern(self, counts: np.ndarray) -> np.ndarray:
         v = 1 / np.abs(counts_per_log(counts))
         return v / v.mean()
 
@@ -293,7 +298,7 @@ class CountGain(_InCounts):
     }
     confusable = {"warmup": "electrodes with very different rest counts", "count_offset": "the same"}
 
-    def pattern(self, counts):
+    def pattern(self, counts: np.ndarray) -> np.ndarray:
         v = counts / np.abs(counts_per_log(counts))
         return v / v.mean()
 
@@ -309,7 +314,7 @@ class Thermal(TimeShaped):
     }
     confusable = {"warmup": "heater on and off: temperature goes back, age does not"}
 
-    def find(self, session):
+    def find(self, session: typing.Any) -> list:
         recording = session.recording
         if recording.tdc is None:
             return []
@@ -360,7 +365,7 @@ class Thermal(TimeShaped):
         ]
 
     @staticmethod
-    def temperature(recording):
+    def temperature(recording: "Recording") -> np.ndarray:
         from ....sensor.channels import temperature_from_counts
 
         return temperature_from_counts(np.clip(recording.tdc, 1, 4094))
@@ -371,12 +376,12 @@ class Thermal(TimeShaped):
         return theta["slope"] * np.interp(time, np.arange(len(lagged)) / theta["rate"], lagged)
 
 
-def counts_per_log(counts):
+def counts_per_log(counts: np.ndarray) -> np.ndarray:
     """dE / d ln Z of raw counts (negative)."""
     return -counts * (1 - counts / 4095)
 
 
-def least_squares(design, x):
+def least_squares(design: np.ndarray, x: np.ndarray) -> tuple[float, np.ndarray]:
     w, *_ = np.linalg.lstsq(design, x, rcond=None)
     residual = x - design @ w
     return float(residual @ residual) + 1e-30, w

@@ -3,6 +3,7 @@ ones."""
 
 import abc
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -49,13 +50,13 @@ class Finding:
     confidence: float = 0.0
 
     @property
-    def id(self):
+    def id(self) -> str:
         return self.effect.id
 
-    def correct(self, counts, time):
+    def correct(self, counts: np.ndarray, time: np.ndarray) -> np.ndarray:
         return self.effect.correct(counts, time, self.channels, self.theta)
 
-    def apply(self, counts, time):
+    def apply(self, counts: np.ndarray, time: np.ndarray) -> np.ndarray:
         return self.effect.apply(counts, time, self.channels, self.theta)
 
 
@@ -76,27 +77,27 @@ class RecordedEffect(abc.ABC):
     confusable: dict = {}
 
     @abc.abstractmethod
-    def find(self, session) -> list:
+    def find(self, session: Any) -> list:
         """Findings in the part of the session that may be fitted."""
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts
 
-    def mask(self, counts, time, finding):
+    def mask(self, counts: np.ndarray, time: np.ndarray, finding: "Finding") -> np.ndarray | None:
         """(n, 19) bool of samples that are no measurement, or None."""
         return None
 
 
-def runs(x):
+def runs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Starts and lengths of runs of equal values."""
     edge = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1, [len(x)]])
     return edge[:-1], np.diff(edge)
 
 
-def spans(flag, edges, least=2):
+def spans(flag: np.ndarray, edges: np.ndarray, least: int = 2) -> list[tuple[float, float]]:
     """Contiguous stretches [s] of windows that are True; edges (w + 1,) [s]. One window missing inside a
     stretch is bridged."""
     flag = np.asarray(flag, bool).copy()

@@ -1,11 +1,16 @@
 """Drift, jump or changed gain of single electrodes: what one of them does and the others do not."""
 
+import typing
+
 import numpy as np
 
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ..shapes import ShapeFit, correlation_length, evaluate_shape, fit_shapes
 from .drifts import LENGTH, ONSET, Common, TimeShaped, counts_per_log, least_squares
 from .effect import Finding, Parameter, RecordedEffect
+
+if typing.TYPE_CHECKING:
+    from ..timeline import Timeline
 
 __all__ = ["Drift", "GainChange"]
 
@@ -32,7 +37,7 @@ class Drift(TimeShaped):
         "warmup": "one electrode or all",
     }
 
-    def find(self, session):
+    def find(self, session: typing.Any) -> list:
         line = session.timeline()
         kinds = self.kinds if line.loaded else (*self.kinds, "pulse")
         best, evidence = None, {}
@@ -161,7 +166,7 @@ class GainChange(RecordedEffect):
     params = {"gain": Parameter("1", -0.95, 3, "manufacturing scatter 3-15 %, damage more"), "onset": ONSET}
     confusable = {"drift": "load the electrode before and after", "saturate": "depth ladder at one place"}
 
-    def find(self, session):
+    def find(self, session: typing.Any) -> list:
         line = session.timeline()
         if not line.loaded:
             return []
@@ -238,10 +243,10 @@ class GainChange(RecordedEffect):
             )
         ]
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return self._scale(counts, time, channels, theta, 1 + theta["gain"], theta["shift"], False)
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return self._scale(
             counts, time, channels, theta, 1 / max(1 + theta["gain"], 0.05), theta["shift"], True
         )
@@ -257,7 +262,7 @@ class GainChange(RecordedEffect):
         return out
 
 
-def whole_electrodes(session, line):
+def whole_electrodes(session: typing.Any, line: "Timeline") -> list[int]:
     """Places in `line.used` of electrodes without clipped or stuck samples: what those hide must not be taken
     for a drift."""
     return [i for i, k in enumerate(line.used) if session.masked[session.fit, k].mean() < 0.03]

@@ -1,5 +1,7 @@
 """Effects of single samples: stuck, frozen, clipped, coarse, spiked and swapped channels."""
 
+from typing import Any
+
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
@@ -17,11 +19,11 @@ class Stuck(RecordedEffect):
     params = {"value": Parameter("counts", 0, 4095, "12-bit range")}
     confusable = {"saturate": "press harder: a stuck channel does not leave its value at all"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         rows = np.flatnonzero(session.fit)
         return self.search(session, rows[0], rows[-1] + 1)
 
-    def search(self, session, first, last):
+    def search(self, session: Any, first: int, last: int) -> list:
         found, rate = [], session.recording.rate
         x = session.recording.electrodes[first:last]
         whole = _frozen_rows(x, rate)
@@ -70,12 +72,12 @@ class Stuck(RecordedEffect):
             return False
         return all(x[s] == x.max() for s, _ in long) or all(x[s] == x.min() for s, _ in long)
 
-    def mask(self, counts, time, finding):
+    def mask(self, counts: np.ndarray, time: np.ndarray, finding: Finding) -> np.ndarray:
         mask = np.zeros(counts.shape, bool)
         mask[:, finding.channels[0]] = finding.theta["mask"]
         return mask
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         out = counts.copy()
         out[theta["mask"], channels[0]] = theta["value"]
         return out
@@ -87,11 +89,11 @@ class Freeze(RecordedEffect):
     params = {"seconds": Parameter("s", 0.1, 1e4, "longer than any bus period")}
     confusable = {"stuck": "one channel or all"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         rows = np.flatnonzero(session.fit)
         return self.search(session, rows[0], rows[-1] + 1)
 
-    def search(self, session, first, last):
+    def search(self, session: Any, first: int, last: int) -> list:
         rate = session.recording.rate
         whole = _frozen_rows(session.recording.electrodes[first:last], rate)
         if not whole.any():
@@ -114,7 +116,7 @@ class Freeze(RecordedEffect):
             )
         ]
 
-    def mask(self, counts, time, finding):
+    def mask(self, counts: np.ndarray, time: np.ndarray, finding: Finding) -> np.ndarray:
         return np.repeat(finding.theta["mask"][:, None], 19, axis=1)
 
 
@@ -132,7 +134,7 @@ class Saturate(RecordedEffect):
         "gain": "depth ladder at one place",
     }
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         hits = {}
         x = session.recording.electrodes[session.fit]
         free = ~session.masked[session.fit]
@@ -167,14 +169,14 @@ class Saturate(RecordedEffect):
             )
         return found
 
-    def mask(self, counts, time, finding):
+    def mask(self, counts: np.ndarray, time: np.ndarray, finding: Finding) -> np.ndarray:
         level, side = finding.theta["level"], finding.theta["side"]
         mask = np.zeros(counts.shape, bool)
         columns = list(finding.channels)
         mask[:, columns] = side * counts[:, columns] >= side * level
         return mask
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         out = counts.copy()
         limit = np.minimum if theta["side"] > 0 else np.maximum
         out[:, list(channels)] = limit(out[:, list(channels)], theta["level"])
@@ -187,7 +189,7 @@ class Quantise(RecordedEffect):
     params = {"step": Parameter("counts", 2, 512, "3 to 11 of 12 bits")}
     confusable = {"stuck": "a coarse channel still takes several values"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         rows = np.flatnonzero(session.fit)
         edges = np.linspace(rows[0], rows[-1] + 1, 25).astype(int)
         x = session.recording.electrodes
@@ -234,7 +236,7 @@ class Quantise(RecordedEffect):
             note=note,
         )
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         out = counts.copy()
         rows = np.ix_((time >= theta["start"]) & (time < theta["end"]), channels)
         out[rows] = theta["step"] * np.rint(out[rows] / theta["step"])
@@ -247,7 +249,7 @@ class Spikes(RecordedEffect):
     params = {"rate": Parameter("1/min", 0, 6000, "up to every tenth sample")}
     confusable = {"noise": "noise is there in every sample"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         rows = np.flatnonzero(session.fit)
         x = session.recording.electrodes[rows[0] : rows[-1] + 1]
         bad = np.zeros(session.counts.shape, bool)
@@ -275,7 +277,7 @@ class Spikes(RecordedEffect):
         ]
 
     @staticmethod
-    def flag(x):
+    def flag(x: np.ndarray) -> np.ndarray:
         middle = median_filter(x, size=(7, 1), mode="nearest")
         off = np.abs(x - middle)
         before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
@@ -285,7 +287,7 @@ class Spikes(RecordedEffect):
             np.abs(before - after) < 0.3 * off
         )
 
-    def mask(self, counts, time, finding):
+    def mask(self, counts: np.ndarray, time: np.ndarray, finding: Finding) -> np.ndarray:
         mask = np.zeros(counts.shape, bool)
         columns = list(finding.channels)
         mask[:, columns] = self.flag(counts)[:, columns]
@@ -298,7 +300,7 @@ class Swap(RecordedEffect):
     params = {"onset": Parameter("s", 0, 1e6, "the record")}
     confusable = {"gain": "a swap changes two channels at once, each to the other's level"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         line = session.timeline()
         found = (None if line.loaded else self._exchanged(line, session)) or self._best(line, session)
         return [found] if found else []
@@ -393,7 +395,7 @@ class Swap(RecordedEffect):
         at = int(np.argmin(total) if late else np.argmax(total)) + inside.start
         return float(t[min(at, len(t) - 1)] + line.period / 2)
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         out = counts.copy()
         rows = (time >= theta["start"]) & (time < theta["end"])
         a, b = channels

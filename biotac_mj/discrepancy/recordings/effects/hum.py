@@ -1,5 +1,7 @@
 """A periodic disturbance: its line in the spectrum, when it is there, and how it is taken out."""
 
+from typing import Any
+
 import numpy as np
 from scipy.stats import gamma
 
@@ -19,7 +21,7 @@ class Hum(RecordedEffect):
     }
     confusable = {"noise": "noise has no line in its spectrum"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         rate = session.recording.rate
         x = session.counts[session.fit]
         best = None
@@ -118,10 +120,10 @@ class Hum(RecordedEffect):
             np.sin(phase)[:, None] * theta["weights"][0] + np.cos(phase)[:, None] * theta["weights"][1]
         )
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts + self._wave(time, theta)
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return counts - self._wave(time, theta)
 
 

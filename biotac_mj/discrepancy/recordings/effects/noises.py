@@ -4,6 +4,8 @@ Noise of a real unloaded sensor is white and independent between electrodes (doc
 and its correlations are the electronics'. Third differences take the load out; windows in which the load
 moves least are used."""
 
+from typing import Any
+
 import numpy as np
 from scipy.optimize import brentq
 
@@ -19,7 +21,7 @@ _THIRD = np.array([1.0, -3.0, 3.0, -1.0])
 _WINDOWS = 24
 
 
-def windows(session, rows=None):
+def windows(session: Any, rows: np.ndarray | None = None) -> list[tuple]:
     """Third differences (without repeated rows) cut into windows: list of (first time, last time, (n,
     19))."""
     recording = session.recording
@@ -34,7 +36,7 @@ def windows(session, rows=None):
     return [(t[a], t[min(a + size, len(t)) - 1], d[a : a + size]) for a in range(0, len(d) - size // 2, size)]
 
 
-def differenced_correlation(pole):
+def differenced_correlation(pole: float) -> float:
     """Lag-1 autocorrelation of the third differences of noise with an exponential autocorrelation
     pole^|h|."""
     c = np.convolve(_THIRD, _THIRD[::-1])
@@ -44,7 +46,7 @@ def differenced_correlation(pole):
     return one / zero
 
 
-def pole_of(correlation):
+def pole_of(correlation: float) -> float:
     """Inverse of `differenced_correlation`, nan below white."""
     white, stiff = differenced_correlation(0.0), differenced_correlation(0.995)
     if not white < correlation:
@@ -73,7 +75,7 @@ def _mean(x):
         return np.where(known, x, 0).sum(0) / known.sum(0)
 
 
-def quiet(cuts, share=0.5):
+def quiet(cuts: list[tuple], share: float = 0.5) -> list[tuple]:
     """The windows in which the third differences are smallest."""
     energy = np.array([np.nanmedian(_mean(d**2)) for _, _, d in cuts])
     return [c for c, e in zip(cuts, energy) if e <= np.quantile(energy, share)]
@@ -85,7 +87,7 @@ class LowPass(RecordedEffect):
     params = {"tau": Parameter("s", 0.002, 1.0, "electronics 3-150 ms")}
     confusable = {"latency": "a tap: delay shifts, a filter rounds", "relax": "longer holds"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         cuts = windows(session)
         if len(cuts) < 4:
             return []
@@ -156,7 +158,7 @@ class LowPass(RecordedEffect):
             note=f"correlation of neighbouring noise samples {pole:.2f}, white is 0",
         )
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         from scipy.signal import lfilter
 
         a = np.exp(-1 / (theta["tau"] * theta["rate"]))
@@ -180,7 +182,7 @@ class CrossTalk(RecordedEffect):
     }
     confusable = {"gain": "drive one electrode alone", "common_noise": "cross-talk falls off with distance"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         result = self._correlation(session)
         if result is None:
             return []
@@ -283,10 +285,10 @@ class CrossTalk(RecordedEffect):
         np.fill_diagonal(corr, 1)
         return corr, len(d) / 2.9  # C(20, 10) / C(10, 5)^2: fifth differences repeat each sample's noise
 
-    def correct(self, counts, time, channels, theta):
+    def correct(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return theta["centre"] + (counts - theta["centre"]) @ np.linalg.inv(theta["matrix"]).T
 
-    def apply(self, counts, time, channels, theta):
+    def apply(self, counts: np.ndarray, time: np.ndarray, channels: tuple, theta: dict) -> np.ndarray:
         return theta["centre"] + (counts - theta["centre"]) @ theta["matrix"].T
 
 
@@ -301,7 +303,7 @@ class CommonNoise(RecordedEffect):
     params = {"correlation": Parameter("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         result = CrossTalk._correlation(session)
         if result is None:
             return []
@@ -335,7 +337,7 @@ class Noise(RecordedEffect):
     params = {"factor": Parameter("1", 1.8, 100, "a real sensor follows the law within 20 %")}
     confusable = {"hum": "a line in the spectrum", "spikes": "single samples"}
 
-    def find(self, session):
+    def find(self, session: Any) -> list:
         from ....sensor.channels import electrode_noise
 
         cuts = windows(session)
