@@ -444,6 +444,14 @@ def test_what_cannot_vary_is_refused():
         GenerateOptions(vary={"friction": [2, 1]})
     with pytest.raises(ValueError, match="leave vary out, or choose tier='full'"):
         GenerateOptions(vary={"friction": [0, 1]}, tier="condensed")
+    for vary, match in (
+        ({"prony": [0.1, 0.5]}, "prony varies and the material has none: give its terms in material"),
+        ({"hysteresis": [0.3, 0.9]}, "hysteresis varies and the material has none"),
+        ({"youngs_modulus": [-1.0, 5e5]}, "Young's modulus -1.0 Pa .* must be positive"),
+        ({"poissons_ratio": [0.3, 0.6]}, "Poisson's ratio 0.6 is outside"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            making.Maker("", GenerateOptions(skin="coarse", labelled=0, vary=vary), {})
     options = GenerateOptions(skin="coarse", material={"prony": [[0.3, 0.1]]}, tier="condensed", labelled=0)
     with pytest.raises(
         ValueError, match="the condensed tier is elastic, the same everywhere: leave prony out"

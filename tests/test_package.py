@@ -56,6 +56,11 @@ def test_public_names_are_there(name):
     assert getattr(biotac_mj, name) is not None and name in dir(biotac_mj)
 
 
+@pytest.mark.parametrize("name", ["batch", "calibration", "data", "learning", "press", "tasks"])
+def test_packages_are_attributes(name):
+    assert getattr(biotac_mj, name).__name__ == f"biotac_mj.{name}" and name in dir(biotac_mj)
+
+
 def test_unknown_name_says_what_there_is():
     with pytest.raises(AttributeError, match="no attribute 'atach'; it has .*attach"):
         _ = biotac_mj.atach

@@ -325,3 +325,12 @@ def test_render_shows_skin_and_indenter(springs):
     green = (picture[..., 1] > 1.3 * picture[..., 0]) & (picture[..., 1] > 1.3 * picture[..., 2])
     orange = (picture[..., 0] > 1.3 * picture[..., 1]) & (picture[..., 0] > 1.5 * picture[..., 2])
     assert green.mean() > 0.05 and orange.mean() > 0.005
+
+
+@pytest.mark.parametrize("skin", [{"fill_volume": 1e-7}, {"rest_pressure": 3000.0}, {"fill_volume": -5e-8}])
+def test_a_filled_skin_is_met_where_its_filling_holds_it(skin):
+    record, _ = press(PressOptions(skin="coarse", depth=2e-4, options={"skin": skin}), progress=False)
+    force = np.linalg.norm(record.force, axis=1)
+    assert record.depth[0] < 0 and force[0] == 0  # 5 um before first touch
+    touched = record.depth > 5e-5
+    assert touched.sum() > 2 and (force[touched] > 0.01).all() and (np.diff(force[touched]) >= 0).all()

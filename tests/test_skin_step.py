@@ -289,3 +289,20 @@ def test_options_that_the_data_was_not_made_for_are_refused(name, value):
     model.options = dataclasses.replace(model.options, **{name: value})
     with pytest.raises(ValueError, match=rf"the model's {name} changed since its SkinData was made"):
         step(model, data, geoms, 1e-3)
+
+
+@pytest.mark.parametrize(
+    "options, match",
+    [
+        (
+            dict(liquid=False, fill_volume=1e-8),
+            r"fill_volume and rest_pressure are of the liquid, and this skin has",
+        ),
+        (dict(liquid=False, rest_pressure=1e3), r"turn it on \(liquid=True, --liquid\)"),
+        (dict(mass_damping=1.0), r"act on a skin in motion: add dynamics='implicit'"),
+        (dict(stiffness_damping=1e-4), r"act on a skin in motion"),
+    ],
+)
+def test_options_that_could_not_act_are_refused(options, match):
+    with pytest.raises(ValueError, match=match):
+        SkinModel(finger().geometry, "default", SkinOptions(**options))

@@ -24,7 +24,7 @@ from .plan import plan_motions
 from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
 from .store import write_shard
-from .vary import draw_worlds
+from .vary import draw_worlds, refuse_impossible
 
 __all__ = ["Maker", "make_shards"]
 
@@ -195,6 +195,7 @@ class Maker:
         chosen = {name: getattr(options, name) for name in ("element", "liquid")}
         rubber, skin, modulus = read_settings(options.material, options.options, **chosen)
         self.vary = options.vary or {}
+        refuse_impossible(self.vary, rubber)
         between = {name: self.vary[name] for name in NAMES if name in self.vary}
         skin, modulus = make_room(skin, modulus, between, len(self.geometry.elem))
         if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
@@ -223,6 +224,10 @@ class Maker:
             from .synthetic_sensor import SyntheticSensor
 
             self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
+        filled = model.options.fill_volume or model.options.rest_pressure
+        self._rest = self.geometry  # what an object meets first
+        if filled:
+            self._rest = dataclasses.replace(self.geometry, vert=model.rest.vert)
         self._count("start", clock)
 
     def run(self, todo: Iterable, workers: int) -> None:
@@ -230,8 +235,7 @@ class Maker:
         from . import readings, synthetic_sensor
 
         o = self.options
-        filled = self.model.options.fill_volume or self.model.options.rest_pressure
-        rest = self.model.rest.vert if filled else None
+        rest = None if self._rest is self.geometry else self._rest.vert
         args = (self.geometry, o.sensor, self.measured and self.measured.meter(), rest)
         with readings.readings_pool(
             self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args
@@ -261,7 +265,7 @@ class Maker:
             mine = [k for k, other in enumerate(batch.names) if other == name]
             seeds = [[o.seed, batch.members[k]] for k in mine]
             for k, motion in zip(
-                mine, plan_motions(self.geometry, name, seeds, o.steps, o.kinds, self.model.device)
+                mine, plan_motions(self._rest, name, seeds, o.steps, o.kinds, self.model.device)
             ):
                 motions[k] = motion
         running = _Running(batch, motions)

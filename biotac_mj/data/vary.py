@@ -7,7 +7,7 @@ import numpy as np
 from ..skin.per_world import NAMES
 from ..skin.rubber.material import Material
 
-__all__ = ["check_vary", "draw_worlds"]
+__all__ = ["check_vary", "draw_worlds", "refuse_impossible"]
 
 _NUMBERS = ("youngs_modulus", "poissons_ratio", "friction", "stiffening")
 _FACTORS = ("prony", "hysteresis")
@@ -28,6 +28,28 @@ def check_vary(vary: dict) -> None:
             raise ValueError(f"{name} varies over {interval!r}: pass (low, high), finite numbers")
 
 
+def refuse_impossible(vary: dict, material: Material) -> None:
+    """Refuses what this material has nothing of, and ends that no material can have (ValueError)."""
+    for name in _FACTORS:
+        if name in vary and not getattr(material, name):
+            raise ValueError(
+                f"{name} varies and the material has none: give its terms in material, "
+                "vary multiplies their g"
+            )
+    for end in (0, 1):
+        ends = {name: interval[end] for name, interval in vary.items() if name in (*_NUMBERS, *_FACTORS)}
+        _of_material(material, ends)
+
+
+def _of_material(material, drawn):
+    """The material with the numbers that were drawn."""
+    changes = {name: drawn[name] for name in _NUMBERS if name in drawn}
+    for name in _FACTORS:
+        if name in drawn:
+            changes[name] = tuple((drawn[name] * g, other) for g, other in getattr(material, name))
+    return dataclasses.replace(material, **changes)
+
+
 def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | None, dict, list]:
     """What the skins of some interactions are.
 
@@ -45,11 +67,4 @@ def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | Non
     worlds = {name: np.array([one[name] for one in drawn]) for name in vary if name in _WORLDS}
     if not set(vary) - set(worlds):
         return None, worlds, drawn
-    materials = []
-    for one in drawn:
-        changes = {name: one[name] for name in _NUMBERS if name in one}
-        for name in _FACTORS:
-            if name in one:
-                changes[name] = tuple((one[name] * g, other) for g, other in getattr(material, name))
-        materials.append(dataclasses.replace(material, **changes))
-    return materials, worlds, drawn
+    return [_of_material(material, one) for one in drawn], worlds, drawn

@@ -51,7 +51,7 @@ def press(
 
     geometry = load_skin(options.skin)
     indenter = make_indenter(options.indenter)
-    path = plan_path(geometry, indenter, options)
+    path = plan_path(_at_rest(geometry, options), indenter, options)
     spec, handle = build_scene(indenter, path, options)
     try:
         model = spec.compile()
@@ -105,6 +105,18 @@ def press(
         seconds=seconds,
     )
     return record, picture
+
+
+def _at_rest(geometry, options):
+    """The skin where its filling holds it: that is what the indenter meets first."""
+    from ..coupling.config import Config
+    from ..coupling.fem import rest_geometry
+    from ..skin.settings import plain, read_dict, read_material
+
+    liquid = read_material(options.material).liquid if options.liquid is None else options.liquid
+    chosen = read_dict(options.options, "options")
+    config = Config(material=plain(options.material), liquid=liquid, device=options.device, options=chosen)
+    return rest_geometry(config, geometry)
 
 
 def render(

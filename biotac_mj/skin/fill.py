@@ -57,7 +57,13 @@ def _inflated(model):
     model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
-        options, fill_volume=0.0, rest_pressure=0.0, dynamics="quasistatic", tolerance=_UNDERWAY
+        options,
+        fill_volume=0.0,
+        rest_pressure=0.0,
+        dynamics="quasistatic",
+        mass_damping=0.0,
+        stiffness_damping=0.0,
+        tolerance=_UNDERWAY,
     )
     # relaxed and virgin
     bare.material = dataclasses.replace(model.material, prony=(), mullins=None, hysteresis=())

@@ -122,6 +122,11 @@ class SkinOptions:
             raise ValueError(
                 f"contact_stiffness is {self.contact_stiffness}: pass a positive number of Pa/m, or None"
             )
+        if (self.mass_damping or self.stiffness_damping) and self.dynamics != "implicit":
+            raise ValueError(
+                "mass_damping and stiffness_damping act on a skin in motion: "
+                "add dynamics='implicit', or leave them out"
+            )
         if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
             raise ValueError("samples, max_newton and max_cg must be at least 1")
 
@@ -248,6 +253,11 @@ class SkinModel:
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
             )
         self.has_liquid = bool(self.has_liquid and self.inner is not None)
+        if (self.options.fill_volume or self.options.rest_pressure) and not self.has_liquid:
+            raise ValueError(
+                "fill_volume and rest_pressure are of the liquid, and this skin has none: "
+                "turn it on (liquid=True, --liquid), or leave them out"
+            )
         self.has_core = bool(self.options.core_contact and self.inner is not None and len(geometry.core_face))
         if self.has_core:
             faces = self._core_faces() if core_faces is None else geometry.inner_face[core_faces]
