@@ -20,7 +20,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["Handle", "attach"]
 
-CHANNELS = {**WIDTHS, "contact_force": 6, "status": 5}  # width of each in sensor data
+CHANNELS = {**WIDTHS, "contact_force": 6, "status": 8}  # width of each in sensor data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +166,7 @@ def attach(
         parent = spec.worldbody if body is None else spec.body(body)
         spec.attach(child, frame=parent.add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
+    _collide(spec, core, config)
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
         _add_slots(spec, core, prefix, slots)
@@ -228,6 +229,23 @@ def _model(geometry):
     skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
     return spec
+
+
+def _collide(spec, core, config):
+    """Core, nail and clamp meet what the skin meets: the geoms that are named, or all that collide."""
+    for solid in core.geoms:
+        solid.friction[0], solid.priority = config.friction, config.priority
+        if config.geoms is None:
+            continue
+        solid.contype = solid.conaffinity = 0
+        for name in config.geoms:
+            spec.add_pair(
+                geomname1=solid.name,
+                geomname2=name,
+                condim=3,
+                solref=solid.solref,
+                friction=[max(config.friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
+            )
 
 
 def _activate(spec, body, name, config):

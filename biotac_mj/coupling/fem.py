@@ -179,6 +179,16 @@ class FemStepper:
             and self._search.clear(geom_pos, geom_mat, _CLEAR)
         )
 
+    def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
+        """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone."""
+        return self._model.device.is_cuda or self._search.clear(geom_pos, geom_mat, self._reach)
+
+    @property
+    def surface_energy(self) -> float:
+        """The most [J] that adhesion gives to bodies that come near: its energy over the whole skin."""
+        law, area = self._options.contact_law, self._model.outer.area
+        return 0.0 if law is None else law.adhesion * law.adhesion_hysteresis * float(area.numpy().sum())
+
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
         last, new = self._part(state, "geom_pos"), np.ravel(geom_pos)

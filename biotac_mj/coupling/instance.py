@@ -11,7 +11,9 @@ import threading
 
 import mujoco
 import numpy as np
+from scipy.spatial import KDTree
 
+from ..geometry.rigid import displace, displacement
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
@@ -21,10 +23,15 @@ from .touching import Touching
 
 __all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
 
-# head of the plugin state: steps that did not converge, then how the last committed step went
+# head of the plugin state: steps that did not converge, whether the last committed step did, whether a step
+# was made since the reset, and the energy that is in the skin at most [J]
 _HEAD = 4
-_MODEL = 6 + 36 + 3 + 9  # of a touching body: wrench, tangent, and the pose they belong to
-_FAILED, _CONVERGED = 0, 1  # in the head; iterations and residual follow
+_FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
+# of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
+_MODEL = 6 + 36 + 3 + 9 + 3 + 9
+_ALONE = 1, True, 0.0, 0.0, None  # how a step went in which bodies and skin do not meet: see `concluded`
+_BISECTIONS = 6
+LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 
 
 class _Skin:
@@ -37,6 +44,12 @@ class _Skin:
         self.readings = make_readings(config, self.geometry)
         self.lock = threading.Lock()
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
+
+    @functools.cached_property
+    def thickness(self):
+        geometry = self.geometry
+        free = np.setdiff1d(geometry.outer_face, geometry.fixed)
+        return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
 
     @functools.cached_property
     def untouched(self):
@@ -98,13 +111,19 @@ class Setup:
         self.touching = Touching(model, self.core, self.config, compiling)
         self.skin = _skin(self.config, self.touching)
         self.ngroup = len(self.touching.body)
+        self.surface_energy = getattr(self.skin.stepper, "surface_energy", 0.0)
+
+    @property
+    def thickness(self) -> float:
+        """From the skin's outside to the core at most [m]."""
+        return self.skin.thickness
 
     @property
     def nstate(self) -> int:
         return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
 
     def parts(self, state: np.ndarray) -> tuple:
-        """Head, linear models of the last step (ngroup, 54), the skin's and the readings' parts of a plugin
+        """Head, linear models of the last step (ngroup, 66), the skin's and the readings' parts of a plugin
         state, as views."""
         a = _HEAD + _MODEL * self.ngroup
         b = a + self.skin.stepper.nstate
@@ -114,7 +133,7 @@ class Setup:
     def reset(self, state: np.ndarray) -> None:
         head, models, skin, readings = self.parts(state)
         head[:], models[:] = 0.0, 0.0
-        models[:, [45, 49, 53]] = 1.0  # a rotation, though nothing touches
+        models[:, [45, 49, 53, 57, 61, 65]] = 1.0  # rotations, though nothing touches
         head[_CONVERGED] = 1.0
         with self.skin.lock:
             self.skin.stepper.reset(skin)
@@ -178,7 +197,7 @@ class Instance:
         self._state = slice(start, start + size)
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved = {}
-        self._error = False
+        self._error, self._outcome = False, _ALONE
         self._shown = None
 
     @property
@@ -198,7 +217,7 @@ class Instance:
 
     def forget_last_solve(self) -> None:
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
-        self._error, self._result, self._reading = False, None, None
+        self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
@@ -213,8 +232,42 @@ class Instance:
             models[:, :6],
             models[:, 6:42].reshape(-1, 6, 6),
             models[:, 42:45],
-            models[:, 45:].reshape(-1, 3, 3),
+            models[:, 45:54].reshape(-1, 3, 3),
         )
+
+    def last_energy(self) -> tuple:
+        """Energy [J] that the last step left in the skin at most, and the poses (ngroup, 3), (ngroup, 3, 3) at
+        which it left the bodies; None instead of these before the first step."""
+        head, models, *_ = self.setup.parts(self.state)
+        ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[_STARTED] else None
+        return float(head[_ENERGY]), ends
+
+    def most_energy(self, wrench: np.ndarray) -> float:
+        """The most [J] that a skin which pushes with wrenches (ngroup, 6) can hold: its force over the whole
+        way to the core."""
+        if self.inertial or not wrench.any():
+            return np.inf if self.inertial else self.setup.surface_energy
+        force = np.linalg.norm(wrench[:, :3], axis=1) + np.linalg.norm(wrench[:, 3:], axis=1) / LEVER
+        return float(force.sum()) * self.setup.thickness + self.setup.surface_energy
+
+    def clear_share(self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
+        """Share of the way from one pose of the bodies to another, about as far as nothing touches the skin
+        at rest; 1 where that is not known."""
+        skin = self.setup.skin
+        if not hasattr(skin.stepper, "is_clear"):
+            return 1.0
+        way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
+        with skin.lock:
+            if skin.stepper.is_clear(*self.touching.geom_pose(pos, mat)):
+                return 1.0
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (low + high)
+                pose = displace(pos0, mat0, middle * way)
+                if skin.stepper.is_clear(*self.touching.geom_pose(*pose)):
+                    low = middle
+                else:
+                    high = middle
+        return low
 
     @property
     def inertial(self) -> bool:
@@ -257,18 +310,46 @@ class Instance:
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core)
-            if not result.converged:  # go on with what was last known to be good
-                wrench, _, pos, mat = self.last_model()
-                tangent = np.zeros((self.setup.ngroup, 6, 6))
-                result = dataclasses.replace(
-                    result, state=before.copy(), wrench=wrench.copy(), tangent=tangent
-                )
-                result.vert_xpos = skin.stepper.vert_xpos(result.state)
+            result = dataclasses.replace(result, pose=(pos, mat))
+            if not result.converged:
+                result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:
                 self._solved.clear()
             self._solved[key] = result
-        self._result, self._reading = result, None
+        self.keep(result)
         return result
+
+    def keep(self, result: SkinResult) -> None:
+        """Makes an earlier result of this step the one that counts."""
+        self._result, self._reading, self._pose = result, None, result.pose
+
+    def _as_far_as_known(self, result, before):
+        """Of a solve that found no balance: where the way to it ended, or the last step's model."""
+        wrench, tangent, *last = self.last_model()
+        if 0.0 < result.reached < 1.0:
+            way = displacement(*result.pose, *last)
+            return dataclasses.replace(result, pose=displace(*last, result.reached * way))
+        state = before.copy()
+        return dataclasses.replace(
+            result,
+            state=state,
+            wrench=wrench.copy(),
+            tangent=tangent.copy(),
+            pose=tuple(p.copy() for p in last),
+            vert_xpos=self.setup.skin.stepper.vert_xpos(state),
+        )
+
+    def concluded(self, rounds: int, settled: bool, withheld: float, energy: float, ends: tuple) -> None:
+        """Keeps for `commit_step` how the coupled step went.
+
+        Args:
+          rounds: through MuJoCo's solver and the skin.
+          settled: whether the skin was solved where the bodies go.
+          withheld: share of the skin's push that it could not pay for.
+          energy: left in the skin at most [J].
+          ends: poses (ngroup, 3), (ngroup, 3, 3) where the step leaves the bodies.
+        """
+        self._outcome = rounds, settled, withheld, energy, ends
 
     def _key(self):
         """Bytes of all in the plugin state that a solve depends on."""
@@ -299,14 +380,18 @@ class Instance:
         if "contact_force" in self.sensor:
             out[self.sensor["contact_force"]] = -result.wrench.sum(axis=0)
         if "status" in self.sensor:
-            failed = self.state[_FAILED] + (not result.converged)
+            rounds, settled, withheld, *_ = self._outcome
+            good = result.converged and settled
             tier = self._tier if result.measured else -self._tier
             out[self.sensor["status"]] = (
-                float(result.converged),
-                failed,
+                float(good),
+                self.state[_FAILED] + (not good),
                 result.iterations,
                 result.residual,
                 tier,
+                rounds,
+                result.reached,
+                withheld,
             )
 
     def failed(self) -> None:
@@ -316,7 +401,16 @@ class Instance:
 
     def _flag(self):
         if "status" in self.sensor:
-            self.data.sensordata[self.sensor["status"]] = (-1.0, self.state[_FAILED], 0.0, np.nan, self._tier)
+            self.data.sensordata[self.sensor["status"]] = (
+                -1.0,
+                self.state[_FAILED],
+                0.0,
+                np.nan,
+                self._tier,
+                0.0,
+                0.0,
+                0.0,
+            )
 
     def commit_step(self) -> None:
         """Commits the solved step."""
@@ -325,10 +419,13 @@ class Instance:
             return
         readings, _ = self._counts()
         head, models, skin, readings_state = self.setup.parts(self.state)
-        head[:] = head[_FAILED] + (not result.converged), result.converged, result.iterations, result.residual
-        n = self.setup.ngroup
+        _, settled, _, energy, ends = self._outcome
+        good = result.converged and settled
+        head[:] = head[_FAILED] + (not good), good, 1.0, energy
+        n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
-        models[:, 42:45], models[:, 45:] = self._pose[0], self._pose[1].reshape(n, 9)
+        models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)
+        models[:, 54:57], models[:, 57:] = ends[0], ends[1].reshape(n, 9)
         if result.state is None:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:

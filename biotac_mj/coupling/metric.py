@@ -21,12 +21,7 @@ __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-_SILENT = (
-    0.0,
-    0.0,
-    1.0,
-    0.0,
-)  # of a row: stiffness, damping, impedance, its derivative: reference acceleration 0
+_PLAIN = 1.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its derivative
 
 
 class Metric:
@@ -83,8 +78,11 @@ class Metric:
         islands = data.map_efc2iefc if data.nisland else None
         for root, here in self._places.items():
             self._rows[root] = here, None if islands is None else islands[here]
-        data.efc_pos[self._all] = 0.0
-        data.efc_KBIP[self._all] = _SILENT
+        # MuJoCo adds dJ/dt v of the weld that a row was to the reference acceleration: taken off by the position
+        data.efc_KBIP[self._all] = _PLAIN
+        data.efc_pos[self._all] = data.efc_margin[self._all]
+        data.reference_constraints()
+        data.efc_pos[self._all] += data.efc_aref[self._all]
         self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
         if islands is not None:
             self._island_weight, self._island_regular = data.iefc_D, data.iefc_R

@@ -62,6 +62,9 @@ class SkinResult:
       vert_xpos: (nvert, 3) deformed nodes [m].
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
+      reached: share of the touching bodies' motion in this step at which all this holds: 1 where it
+        converged.
+      pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
@@ -74,6 +77,8 @@ class SkinResult:
     iterations: int = 0
     residual: float = 0.0
     measured: bool = True
+    reached: float = 1.0
+    pose: tuple | None = None
 
 
 class SkinStepper(Protocol):

@@ -213,6 +213,10 @@ class DataView(_View):
         regularisation."""
         LIBRARY.mj_projectConstraint(self.model.address, self.address)
 
+    def reference_constraints(self) -> None:
+        """Makes the rows' reference accelerations of what defines them now."""
+        LIBRARY.mj_referenceConstraint(self.model.address, self.address)
+
     def acceleration(self) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.

@@ -5,27 +5,32 @@ accelerations a with which MuJoCo's integrator moves the bodies under it (`integ
 x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which
 says where the bodies go, and solves the skins there, which gives new linear models. The models of the last
 step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a
-light object that meets the skin within the step, two or three."""
+light object that meets the skin within the step, two or three.
+
+Where rounds do not come closer, they go part of the way (`_Rounds`); where they never arrive, the models that
+came closest act; and whatever acts, no skin gives back more energy than was put into it (`_restrain`)."""
 
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import displace, displacement, rotation
-from .instance import Instance
+from .coupled import Coupled
+from .instance import LEVER, Instance
 from .integrator import FixedPoint, Integrator
 from .structs import DataView, ModelView
 
 __all__ = ["World"]
 
-MAX_ROUNDS = 4
-# [m] change of the predicted pose, rotations over a lever of _LEVER, below which the skin is not solved again
+MAX_ROUNDS = 16
+# [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
 TOLERANCE = 2e-6
 MAX_CORRECTIONS = 12
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
-_LEVER = 0.01  # [m] about the size of a fingertip
-_SCALE = np.array([1.0, 1.0, 1.0, *[1 / _LEVER] * 3])  # compares torques with forces
+_SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
+_CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
+_LEAST_STEP = 0.125
+_TRIALS = 4  # to find how much of a skin's push it can pay for
 
 
 class World:
@@ -64,7 +69,7 @@ class World:
 
     def _step(self):
         outside = self.data.qfrc_passive.copy()
-        skins = [_Coupled(t, self.data) for t in self.coupled]
+        skins = [Coupled(t, self.data) for t in self.coupled]
         try:
             self._newton(skins, outside)
         except BaseException:
@@ -74,7 +79,6 @@ class World:
             raise
 
     def _newton(self, skins, outside):
-        moving = skins[0].horizon > 0 and self.model.nv > 0
         self._damped = None
         for skin in skins:
             if skin.idle:
@@ -82,17 +86,68 @@ class World:
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
-        for _ in range(MAX_ROUNDS):
-            acceleration = self._accelerations(skins, outside) if moving else np.zeros(self.model.nv)
-            solved = [skin.follow(acceleration) for skin in skins]
-            if not any(solved):
-                return
-            if not moving:
-                break
-        if moving and self._damped:
-            self._accelerations(skins, outside)
+        if skins[0].horizon > 0 and self.model.nv > 0:
+            acceleration, rounds = self._find_balance(skins, outside)
+            self._restrain(skins, outside, acceleration)
         else:
+            rounds = 1
+            for skin in skins:
+                skin.aim(np.zeros(self.model.nv))
+                skin.go()
             self._forces(skins, outside)
+        for skin in skins:
+            skin.conclude(rounds)
+
+    def _find_balance(self, skins, outside):
+        """Accelerations under models of the skins that hold where these lead, and how many rounds that took.
+
+        Their forces are left in place. Where rounds go to and fro (friction that sticks in one and slips in
+        the other, a skin that begins to touch), shorter steps settle them.
+        """
+        share, last, best = 1.0, np.inf, None
+        for rounds in range(MAX_ROUNDS + 1):
+            acceleration = self._accelerations(skins, outside)
+            off = max([skin.aim(acceleration) for skin in skins])
+            if off < TOLERANCE:
+                return acceleration, rounds
+            if best is None or not off >= best[0]:
+                best = off, [skin.model() for skin in skins]
+            if rounds == MAX_ROUNDS:
+                break
+            share = max(0.5 * share, _LEAST_STEP) if off > _CLOSER * last else min(1.0, 2 * share)
+            last = off
+            for skin in skins:
+                if skin.off >= TOLERANCE:
+                    skin.go(share)
+        for skin, model in zip(skins, best[1]):
+            skin.use(*model)
+        acceleration = self._accelerations(skins, outside)
+        for skin in skins:
+            skin.aim(acceleration)
+            skin.settled = skin.off < TOLERANCE
+        return acceleration, rounds
+
+    def _restrain(self, skins, outside, acceleration):
+        """Withholds so much of a skin's push that it does not give more energy than it has.
+
+        An accepted step may be wrong (friction's tangent is not exact, a solve may have gone part of the way),
+        and nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
+        about the present pose: a damper.
+        """
+        for skin in [s for s in skins if s.overdraws()]:
+            low, high = 0.0, 1.0  # of the push: affordable, and not
+            for trial in range(_TRIALS):
+                skin.push = 0.0 if trial == _TRIALS - 1 else 0.5 * (low + high)
+                for s in skins:
+                    s.aim(self._accelerations(skins, outside))
+                if skin.overdraws():
+                    high = skin.push
+                else:
+                    low = skin.push
+            skin.push = low
+            acceleration = self._accelerations(skins, outside)
+            for s in skins:
+                s.aim(acceleration)
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
@@ -139,67 +194,3 @@ class World:
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
-
-
-class _Coupled:
-    """A two-way skin during one step: its linear model wrench0 - tangent (pose - pose0)."""
-
-    def __init__(self, instance, data):
-        self.instance, self.data, self.horizon = instance, data, instance.horizon
-        instance.metric.find_rows(data)
-        self.pose = instance.touching.predict(data, self.horizon)
-        # the skin rests, and what comes is too far for this step's accelerations to matter
-        self.idle = instance.is_out_of_reach(*self.pose)
-        self.core, self.jacobian = (), None
-        if self.idle:
-            return
-        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
-        self.jacobian = instance.metric.jacobians(data)
-        if instance.inertial:
-            self.core = instance.touching.core_motion(data, self.horizon)
-            self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.correction = np.zeros((len(self.wrench0), 6))
-        self.solved = self.written = False
-        self.converged = True
-
-    def leave_at_rest(self):
-        """Leaves a skin that nothing reaches as it is, and takes its rows away."""
-        self.instance.stay_at_rest(*self.pose)
-        self.let_go()
-
-    def follow(self, acceleration):
-        """Solves the skin where its bodies go, unless it has been solved there; returns whether it did."""
-        motion = self.horizon**2 * (self.jacobian @ acceleration)
-        pose = displace(*self.pose, motion)
-        if self.solved and (not self.converged or self._distance(pose) < TOLERANCE):
-            return False
-        result = self.instance.solve_for_pose(*pose, self._core_motion(acceleration))
-        self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, pose
-        self.solved, self.converged, self.written = True, result.converged, False
-        if not self.tangent.any():
-            self.correction = np.zeros_like(self.wrench0)
-        return True
-
-    def _core_motion(self, acceleration):
-        if not self.core:
-            return ()
-        (start, end), (turned, turning) = self.core
-        move = self.horizon**2 * (self.core_jacobian @ acceleration)
-        return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
-
-    def _distance(self, pose):
-        motion = displacement(*pose, *self.pose0)
-        return max(np.abs(motion[:, :3]).max(initial=0.0), _LEVER * np.abs(motion[:, 3:]).max(initial=0.0))
-
-    def apply(self):
-        metric = self.instance.metric
-        if not self.written:
-            metric.write(self.jacobian, self.tangent, self.horizon)
-            self.written = True
-        if self.wrench0.any() or self.tangent.any():
-            motion = displacement(*self.pose, *self.pose0)
-            wrench = self.correction + self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
-            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
-
-    def let_go(self):
-        self.instance.metric.release()

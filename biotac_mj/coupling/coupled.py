@@ -1,0 +1,172 @@
+"""A skin in two-way coupling during one step: its linear model, where its bodies go under it, and the energy
+that it can give."""
+
+import numpy as np
+
+from ..geometry.rigid import displace, displacement, rotation
+from .instance import LEVER, Instance
+from .structs import DataView
+
+__all__ = ["Coupled"]
+
+# [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
+# that lacks its force leads through the core
+_DEEPER = 5e-4
+_TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
+
+
+class Coupled:
+    """An `Instance` during a step. Its model is wrench0 - tangent (pose - pose0).
+
+    Attributes:
+      idle: the skin rests, and what comes is too far for this step's accelerations to matter.
+      off: [m] how far the bodies go from where the skin was last solved.
+      push: share of the wrench at the present pose that acts, see `World._restrain`.
+    """
+
+    def __init__(self, instance: Instance, data: DataView):
+        self.instance, self.data, self.horizon = instance, data, instance.horizon
+        instance.metric.find_rows(data)
+        self.pose = instance.touching.predict(data, self.horizon)
+        self.idle = instance.is_out_of_reach(*self.pose)
+        self.core, self.jacobian = (), None
+        if self.idle:
+            return
+        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
+        self.sound = self.pose0 if self.wrench0.any() else None  # a pose at which the skin's answer is known
+        self.jacobian = instance.metric.jacobians(data)
+        if instance.inertial:
+            self.core = instance.touching.core_motion(data, self.horizon)
+            self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
+        self.correction = np.zeros((len(self.wrench0), 6))
+        self.asked = self.result = None
+        self.written, self.settled = False, True
+        self.push, self.off = 1.0, np.inf
+        self.here = instance.touching.predict(data, 0.0)
+
+    def leave_at_rest(self) -> None:
+        """Leaves a skin that nothing reaches as it is, and takes its rows away."""
+        self.instance.stay_at_rest(*self.pose)
+        self.let_go()
+
+    # --- Newton's method on the pose at the end of the step ---
+
+    def aim(self, acceleration: np.ndarray) -> float:
+        """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skin was
+        solved [m]."""
+        self.acceleration = acceleration
+        self.moved = self.horizon**2 * (self.jacobian @ acceleration)
+        self.target = displace(*self.pose, self.moved)
+        self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
+        return self.off
+
+    def go(self, share: float = 1.0) -> None:
+        """Solves the skin where its bodies go, or a share of the way from where it was solved."""
+        pose = self.target
+        if share < 1.0 and self.asked is not None:
+            pose = displace(*self.asked, share * displacement(*pose, *self.asked))
+        pose = self._within_reach(pose)
+        result = self.instance.solve_for_pose(*pose, self._core_motion())
+        self.use(pose, result)
+
+    def model(self) -> tuple:
+        """What `use` takes to come back to the present model."""
+        return self.asked, self.result
+
+    def use(self, asked: tuple, result) -> None:
+        """Takes the model of a solve at `asked`."""
+        if asked is None:
+            return
+        self.asked, self.result = asked, result
+        self.instance.keep(result)
+        self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
+        self.sound, self.written = (result.pose if result.wrench.any() else None), False
+        if not self.tangent.any():
+            self.correction = np.zeros_like(self.wrench0)
+
+    def _within_reach(self, pose):
+        """The pose, or the part of the way to it that is no more than `_DEEPER` into the skin than is
+        known."""
+        start, room = self.sound, _DEEPER
+        if start is None:
+            start = self.here if self.asked is None else self.asked
+            clear = self.instance.clear_share(*start, *pose)
+            way = displacement(*pose, *start)
+            depth = (1.0 - clear) * _size(way)
+            return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
+        way = displacement(*pose, *start)
+        force = (
+            np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
+        )
+        depth = (-(self.wrench0 * way).sum(axis=1)[force > 0] / force[force > 0]).max(initial=0.0)
+        return pose if depth <= room else displace(*start, room / depth * way)
+
+    def _core_motion(self):
+        if not self.core:
+            return ()
+        (start, end), (turned, turning) = self.core
+        move = self.horizon**2 * (self.core_jacobian @ self.acceleration)
+        return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
+
+    # --- in MuJoCo's dynamics ---
+
+    def apply(self) -> None:
+        """Puts the model into MuJoCo's passive forces and rows."""
+        metric = self.instance.metric
+        if not self.written:
+            metric.write(self.jacobian, self.tangent, self.horizon)
+            self.written = True
+        if self.wrench0.any() or self.tangent.any():
+            wrench = self.correction + self._push()
+            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+
+    def _push(self):
+        """Wrenches where the bodies come without acceleration."""
+        wrench = self._model(self.pose)
+        return wrench if self.push == 1.0 else wrench - (1.0 - self.push) * self._model(self.here)
+
+    def _acting(self):
+        """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
+        return self._push() - (self.tangent @ self.moved[:, :, None])[:, :, 0]
+
+    def _model(self, pose):
+        motion = displacement(*pose, *self.pose0)
+        return self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
+
+    def let_go(self) -> None:
+        """Takes the rows' stiffness away."""
+        self.instance.metric.release()
+
+    # --- the energy that the skin can give ---
+
+    def overdraws(self) -> bool:
+        """Whether what acts on the bodies on their way gives them more energy than the skin has."""
+        return self._given() > max(self._store(), 0.0)
+
+    def _given(self):
+        motion = self.horizon * (self.jacobian @ self.data.qvel) + self.moved
+        return float((self._acting() * motion).sum())
+
+    def _store(self):
+        """What has been put into the skin so far, also by those who move bodies from outside [J]."""
+        store, ends = self.instance.last_energy()
+        wrench = self._acting()
+        most = self.instance.most_energy(wrench)
+        if ends is None:
+            return most
+        jump = displacement(*self.here, *ends)
+        if _size(jump) > _TELEPORT:
+            return most
+        last = self.instance.last_model()[0]
+        return min(store - min((w * jump).sum() for w in (wrench, last)), most)
+
+    def conclude(self, rounds: int) -> None:
+        """Tells the instance how the step went."""
+        store = self._store() - self._given()
+        store = min(store, self.instance.most_energy(self._acting()))
+        self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
+
+
+def _size(motion):
+    """Of motions (n, 6) [m]."""
+    return max(np.abs(motion[:, :3]).max(initial=0.0), LEVER * np.abs(motion[:, 3:]).max(initial=0.0))
