@@ -9,6 +9,7 @@ from blocks import shell, skin
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.newton.worlds import INSIDE_CORE
 from biotac_mj.skin.step import SkinStep
 
 PATH = np.linspace(0, 1.2e-3, 5)
@@ -203,15 +204,69 @@ def test_after_a_failed_step_smaller_ones_go_on():
 # --- bad input  ---
 
 
-def test_a_geom_deep_inside_the_core(model):
+DEEP = [[0, 0, 8e-3], [1.0, 0, 0]]  # the sphere is 2.5 mm inside the core
+
+
+@pytest.mark.parametrize("began", [True, False])
+def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
+    """From above the skin, or found there: then it comes from where it clears the skin. What it reached is a
+    balance of its own, from which the press goes back to where it would have been."""
     data, touching = SkinData(model), geoms()
-    touching.set_pose([[0, 0, 8e-3], [1.0, 0, 0]])
-    text = (
-        r"geom 0 of world 0 \(sphere\) is 2.\d\d mm inside the rigid core: no skin fits between them; "
-        r"move it out, press less deep"
-    )
-    with pytest.raises(ValueError, match=text):
+    if began:
+        touching.set_pose(pose(0))
         step(model, data, touching)
+    for _ in range(2):
+        touching.set_pose(DEEP)
+        step(model, data, touching)
+        assert not data.converged[0] and 0 <= data.reached[0] < 1
+    assert data.nonconverged[0] == 2 and data.worlds.reason.numpy()[0] == INSIDE_CORE
+    where = touching.struct.pos_last.numpy()[0, 0]
+    assert 9e-3 < where[2] < 12e-3 and (touching.struct.pos.numpy()[0, 0] == DEEP[0]).all()
+    pressed, tangent = data.wrench[0, 0], data.tangent(touching)[0, 0]
+    assert pressed[2] > 1 and np.trace(tangent[:3, :3]) > 1e3
+    touching.set_pose([where, DEEP[1]])
+    step(model, data, touching)
+    assert data.converged[0]
+    np.testing.assert_allclose(data.wrench[0, 0], pressed, rtol=0, atol=3e-3 * abs(pressed).max())
+    touching.set_pose(pose(1e-3))
+    step(model, data, touching)
+    assert data.converged[0] and data.reached[0] == 1
+    expected, _ = press(model, [0], [0, 1e-3])
+    np.testing.assert_allclose(data.wrench[0, 0, 2], expected.wrench[0, 0, 2], rtol=0.05)
+
+
+def test_a_step_in_parts_is_the_step(model, monkeypatch):
+    """Where the whole way fails twice, its parts lead to the same balance; a turned geom turns on the way."""
+    newton, failing = SkinStep._newton, []
+
+    def stubborn(self):
+        newton(self)
+        self._launcher.call(lambda: self.st.failed.fill_(1) if failing and failing.pop() else None)
+
+    monkeypatch.setattr(SkinStep, "_newton", stubborn)
+    exact = finger(tolerance=1e-8, max_newton=200)
+    turn = np.tile(np.eye(3), (2, 1, 1))
+    turn[1] = [[np.cos(0.3), 0, -np.sin(0.3)], [0, 1, 0], [np.sin(0.3), 0, np.cos(0.3)]]
+    found = []
+    for script in ([], [0, 0, 1, 1], [0, 0, 1, 0, 0, 1, 1, 1]):  # taken from the end
+        data, touching = press(exact, [0], [0.6e-3])
+        failing[:] = script
+        touching.set_pose(pose(1.2e-3), turn)
+        step(exact, data, touching)
+        assert data.converged[0] and data.reached[0] == 1 and not failing
+        found.append((data.vert_xpos, data.wrench, touching.struct.mat_last.numpy()))
+    for other in found[1:]:
+        np.testing.assert_allclose(other[0], found[0][0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(other[1], found[0][1], rtol=0, atol=1e-5 * abs(found[0][1]).max())
+        assert (other[2] == found[0][2]).all()
+    halfway, touching = press(exact, [0], [0.6e-3])
+    failing[:] = [1] * 20 + [0, 1, 1]
+    touching.set_pose(pose(1.2e-3), turn)
+    step(exact, halfway, touching)
+    assert halfway.reached[0] == 0.5 and not halfway.converged[0]
+    cos, sin = np.cos(0.15), np.sin(0.15)
+    half = touching.struct.mat_last.numpy()[1, 0]
+    np.testing.assert_allclose(half, [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]], atol=1e-12)
 
 
 def test_numbers_of_worlds(model):

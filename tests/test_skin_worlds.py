@@ -118,15 +118,15 @@ def test_more_worlds_than_are_solved_finely(model):
 
 
 def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
-    """NaN pose, NaN modulus, a geom inside the core: last good state, a reason each, and bit for bit the same
-    in the sound worlds."""
+    """NaN pose, NaN modulus: last good state. A geom inside the core: as far as it comes. A reason each, and
+    bit for bit the same in the sound worlds."""
     worlds = random_worlds(5, seed=7)
     data, geoms = walk(model, worlds, "dense", DEPTHS[:2])
     sound, others = walk(model, worlds, "dense", DEPTHS[:2])
     good = data.vert_xpos, data.wrench
     bad = poses(worlds, DEPTHS[2])
     others.set_pose(bad)
-    bad[2, 0, 2] = 8e-3
+    start, bad[2, 0, 2] = poses(worlds, DEPTHS[1])[2, 0], 8e-3
     geoms.set_pose(bad)
     at = geoms.struct.pos.numpy().copy()
     at[0, 0, 0] = np.nan
@@ -146,16 +146,21 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     assert (data.vert_xpos[[1, 3]] == sound.vert_xpos[[1, 3]]).all() and (
         data.wrench[[1, 3]] == sound.wrench[[1, 3]]
     ).all()
-    assert (data.vert_xpos[[0, 2, 4]] == good[0][[0, 2, 4]]).all()
-    np.testing.assert_allclose(data.wrench[[0, 2]], good[1][[0, 2]], rtol=0, atol=1e-6 * abs(good[1]).max())
-    # what was wrong is mended: the worlds go on to where the sound ones are
+    assert (data.vert_xpos[[0, 4]] == good[0][[0, 4]]).all()
+    np.testing.assert_allclose(data.wrench[0], good[1][0], rtol=0, atol=1e-6 * abs(good[1]).max())
+    reached = data.reached
+    assert reached[[0, 1, 3, 4]].tolist() == [0, 1, 1, 0] and 0.05 < reached[2] < 0.9
+    at = geoms.struct.pos_last.numpy()[0, 2]
+    np.testing.assert_allclose(at, start + reached[2] * (bad[2, 0] - start), rtol=0, atol=1e-12)
+    assert np.linalg.norm(data.wrench[2, 0, :3]) > 3 * np.linalg.norm(good[1][2, 0, :3])
+    # what was wrong is mended: the worlds go on to where the sound ones are, but for friction where one was
+    # pressed deep
     data.mu.assign(stiff)
     geoms.set_pose(poses(worlds, DEPTHS[2]))
     step(model, data, geoms)
     assert data.converged.all() and data.nonconverged.tolist() == [1, 0, 1, 0, 1]
-    np.testing.assert_allclose(
-        data.wrench[..., :3], sound.wrench[..., :3], rtol=0, atol=5e-3 * abs(sound.wrench[..., :3]).max()
-    )
+    force, expected = (d.wrench[[0, 1, 3, 4]][..., :3] for d in (data, sound))
+    np.testing.assert_allclose(force, expected, rtol=0, atol=5e-3 * abs(expected).max())
 
 
 def test_a_step_that_does_not_converge():
@@ -442,12 +447,13 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     st = SkinData(finger()).worlds
     st.active.fill_(1)
     st.touched.fill_(1)
+    st.limit.fill_(30)
     part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
     part[0], worth[0], worth[1] = rz, 1e-4, 1.0  # residual squared [N^2], work of the load [J]
     arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
     go_on = wp.zeros(1, dtype=int, device="cpu")
     wp.launch_tiled(
-        judge_balance, dim=[1], inputs=[1e-4, 30, 0, *arrays, st], outputs=[go_on], block_dim=1, device="cpu"
+        judge_balance, dim=[1], inputs=[1e-4, 0, *arrays, st], outputs=[go_on], block_dim=1, device="cpu"
     )
     assert bool(st.active.numpy()[0]) is not balanced and bool(go_on.numpy()[0]) is not balanced
     assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)

@@ -98,8 +98,8 @@ class BatchSkin:
         """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA
         graph.
 
-        A world whose poses are not finite, with a geom deep inside the core, or without a balance keeps its
-        last good state."""
+        A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
+        not finite stays as it was."""
         m, d = self.model, self.data
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]

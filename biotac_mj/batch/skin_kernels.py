@@ -128,6 +128,7 @@ def reset_worlds(
         st.last_pressure[w] = pressure
         st.pressure[w] = pressure
         st.reason[w] = 0
+        st.reached[w] = real(1.0)
         st.nonconverged[w] = 0
         st.iterations[w] = 0
         st.error[w] = real(0.0)

@@ -121,7 +121,7 @@ class FemStepper:
         """See `SkinStepper`.
 
         Raises:
-          ValueError: NaN in a pose, a geom deep inside the core, or more contact than the state can hold.
+          ValueError: NaN in a pose, or more contact than the state can hold.
         """
         if self._untouched(state, geom_pos, geom_mat):
             return self._still(state, geom_pos, geom_mat)
@@ -142,7 +142,7 @@ class FemStepper:
         else:
             step(self._model, d, geoms, dt)
         new = np.zeros_like(state)
-        self._pack(new, geom_pos, geom_mat)
+        self._pack(new)
         if d.converged[0] and self._came_to_rest(new):
             return self._still(state, geom_pos, geom_mat)
         return SkinResult(
@@ -156,6 +156,7 @@ class FemStepper:
             converged=bool(d.converged[0]),
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
+            reached=float(d.reached[0]),
         )
 
     # --- a skin at rest  ---
@@ -203,10 +204,9 @@ class FemStepper:
             or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all())
         ):
             return False
-        if not self._search.clear(geom_pos, geom_mat, self._reach):
-            return False
-        self._search.refuse_core(geom_pos, geom_mat)
-        return True
+        return self._search.clear(geom_pos, geom_mat, self._reach) and not self._search.deep(
+            geom_pos, geom_mat
+        )
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:
@@ -249,8 +249,8 @@ class FemStepper:
         )
         geoms.advance()
 
-    def _pack(self, state, geom_pos, geom_mat):
-        d = self._data
+    def _pack(self, state):
+        d, geoms = self._data, self._geom_set.struct
         contacts = d.contacts()
         if len(contacts) > _MAX_CONTACTS:
             raise ValueError(
@@ -260,8 +260,8 @@ class FemStepper:
         self._part(state, "started")[:] = 1
         self._part(state, "x")[:] = d.vert_xpos[0].ravel()
         self._part(state, "increment")[:] = d.increment.numpy()[:, 0].ravel()
-        self._part(state, "geom_pos")[:] = np.ravel(geom_pos)
-        self._part(state, "geom_mat")[:] = np.ravel(geom_mat)
+        self._part(state, "geom_pos")[:] = geoms.pos_last.numpy().ravel()  # where they came to
+        self._part(state, "geom_mat")[:] = geoms.mat_last.numpy().ravel()
         self._part(state, "motion")[:] = d.motion[0].ravel()
         self._part(state, "pressure")[:] = d.liquid.last_pressure[0] if d.liquid else 0.0
         buffer = self._part(state, "contacts")

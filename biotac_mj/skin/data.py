@@ -85,6 +85,8 @@ class SkinData:
       pressure: (nworld,) of the liquid above its rest value, which is `model.rest.pressure` [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
+      reached: (nworld,) share of the geoms' way in the last step at which positions, wrench, pressure and
+        tangent hold: 1 where it converged.
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
@@ -226,6 +228,7 @@ class SkinData:
             self.memory.forget(self.x)
         for name in ("reason", "nonconverged", "iterations", "error"):
             getattr(self.worlds, name).zero_()
+        self.worlds.reached.fill_(1.0)
 
     def set_external(self, force: ArrayLike | None) -> None:
         """Loads the nodes in every step from now on, until `reset`.
@@ -272,6 +275,10 @@ class SkinData:
     @property
     def converged(self) -> np.ndarray:
         return self.worlds.reason.numpy() == 0
+
+    @property
+    def reached(self) -> np.ndarray:
+        return self.worlds.reached.numpy().copy()
 
     @property
     def nonconverged(self) -> np.ndarray:

@@ -53,7 +53,7 @@ class SkinOptions:
       core_contact: whether the inner surface can touch the rigid core.
       core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core
         contact [m].
-      max_core_depth: a geom that reaches deeper into the core than this is refused [m].
+      max_core_depth: no skin fits between the core and a geom that reaches deeper into it than this [m].
       contact_stiffness: pressure per overclosure k [Pa/m]; None gives 180 E per millimetre, the reference
         solutions' ratio, with each world's own E.
       stick_ratio: tangential stiffness of sticking contact relative to k.

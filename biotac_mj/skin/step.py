@@ -14,9 +14,11 @@ Everything that changes between steps is read from device arrays: poses and fric
 `data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos,
 .frame_mat` (implicit dynamics). Overwrite them, then step.
 
-A world whose input is not finite, that has a geom deep inside the core or that finds no balance keeps its
-last good state, is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; the others do
-not notice. Worlds that are done idle inside the loops."""
+A world that finds no balance goes there in parts: its geoms move from where they were when the last step
+ended, as far as the skin finds a balance; no skin fits between the core and a geom deep inside it. A world
+that does not come to the end stays where it came to (`data.reached`), is counted in
+`data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not finite, which
+stays where it was. The others do not notice. Worlds that are done idle inside the loops."""
 
 import dataclasses
 import weakref
@@ -27,6 +29,7 @@ import warp as wp
 from ..threads import single_thread
 from . import liquid
 from .contact import faces, limits, touch
+from .contact.faces import Way
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
@@ -46,6 +49,8 @@ _FREE = (
     "stiffness_damping",
     "max_core_depth",
 )
+_PARTS = 3  # times the iterations of a try: all that a step may take to go its way in parts
+_SHORTEST = 1 / 64  # part of the way of the geoms that is tried
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 
@@ -59,8 +64,8 @@ def step(
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
-    A world that does not converge within `options.max_newton` iterations keeps its last good state; it is
-    counted in `data.nonconverged` and flagged in `data.converged`.
+    A world that finds no balance there comes as far as it can, see `data.reached`; it is counted in
+    `data.nonconverged` and flagged in `data.converged`. The next step goes on from there.
 
     Args:
       model, data: the skin.
@@ -70,8 +75,8 @@ def step(
         the step, for the inertia of implicit dynamics; None means that it does not move.
 
     Raises:
-      ValueError: a geom deep inside the rigid core, geoms of another number of worlds, adhesion that reaches
-        further than a mesh geom's distance is known, or a time step that is missing or not positive.
+      ValueError: geoms of another number of worlds, adhesion that reaches further than a mesh geom's distance
+        is known, or a time step that is missing or not positive.
     """
     ready = prepare_step(model, data, geoms)
     _set_time(model, data, dt, core_pos, core_mat)
@@ -81,8 +86,6 @@ def step(
     else:
         with single_thread():
             ready.run()
-    if model.has_core and geoms.count and (data.worlds.reason.numpy() == worlds.INSIDE_CORE).any():
-        _refuse_core(model, geoms)
 
 
 def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep":
@@ -152,20 +155,6 @@ def _set_time(model, data, dt, core_pos, core_mat):
                 array.assign(np.asarray(value, float))
 
 
-def _refuse_core(model, geoms):
-    depth = wp.zeros((geoms.count, geoms.nworld), dtype=real, device=model.device)
-    wp.launch(
-        limits.depth_in_core, depth.shape, [model.core_vert, geoms.struct], [depth], device=model.device
-    )
-    depth = depth.numpy()
-    geom, world = np.unravel_index(depth.argmax(), depth.shape)
-    raise ValueError(
-        f"geom {geom} of world {world} ({geoms.types[geom]}) is {depth.max() * 1e3:.2f} mm inside the rigid "
-        "core: "
-        "no skin fits between them; move it out, press less deep or take smaller steps"
-    )
-
-
 class _Vectors:
     """Vectors of all worlds, shared by the recorded steps of one SkinData."""
 
@@ -180,7 +169,7 @@ class _Vectors:
         self.by_sample = None
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.base = wp.zeros((n, w), dtype=vec3)
+            self.base, self.balanced = (wp.zeros((n, w), dtype=vec3) for _ in range(2))
             self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
             self.part = wp.zeros((2, self.nchunk, w), dtype=real)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
@@ -225,15 +214,23 @@ class SkinStep:
         w = data.nworld
         self._wrench_chunks = -(-len(model.outer.face) // _WRENCH_CHUNK)
         with wp.ScopedDevice(model.device):
-            self._held_pos = wp.zeros((geoms.count, w), dtype=vec3)
-            self._held_mat = wp.zeros((geoms.count, w), dtype=mat33)
+            self._way = Way()
+            self._way.pos_start, self._way.pos_end = (
+                wp.zeros((geoms.count, w), dtype=vec3) for _ in range(2)
+            )
+            self._way.mat_start, self._way.mat_end = (
+                wp.zeros((geoms.count, w), dtype=mat33) for _ in range(2)
+            )
             self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, w), dtype=vec3)
         self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
-        self._newton_on, self._solve_on, self._search_on, self._again, self._any_failed = (
+        self._newton_on, self._solve_on, self._search_on, self._again, self._any_short = (
             flags[i : i + 1] for i in range(5)
         )
+        rest = model.rest.vert
+        center = (rest.min(0) + rest.max(0)) / 2
+        self._ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
         self._graph = None
         few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
         self._streams = [wp.Stream(model.device) for _ in range(2 if few else 0)]
@@ -295,39 +292,58 @@ class SkinStep:
         self._launcher = program
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         n, w = m.nvert, d.nworld
-        if m.has_core and g.count:
-            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if w < 32 else 64
-            dim = (g.count, -(-len(m.core_vert) // chunk), w)
-            constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
-            self._launch(limits.contact_inside_core, dim, constants, [st.deep])
         motion, touched_by, wrench = self._of_geoms
         self.M.begin_step(program)
-        E = m.material.youngs_modulus
-        self._launch(worlds.begin_worlds, w, [m.law, E, g.struct, motion, st, touched_by], [k.flags])
+        given = [m.law, m.material.youngs_modulus, m.options.max_newton, g.struct, motion, st]
+        self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._way, k.flags])
         if d.memory:
             d.memory.begin_step(program, d.dt, st.softness)
         if self.implicit:
             frames = [d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt]
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x])
-        self._newton()
-        self._launch(worlds.retry_worlds, w, [st, self._again])
-        program.branch(self._again, self._second_try)
-        self._launch(
-            worlds.hold_geoms, w, [g.struct, st], [self._held_pos, self._held_mat, motion, self._any_failed]
-        )
-        program.branch(self._any_failed, self._stay)
+        self._try()
+        program.loop(self._again, self._go_on)
+        self._launch(worlds.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
+        program.branch(self._any_short, self._stay)
         self._finish(touched_by, wrench)
 
-    def _second_try(self):
-        """From where the step began: the guess may have been the trouble."""
-        self._launch(nodes.retry_nodes, self.d.x.shape, [self.d.x_last, self.st.active, self.d.x])
-        self.M.renew(self._launcher, self.d.x)
+    def _try(self):
+        """Newton's method where the geoms are, in the active worlds."""
+        m, g = self.m, self.geoms
+        if m.has_core and g.count:
+            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if self.d.nworld < 32 else 64
+            dim = (g.count, -(-len(m.core_vert) // chunk), self.d.nworld)
+            constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
+            outputs = [self.st.active, self.st.failed, self.st.deep]
+            self._launch(limits.refuse_deep, dim, constants, outputs)
         self._newton()
+        bounds = [_SHORTEST if g.count else 1.0, _PARTS * m.options.max_newton]
+        self._launch(worlds.judge_way, self.d.nworld, [*bounds, self.st, self._again])
+
+    def _go_on(self):
+        """The next part of the way of the worlds that are not there."""
+        d, k, st, m = self.d, self.k, self.st, self.m
+        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, st, self._again])
+        self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
+        self._place(st.ahead, st.asked)
+        self.M.renew(self._launcher, d.x)
+        self._try()
+        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st], [k.balanced])
+
+    def _place(self, share, on):
+        """Geoms at a share of their way, nodes where they were last in balance."""
+        d, g = self.d, self.geoms
+        dim = (g.count, d.nworld)
+        self._launch(worlds.place_geoms, dim, [self._way, share, on], [g.struct])
+        kept = [d.x_last, self.k.balanced, self.st.reached]
+        self._launch(nodes.return_nodes, d.x.shape, [*kept, on], [d.x])
 
     def _stay(self):
-        self._launch(nodes.retry_nodes, self.d.x.shape, [self.d.x_last, self.st.failed, self.d.x])
-        self._evaluate(self.st.failed)
+        """Where the way ended, as if it had been asked for: forces, and the tangents of what touches."""
+        self._place(self.st.reached, self.st.moving)
+        self._evaluate(self.st.moving)
+        self._precondition()
 
     def _newton(self):
         self._evaluate(self.st.active)
@@ -357,6 +373,12 @@ class SkinStep:
 
     def _check(self):
         """Residual, preconditioner and the first direction; which worlds are in balance."""
+        m, k, st = self.m, self.k, self.st
+        self._precondition()
+        bounds = [m.options.tolerance, int(m.has_liquid)]
+        self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
+
+    def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
         core = d.core.node_force if d.core else k.no_vector
         forces = [d.force, d.outer.node_force, core, self._external(), self._gradient()]
@@ -366,8 +388,6 @@ class SkinStep:
             [k.r, k.worth, st.touched, self._newton_on],
         )  # fmt: skip
         self.M.update(self._launcher, st, k.worth, k.r, self._gradient(), k.p, k.part, self._beside)
-        bounds = [m.options.tolerance, m.options.max_newton, int(m.has_liquid)]
-        self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
 
     def _solve(self):
         self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
@@ -461,7 +481,7 @@ class SkinStep:
         )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
-        self._launch(worlds.release_geoms, w, [g.struct, self._held_pos, self._held_mat, st])
+        self._launch(worlds.release_geoms, (g.count, w), [g.struct, self._way, st])
         frame = [d.frame_pos, d.frame_mat]
         self._launch(nodes.end_nodes, d.x.shape, [int(self.implicit), d.x, k.world, *frame, d.dt, d.x_last],
                      [d.increment, d.velocity])  # fmt: skip

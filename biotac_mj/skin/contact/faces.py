@@ -15,6 +15,7 @@ __all__ = [
     "FaceSum",
     "Geoms",
     "Laws",
+    "Way",
     "block_index",
     "commit_contacts",
     "empty_laws",
@@ -48,6 +49,17 @@ class Geoms:
     pos_last: wp.array2d(dtype=vec3)
     mat_last: wp.array2d(dtype=mat33)
     grids: Grids
+
+
+@wp.struct
+class Way:
+    """Of the geoms within a step [geom, world]: from where they were in the last one, or where nothing
+    touched, to where they are asked to be."""
+
+    pos_start: wp.array2d(dtype=vec3)
+    mat_start: wp.array2d(dtype=mat33)
+    pos_end: wp.array2d(dtype=vec3)
+    mat_end: wp.array2d(dtype=mat33)
 
 
 @wp.struct

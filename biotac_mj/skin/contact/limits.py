@@ -3,12 +3,14 @@
 import warp as wp
 
 from ..types import real, vec3
-from .faces import Geoms
+from .faces import Geoms, Way
 from .shapes import distance, distance_bound
 
-__all__ = ["contact_inside_core", "crushed_on_core", "depth_in_core", "rest_gap"]
+__all__ = ["crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
 
 wp.set_module_options({"enable_backward": False})
+
+_ROUNDS = 4  # distances of meshes from afar are lower bounds along their grid's box
 
 
 @wp.kernel
@@ -57,17 +59,23 @@ def crushed_on_core(
 
 
 @wp.kernel
-def contact_inside_core(
+def refuse_deep(
     # In:
     chunk: int,
     limit: real,
     core_vert: wp.array(dtype=vec3),
     geoms: Geoms,
+    # In and out:
+    active: wp.array(dtype=int),
     # Out:
+    failed_out: wp.array(dtype=int),
     deep_out: wp.array(dtype=int),
 ):
-    """Marks worlds in which a geom reaches deeper into the rigid core than the limit."""
+    """Worlds in which a geom reaches deeper into the rigid core than the limit fail: no skin fits between
+    them."""
     g, c, w = wp.tid()
+    if active[w] == 0:
+        return
     R = geoms.mat[g, w]
     for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0])):
         y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
@@ -75,24 +83,40 @@ def contact_inside_core(
             distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
             < -limit
         ):
+            active[w] = 0
+            failed_out[w] = 1
             deep_out[w] = 1
 
 
 @wp.kernel
-def depth_in_core(
+def draw_back(
     # In:
-    core_vert: wp.array(dtype=vec3),
+    center: vec3,
+    radius: real,
     geoms: Geoms,
-    # Out:
-    depth_out: wp.array2d(dtype=real),
+    asked: wp.array(dtype=int),
+    # In and out:
+    way: Way,
 ):
-    """How deep each geom reaches into the rigid core, by the core's vertices inside the geom [geom,
-    world]."""
-    g, w = wp.tid()
-    R = geoms.mat[g, w]
-    deepest = real(0.0)
-    for i in range(core_vert.shape[0]):
-        y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
-        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-        deepest = wp.min(deepest, bound)
-    depth_out[g, w] = -deepest
+    """Where nothing is known of how geoms came to where they are, they come from outside: their way starts
+    where the ball around the skin is clear of them."""
+    w = wp.tid()
+    if asked[w] == 0:
+        return
+    still = int(1)
+    for g in range(geoms.count):
+        p = way.pos_start[g, w]
+        R = way.mat_start[g, w] - way.mat_end[g, w]
+        if wp.length_sq(p - way.pos_end[g, w]) + wp.ddot(R, R) > real(0.0):
+            still = 0
+    for g in range(geoms.count):
+        p = way.pos_start[g, w]
+        if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
+            p = way.pos_end[g, w]
+            R = way.mat_end[g, w]
+            for _round in range(_ROUNDS):
+                y = wp.transpose(R) * (center - p)
+                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                p -= wp.max(radius - dn[3], real(0.0)) * (R * vec3(dn[0], dn[1], dn[2]))
+            way.pos_start[g, w] = p
+            way.mat_start[g, w] = R

@@ -17,8 +17,9 @@ __all__ = [
     "end_core",
     "end_nodes",
     "fly_freely",
+    "keep_nodes",
     "nodes_kernels",
-    "retry_nodes",
+    "return_nodes",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -35,10 +36,29 @@ def begin_nodes(
 
 
 @wp.kernel
-def retry_nodes(x_last: wp.array2d(dtype=vec3), on: wp.array(dtype=int), x: wp.array2d(dtype=vec3)):
+def return_nodes(
+    # In:
+    x_last: wp.array2d(dtype=vec3),
+    balanced: wp.array2d(dtype=vec3),
+    reached: wp.array(dtype=real),
+    on: wp.array(dtype=int),
+    # Out:
+    x: wp.array2d(dtype=vec3),
+):
+    """Back to the furthest part of the way that was gone."""
     i, w = wp.tid()
     if on[w] == 1:
         x[i, w] = x_last[i, w]
+        if reached[w] > real(0.0):
+            x[i, w] = balanced[i, w]
+
+
+@wp.kernel
+def keep_nodes(x: wp.array2d(dtype=vec3), st: Worlds, balanced_out: wp.array2d(dtype=vec3)):
+    """Keeps the end of a part that was gone."""
+    i, w = wp.tid()
+    if st.failed[w] == 0 and st.stride[w] > real(0.0):
+        balanced_out[i, w] = x[i, w]
 
 
 @wp.kernel

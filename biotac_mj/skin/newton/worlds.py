@@ -3,8 +3,8 @@ search and ends its step."""
 
 import warp as wp
 
-from ..contact.faces import Geoms
-from ..types import mat33, real, vec3
+from ..contact.faces import Geoms, Way
+from ..types import real, vec3
 
 __all__ = [
     "BALANCED",
@@ -17,11 +17,13 @@ __all__ = [
     "all_on",
     "begin_worlds",
     "choose_length",
+    "end_way",
     "end_worlds",
-    "hold_geoms",
     "judge_balance",
+    "judge_way",
+    "place_geoms",
     "release_geoms",
-    "retry_worlds",
+    "start_part",
     "total_of",
     "totals_of",
 ]
@@ -55,7 +57,7 @@ class Worlds:
     last_pressure: wp.array(dtype=real)  # when the last step ended, above the surroundings [Pa]
     pressure: wp.array(dtype=real)  # at the last evaluation [Pa]
     volume: wp.array(dtype=real)  # of the liquid there [m^3]
-    asked: wp.array(dtype=int)  # its input can be solved, and it has not failed twice
+    asked: wp.array(dtype=int)  # its input can be solved, and its way is not at its end
     active: wp.array(dtype=int)  # not yet in balance
     running: wp.array(dtype=int)  # its linear solve goes on
     moving: wp.array(dtype=int)  # its line search goes on
@@ -67,7 +69,11 @@ class Worlds:
     reason: wp.array(dtype=int)
     nonconverged: wp.array(dtype=int)  # steps since reset
     iterations: wp.array(dtype=int)
+    limit: wp.array(dtype=int)  # of iterations, at which the present try ends
     error: wp.array(dtype=real)
+    reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
+    ahead: wp.array(dtype=real)  # that is tried
+    stride: wp.array(dtype=real)  # between them; 0: the first try
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
     beta: wp.array(dtype=real)
@@ -122,12 +128,14 @@ def begin_worlds(
     # In:
     law: int,
     youngs_modulus: real,
+    limit: int,
     geoms: Geoms,
     motion: wp.array2d(dtype=vec3),
     st: Worlds,
     # In and out:
     touched_by: wp.array2d(dtype=int),
     # Out:
+    way: Way,
     flags: wp.array(dtype=int),
 ):
     """Looks at the input; finds how far each touching geom repeats its last motion."""
@@ -149,6 +157,10 @@ def begin_worlds(
         if not wp.isfinite(total):
             finite = 0
         last = geoms.pos_last[g, w]
+        way.pos_start[g, w] = last
+        way.mat_start[g, w] = geoms.mat_last[g, w]
+        way.pos_end[g, w] = p
+        way.mat_end[g, w] = R
         if finite == 1 and not wp.isfinite(last[0] + last[1] + last[2]):
             geoms.pos_last[g, w] = p
             geoms.mat_last[g, w] = R
@@ -170,19 +182,18 @@ def begin_worlds(
     if square > real(0.0):
         repeat = wp.clamp(now_last / square, real(0.0), real(2.0))
     st.repeat[w] = repeat
-    asked = int(1)
     if finite == 0:
         st.reason[w] = NOT_FINITE
-        asked = 0
-    elif st.deep[w] == 1:
-        st.reason[w] = INSIDE_CORE
-        asked = 0
-    st.deep[w] = 0
-    st.asked[w] = asked
-    st.active[w] = asked
+    st.asked[w] = finite
+    st.active[w] = finite
     st.failed[w] = 0
+    st.deep[w] = 0
     st.inverted[w] = 0
     st.iterations[w] = 0
+    st.limit[w] = limit
+    st.reached[w] = real(0.0)
+    st.ahead[w] = real(1.0)
+    st.stride[w] = real(0.0)
     st.offset[w] = real(0.0)
     if st.holds[w] == 1:
         st.offset[w] = st.last_pressure[w]
@@ -193,7 +204,6 @@ def begin_worlds(
 def judge_balance(
     # In:
     tolerance: real,
-    limit: int,
     has_liquid: int,
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
@@ -230,7 +240,7 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif st.iterations[w] == limit:
+    elif st.iterations[w] >= st.limit[w]:
         st.active[w] = 0
         st.failed[w] = 1
     else:
@@ -241,15 +251,51 @@ def judge_balance(
 
 
 @wp.kernel
-def retry_worlds(st: Worlds, again: wp.array(dtype=int)):
-    """Worlds that failed although their input is sound are asked once more."""
+def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int)):
+    """After a try: how far the worlds that are asked have come, and which part of the way they try next.
+
+    The first try is the whole way from a guess, the second the whole way from where the step began.
+    """
     w = wp.tid()
     st.active[w] = 0
-    if st.asked[w] == 1 and st.failed[w] == 1:
-        st.active[w] = 1
+    if st.asked[w] == 0:
+        return
+    stride = st.stride[w]
+    if st.failed[w] == 0:
+        st.reached[w] = st.ahead[w]
+        if st.ahead[w] == real(1.0):
+            st.reason[w] = CONVERGED
+            st.asked[w] = 0
+            return
+        stride = real(2.0) * stride
+    elif stride == real(0.0):
+        st.reason[w] = NOT_CONVERGED
+        stride = real(1.0)
+        if st.deep[w] == 1:
+            st.reason[w] = INSIDE_CORE
+            stride = real(0.5)
+    else:
+        stride = real(0.5) * stride
+    if stride < shortest or st.iterations[w] >= budget:
+        st.asked[w] = 0
+        return
+    st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
+    st.ahead[w] = st.reached[w] + st.stride[w]
+    again[0] = 1
+
+
+@wp.kernel
+def start_part(limit: int, st: Worlds, again: wp.array(dtype=int)):
+    """Worlds that are asked try the next part of their way."""
+    w = wp.tid()
+    if w == 0:
+        again[0] = 0
+    st.active[w] = st.asked[w]
+    if st.asked[w] == 1:
         st.failed[w] = 0
+        st.deep[w] = 0
         st.inverted[w] = 0
-        again[0] = 1
+        st.limit[w] = st.iterations[w] + limit
 
 
 @wp.kernel
@@ -320,59 +366,89 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
 
 
 @wp.kernel
-def hold_geoms(
+def place_geoms(
     # In:
-    geoms: Geoms,
-    st: Worlds,
+    way: Way,
+    share: wp.array(dtype=real),
+    on: wp.array(dtype=int),
     # Out:
-    pos_out: wp.array2d(dtype=vec3),
-    mat_out: wp.array2d(dtype=mat33),
-    motion_out: wp.array2d(dtype=vec3),
-    any_failed: wp.array(dtype=int),
+    geoms: Geoms,
 ):
-    """Keeps the poses as they were set; puts the geoms of failed worlds back to where the step began."""
-    w = wp.tid()
-    if st.asked[w] == 0:
-        st.failed[w] = 1
-    if st.failed[w] == 1:
-        any_failed[0] = 1
-    for g in range(geoms.count):
-        pos_out[g, w] = geoms.pos[g, w]
-        mat_out[g, w] = geoms.mat[g, w]
-        if st.failed[w] == 1:
-            last = geoms.pos_last[g, w]
-            if wp.isfinite(last[0] + last[1] + last[2]):
-                geoms.pos[g, w] = last
-                geoms.mat[g, w] = geoms.mat_last[g, w]
-            else:
-                geoms.pos[g, w] = vec3(_FAR, _FAR, _FAR)
-                geoms.mat[g, w] = wp.identity(n=3, dtype=real)
-            motion_out[g, w] = vec3()
-        else:
-            motion_out[g, w] = geoms.pos[g, w] - geoms.pos_last[g, w]
+    """Puts the geoms of the worlds that are on to a share of their way: along a line, turning about one
+    axis."""
+    g, w = wp.tid()
+    if on[w] == 0:
+        return
+    f = share[w]
+    begin = way.pos_start[g, w]
+    if f == real(1.0):
+        geoms.pos[g, w] = way.pos_end[g, w]
+        geoms.mat[g, w] = way.mat_end[g, w]
+    elif not wp.isfinite(begin[0] + begin[1] + begin[2]):  # bad input, and no pose before
+        geoms.pos[g, w] = vec3(_FAR, _FAR, _FAR)
+        geoms.mat[g, w] = wp.identity(n=3, dtype=real)
+    elif f == real(0.0):
+        geoms.pos[g, w] = begin
+        geoms.mat[g, w] = way.mat_start[g, w]
+    else:
+        geoms.pos[g, w] = begin + f * (way.pos_end[g, w] - begin)
+        R = way.mat_start[g, w]
+        turn = wp.quat_from_matrix(wp.transpose(R) * way.mat_end[g, w])
+        u = vec3(turn[0], turn[1], turn[2])
+        half = wp.atan2(wp.length(u), wp.abs(turn[3]))
+        u = wp.where(turn[3] < real(0.0), -u, u)
+        part = wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * f * half)
+        geoms.mat[g, w] = R * wp.quat_to_matrix(part)
 
 
 @wp.kernel
-def release_geoms(geoms: Geoms, pos: wp.array2d(dtype=vec3), mat: wp.array2d(dtype=mat33), st: Worlds):
-    """Makes the poses of this step those of the last one, where it went well, and writes back what was
-    set."""
+def end_way(
+    # In:
+    way: Way,
+    geoms: Geoms,
+    st: Worlds,
+    # Out:
+    motion_out: wp.array2d(dtype=vec3),
+    any_short: wp.array(dtype=int),
+):
+    """Motion of the geoms as far as it went; the worlds whose way was not gone to its end are moving, those
+    that are where they were have failed."""
     w = wp.tid()
+    f = st.reached[w]
+    st.moving[w] = 0
+    st.failed[w] = 0
+    if f < real(1.0):
+        st.moving[w] = 1
+        any_short[0] = 1
+        if f == real(0.0):
+            st.failed[w] = 1
+        if st.reason[w] != NOT_FINITE:
+            st.active[w] = 1
     for g in range(geoms.count):
-        if st.failed[w] == 0:
-            geoms.pos_last[g, w] = geoms.pos[g, w]
-            geoms.mat_last[g, w] = geoms.mat[g, w]
-        geoms.pos[g, w] = pos[g, w]
-        geoms.mat[g, w] = mat[g, w]
+        motion_out[g, w] = vec3()
+        begin = way.pos_start[g, w]
+        if f > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
+            motion_out[g, w] = f * (way.pos_end[g, w] - begin)
+
+
+@wp.kernel
+def release_geoms(geoms: Geoms, way: Way, st: Worlds):
+    """Makes the poses that were reached those of the last step, and writes back what was set."""
+    g, w = wp.tid()
+    if st.reason[w] != NOT_FINITE:
+        geoms.pos_last[g, w] = geoms.pos[g, w]
+        geoms.mat_last[g, w] = geoms.mat[g, w]
+    geoms.pos[g, w] = way.pos_end[g, w]
+    geoms.mat[g, w] = way.mat_end[g, w]
 
 
 @wp.kernel
 def end_worlds(st: Worlds):
     w = wp.tid()
-    if st.failed[w] == 1:
+    st.active[w] = 0
+    if st.reason[w] != CONVERGED:
         st.nonconverged[w] = st.nonconverged[w] + 1
-        if st.reason[w] == CONVERGED:
-            st.reason[w] = NOT_CONVERGED
-    else:
+    if st.failed[w] == 0:
         st.last_pressure[w] = st.pressure[w]
 
 
