@@ -63,6 +63,8 @@ class SkinResult:
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
       measured: False where an approximate tier leaves the range in which its error was measured.
+      reached: share of the touching bodies' motion in this step at which all this holds: 1 where it
+        converged.
     """
 
     state: np.ndarray | None
@@ -74,6 +76,7 @@ class SkinResult:
     iterations: int = 0
     residual: float = 0.0
     measured: bool = True
+    reached: float = 1.0
 
 
 class SkinStepper(Protocol):

@@ -172,16 +172,20 @@ class NearSearch:
         self._x[:, 0] = self._rest
         return not len(self.faces(margin, 0.0, pos, mat))
 
-    def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Raises ValueError for a geom deep inside the core."""
+    def deep(self, pos: np.ndarray, mat: np.ndarray) -> bool:
+        """Whether a geom, posed so, is deeper inside the core than `max_core_depth`."""
         if not (self._model.has_core and self._geoms.count):
-            return
+            return False
         limit = self._model.options.max_core_depth
         # a bound may change a little faster than the geom moves: grids are trilinear
         if any(r.clearance - 2 * t > -limit for r, t in zip(self._regions, self._travel(pos, mat))):
-            return
+            return False
         self._clearances()
-        if -self._clearance.min() > limit:
+        return bool(-self._clearance.min() > limit)
+
+    def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Raises ValueError for a geom deep inside the core."""
+        if self.deep(pos, mat):
             g = int(self._clearance.argmin())
             raise ValueError(
                 f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid "
