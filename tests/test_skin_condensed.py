@@ -631,8 +631,35 @@ def test_nan_is_refused(coarse):
         skin.solve(Memory.rest(1), np.full((1, 3), np.nan), EYE)
 
 
-def test_a_geom_inside_the_core_is_refused(coarse):
-    skin = CondensedSkin(coarse, sphere(), cache=False)
+# --- steps that are too hard for one solve
+
+
+def squeezed(out):
+    """Force [N] of an outcome, whose tangent is symmetric and positive semi-definite whatever the step
+    was."""
+    assert np.allclose(out.tangent, out.tangent.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(out.tangent).min() >= -1e-9 * np.abs(out.tangent).max()
+    assert 0 <= out.reached <= 1 and out.converged == (out.reached == 1)
+    return float(np.linalg.norm(out.wrench[:, :3]))
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_a_geom_deep_in_the_core_squeezes_the_skin_as_far_as_it_goes(coarse, started):
+    """Also where nobody knows where it came from; what came of it holds at the poses in the memory."""
+    skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
-    with pytest.raises(ValueError, match="inside the rigid core: no skin fits between them"):
-        skin.solve(Memory.rest(1), (start + 6e-3 * direction)[None], EYE)
+    memory = Memory.rest(1)
+    if started:
+        memory = skin.solve(memory, (start - 1e-3 * direction)[None], EYE).memory
+    deep = skin.solve(memory, (start + 6e-3 * direction)[None], EYE)
+    assert squeezed(deep) > 20 and 0 < deep.reached < 1
+    depth = (deep.memory.geom_pos[0] - start) @ direction
+    assert 1.5e-3 < depth < 4e-3
+    if started:
+        assert depth == pytest.approx(deep.reached * 7e-3 - 1e-3, abs=1e-9)
+    again = skin.solve(deep.memory, (start + 6e-3 * direction)[None], EYE)
+    assert squeezed(again) == pytest.approx(squeezed(deep), rel=0.05) and again.reached < 0.05
+    out = skin.solve(again.memory, (start + 1e-3 * direction)[None], EYE)
+    slow = walk(skin, start + np.outer(np.arange(1, 6) * 2e-4, direction))[-1]
+    assert out.converged and squeezed(out) == pytest.approx(squeezed(slow), rel=0.05)
+    assert squeezed(skin.solve(again.memory, (start - 1e-3 * direction)[None], EYE)) == 0

@@ -6,13 +6,13 @@ import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin.condensed import CondensedSkin, Memory
+from ..skin.condensed.step import MAX_CONTACTS, MAX_FORCES
 from .config import Config
 from .fem import FemStepper
 from .stepper import Geom, SkinResult
 
 __all__ = ["CondensedStepper"]
 
-_MAX_FORCES, _MAX_CONTACTS = 1024, 2048
 _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
 
 
@@ -32,8 +32,8 @@ class CondensedStepper(FemStepper):
             "geom_pos": 3 * g,
             "geom_mat": 9 * g,
             "motion": 3 * g,
-            "forces": 1 + 3 * _MAX_FORCES,
-            "contacts": 1 + 5 * _MAX_CONTACTS,
+            "forces": 1 + 3 * MAX_FORCES,
+            "contacts": 1 + 5 * MAX_CONTACTS,
         }
         ends = np.cumsum(list(sizes.values()))
         self._slices = {
@@ -71,7 +71,7 @@ class CondensedStepper(FemStepper):
         """See `SkinStepper`.
 
         Raises:
-          ValueError: NaN in a pose, a geom deep inside the core, or more contact than the state can hold.
+          ValueError: NaN in a pose.
         """
         out = self._skin.solve(self._read(state), geom_pos, geom_mat)
         new = np.zeros_like(state)
@@ -86,6 +86,7 @@ class CondensedStepper(FemStepper):
             iterations=out.iterations,
             residual=out.error,
             measured=out.measured,
+            reached=out.reached,
         )
 
     def resting(self, state: np.ndarray) -> bool:
@@ -130,12 +131,6 @@ class CondensedStepper(FemStepper):
 
     def _write(self, state, memory):
         n, k = len(memory.coordinate), len(memory.contacts)
-        if n > _MAX_FORCES or k > _MAX_CONTACTS:
-            raise ValueError(
-                f"{k} contact samples and {n} forces touch, the state holds {_MAX_CONTACTS} and "
-                f"{_MAX_FORCES}: "
-                "sample faces less densely (options samples=), use a coarser skin, or tier='full'"
-            )
         head = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening, memory.swelling
         self._part(state, "head")[:] = *head, *memory.after, *memory.drift
         self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)

@@ -149,8 +149,7 @@ def simulate_condensed(
     of nodes, and nothing in it takes time.
 
     Raises:
-      ValueError: what the condensed tier cannot do, materials or worlds that differ, or an object deep inside
-        the rigid core.
+      ValueError: what the condensed tier cannot do, or materials or worlds that differ.
     """
     from ..skin.condensed import CondensedSkin, Memory
 

@@ -104,6 +104,8 @@ class Compliance:
     def __matmul__(self, p: np.ndarray) -> np.ndarray:
         """W p of p (n,)."""
         # in single precision: half the memory, and rest is no better than that
+        if not len(p):  # which BLAS refuses
+            return np.zeros(0)
         out = sgemv(self._scale, self._rest.T, p).astype(float)
         if self._a is not None:
             out -= (self._share * float(self._a @ p)) * self._a
@@ -129,12 +131,15 @@ class Lumped:
 
     def __init__(self, springs: Springs, W: Compliance):
         self.on, self._blocks = springs.on, springs.lumped()
-        matrix = W.part(self.on, np.float32)
-        springs.add_inverse_lumped(matrix)
-        matrix.ravel()[:: len(matrix) + 1] *= 1 + _ROUNDING
-        self._factor, info = spotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
-        if info:
-            raise np.linalg.LinAlgError("the compliance over the contact is not positive definite")
+        rounding, info = _ROUNDING, 1
+        while info:
+            if rounding > len(self.on):  # a matrix with a positive diagonal is positive definite long before
+                raise np.linalg.LinAlgError("the compliance over the contact is not positive definite")
+            matrix = W.part(self.on, np.float32)
+            springs.add_inverse_lumped(matrix)
+            matrix.ravel()[:: len(matrix) + 1] *= 1 + rounding
+            self._factor, info = spotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
+            rounding *= 10
 
     def fits(self, springs: Springs) -> bool:
         """Whether the same is touched and the stiffness of the nodes is nearly that of these springs."""

@@ -11,6 +11,7 @@ method with a search along the step (a semi-smooth Newton method; the contact la
 What skin does differently from a linear one, s and c, is fitted to the full FEM (`correction`).
 """
 
+import dataclasses
 import math
 import typing
 import weakref
@@ -28,9 +29,10 @@ from .compliance import SurfaceCompliance
 from .core_contact import CoreContact
 from .correction import correction
 from .faces import CandidateFaces
+from .follow import follow
 from .refusals import refuse
 from .search import NearSearch
-from .step import Memory, Outcome, Step
+from .step import Effort, Memory, Outcome, Step
 
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
@@ -124,6 +126,7 @@ class CondensedSkin:
         self._area = model.outer.area.numpy()
         self._outer = np.unique(g.outer_face)
         self._outer = self._outer[free[self._outer]]
+        self.nouter = len(self._outer)
         self._number = np.full(model.nvert, -1)
         self._number[self._outer] = np.arange(len(self._outer))
         self.rest = model.rest.vert.astype(float)
@@ -234,41 +237,91 @@ class CondensedSkin:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
         alone.
 
+        Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
+        its memory, which are those asked for where `reached` is 1.
+
         Raises:
-          ValueError: NaN in a pose, or a geom deep inside the core.
+          ValueError: NaN in a pose.
         """
         if not (math.isfinite(np.sum(geom_pos)) and math.isfinite(np.sum(geom_mat))):
             raise ValueError(
                 "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
                 "never set"
             )
-        struct = self.geoms.struct
-        last = (memory.geom_pos, memory.geom_mat) if memory.started else (geom_pos, geom_mat)
-        if self.geoms.count:
-            struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = geom_pos, geom_mat
-            struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
-        if not len(memory.force):  # at rest: what no sample touches changes nothing
-            self._x[:, 0] = self.rest
-            if not len(self.search.faces(0.0, 0.0, geom_pos, geom_mat)):
-                return self._at_rest(geom_pos, geom_mat, geom_pos - last[0])
-        self.search.refuse_core(geom_pos, geom_mat)
-        u = self.displacement(memory)
-        self._last[:, 0] = self._x[:, 0] = self.rest + u
         with single_thread():
-            step = Step(self, memory, u, geom_pos, geom_mat, geom_pos - last[0])
+            out, u = follow(self, memory, geom_pos, geom_mat)
+        self._keep(out.memory, u)
+        return out
+
+    def attempt(
+        self, memory: Memory, u: np.ndarray | None, pos: np.ndarray, mat: np.ndarray, effort: Effort
+    ) -> tuple[Outcome, np.ndarray] | None:
+        """Solves for poses in one part.
+
+        Args:
+          memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
+          effort: what it may cost.
+
+        Returns:
+          The outcome and displacements, or None where no balance was found.
+        """
+        motion = self.pose(memory, pos, mat)
+        if not len(memory.force) and self.untouched(pos, mat):  # what no sample touches changes nothing
+            return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
+        if self.search.deep(pos, mat):
+            return None
+        step = self._step(memory, u, pos, mat, motion, effort)
+        try:
             for _ in range(4):
                 step.run()
-                if not step.missed():
+                if not (step.converged and step.missed()):
                     break
-            out = step.outcome()
-        self._keep(out.memory, step.u)
-        return out
+            out = step.outcome() if step.converged else None
+        except np.linalg.LinAlgError:
+            return None
+        return (out, step.u) if out is not None and out.sound() else None
+
+    def hold(self, memory: Memory) -> tuple[Outcome, np.ndarray]:
+        """The skin as the memory has it, with the geoms where they are there, and the displacements."""
+        pos, mat = memory.geom_pos, memory.geom_mat
+        motion = self.pose(memory, pos, mat)
+        if not len(memory.force):
+            return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
+        step = self._step(memory, None, pos, mat, motion, Effort(0.0))
+        step.hold()
+        return dataclasses.replace(step.outcome(), memory=memory), step.u
+
+    def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
+        """Whether no sample of the resting skin touches the geoms, posed so."""
+        self._x[:, 0] = self.rest
+        return not len(self.search.faces(0.0, 0.0, pos, mat))
+
+    def normal(self, faces: np.ndarray) -> np.ndarray:
+        """Mean outward normal (3,) of outer faces (n,) at rest."""
+        a, b, c = (self.rest[self._face[faces, i]] for i in range(3))
+        total = np.cross(b - a, c - a).sum(0)
+        return total / max(np.linalg.norm(total), 1e-30)
+
+    def pose(self, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+        """Hands poses to the kernels; how far the geoms move there from the memory's (ngeom, 3) [m]."""
+        struct = self.geoms.struct
+        last = (memory.geom_pos, memory.geom_mat) if memory.started else (pos, mat)
+        if self.geoms.count:
+            struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+            struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
+        return pos - last[0]
+
+    def _step(self, memory, u, pos, mat, motion, effort):
+        u = self.displacement(memory) if u is None else u
+        self._last[:, 0] = self._x[:, 0] = self.rest + u
+        return Step(self, memory, u, pos, mat, motion, effort)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         return self.search.clear(geom_pos, geom_mat, margin)
 
-    def _at_rest(self, pos, mat, motion):
+    def at_rest(self, pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> Outcome:
+        """Of geoms at these poses after this motion (ngeom, 3) [m], which touch nothing."""
         memory = Memory.rest(self.geoms.count)
         memory.started, memory.geom_pos, memory.geom_mat, memory.motion = (
             True,

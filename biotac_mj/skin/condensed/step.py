@@ -9,11 +9,14 @@ import numpy as np
 from ..rigid import rigid_motions
 from .linear import Compliance, Lumped, Springs, solve
 
-__all__ = ["Memory", "Outcome", "Step"]
+__all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 
+MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 30, 4
+_ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
+_PREPARE = 5  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
 
@@ -76,7 +79,8 @@ class Memory:
 @dataclasses.dataclass
 class Outcome:
     """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6,
-    6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured."""
+    6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured; and the
+    share of the geoms' motion at which this holds, 1 where the step converged."""
 
     memory: Memory
     wrench: np.ndarray
@@ -87,6 +91,33 @@ class Outcome:
     converged: bool
     iterations: int
     error: float
+    reached: float = 1.0
+
+    def sound(self) -> bool:
+        """Whether it is finite and a `Memory` of so much contact may be kept."""
+        memory = self.memory
+        few = len(memory.force) <= MAX_FORCES and len(memory.contacts) <= MAX_CONTACTS
+        return few and math.isfinite(self.wrench.sum() + self.tangent.sum() + memory.force.sum())
+
+
+class Effort:
+    """What a step may cost, counted so that it is the same on every machine.
+
+    Args:
+      most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2.
+    """
+
+    def __init__(self, most: float):
+        self.left, self._until = most, 0.0
+
+    def allow(self, share: float) -> None:
+        """Lets what comes next take a share of what is left."""
+        self._until = (1 - share) * self.left
+
+    def spend(self, n: int, times: float = 1.0) -> bool:
+        """Counts iterations over n coordinates; whether there is something left."""
+        self.left -= times * (_ITERATION + n * n)
+        return self.left > self._until
 
 
 class Step:
@@ -100,8 +131,9 @@ class Step:
         geom_pos: np.ndarray,
         geom_mat: np.ndarray,
         motion: np.ndarray,
+        effort: Effort,
     ):
-        self.skin, self.memory, self.u = skin, memory, u
+        self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
         moved = np.abs(motion).max(initial=0.0)
         self.reach = _REACH + 2 * moved
@@ -205,12 +237,19 @@ class Step:
             self.pressure = self.bulge = 0.0
             s._measure_volume()
             return
+        self.converged = False
+        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), _PREPARE):
+            return
         self._set()
         f = self._at_candidates(self.force)
         if self.force is self.memory.force:
             f += self.repeat * self._at_candidates(self.memory.change)
+        failed = 0
         for number in range(_PASSES):
             f = self.last = self._newton(f)
+            failed += not self.converged
+            if failed > 1:
+                break
             if not f.any():  # nothing touches any more
                 self.bulge = 0.0
             order = np.argsort(self.c)
@@ -229,6 +268,17 @@ class Step:
                 break
             f *= self.softening / self.after[0]
             self.softening, self.swelling = self.after.tolist()
+
+    def hold(self) -> None:
+        """Instead of `run`: takes the forces that the memory has for those of this step."""
+        self._set()
+        self.last = self._at_candidates(self.force)
+        self.W, shift = self._scaled()
+        self._evaluate(self.W @ self.last + shift)
+        self.lumped, self.converged = None, False
+        self._place(self.u)
+        self.skin._measure_volume()
+        self.after = self._correct()
 
     def _at_candidates(self, force):
         """Values (n,) of self.coordinate at the candidates; zero elsewhere."""
@@ -251,6 +301,8 @@ class Step:
         g = self._evaluate(u)
         self.converged, self.lumped = False, None
         for _ in range(_MAX_NEWTON):
+            if not self.effort.spend(len(f)):
+                break
             r = g - f
             df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped)
             slope = float(r @ du)

@@ -1,0 +1,97 @@
+"""A step that is too hard for one solve: the geoms are moved in parts from where they were to where they are
+asked to be, and the skin follows from balance to balance, as far as it can."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .step import Effort, Memory, Outcome
+
+__all__ = ["follow"]
+
+_PART = 1e-3  # the geoms move at most so far at once [m]
+_LEAST = 1e-5  # no part is tried that is shorter [m]
+_LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
+_FAR = 1.0  # geoms are moved out of the skin by no more [m]
+_EFFORT = 1.2e5  # of a step, for each outer node: a fifth of a second on the coarse skin
+_FIRST, _EACH = 0.4, 0.3  # shares of the effort left that the step at once and each part may take
+_SPENT = 0.05  # of the effort: so little is not worth a part
+
+
+def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple[Outcome, np.ndarray]:
+    """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
+    once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
+    effort = Effort(_EFFORT * skin.nouter)
+    motion = skin.pose(memory, pos, mat)
+    if np.abs(motion).max(initial=0.0) <= _PART:
+        effort.allow(_FIRST)
+        found = skin.attempt(memory, None, pos, mat, effort)
+        if found:
+            return found
+    deep = skin.search.deep(pos, mat)
+    if not deep and skin.untouched(pos, mat):  # the skin lets go
+        return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
+    if memory.started:
+        out, u, blocked = _go(skin, memory, pos, mat, effort)
+        if not blocked or deep:
+            return out, u
+    # the way there, if there is one, leads through the core; or nobody knows it
+    out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
+    return out, u
+
+
+def _go(skin, memory, pos, mat, effort):
+    """From a memory to poses in parts: outcome, displacements, whether the core is in the way."""
+    turn = Rotation.from_matrix(mat @ memory.geom_mat.transpose(0, 2, 1)).as_rotvec()
+    move = pos - memory.geom_pos
+    length = max(float((np.linalg.norm(move, axis=1) + _LEVER * np.linalg.norm(turn, axis=1)).max()), 1e-12)
+    at, part, found, blocked, iterations = 0.0, min(0.5, _PART / length), None, False, 0
+    spent, from_pos, from_mat = _SPENT * effort.left, memory.geom_pos, memory.geom_mat
+    u = None
+    while at < 1:
+        to = at + part
+        pose = from_pos + to * move, Rotation.from_rotvec(to * turn).as_matrix() @ from_mat
+        if to > 1 - 1e-9:
+            to, pose = 1.0, (pos, mat)
+        effort.allow(_EACH)
+        new = skin.attempt(memory, u, *pose, effort)
+        if new:
+            found, at, part = new, to, min(2 * part, _PART / length)
+            memory, u = found[0].memory, found[1]
+            iterations += found[0].iterations
+            continue
+        blocked |= skin.search.deep(*pose)
+        part /= 2
+        if part * length < _LEAST or effort.left < spent:
+            break
+    out, u = found or skin.hold(memory)
+    out = dataclasses.replace(out, converged=at == 1.0, iterations=iterations, reached=at)
+    return out, u, blocked and at < 1
+
+
+def _outside(skin, pos, mat):
+    """Memory of the resting skin with the geoms moved out of it, each along the mean normal of what it
+    touches."""
+    out = pos.copy()
+    for g in range(len(pos)):
+        alone = np.full_like(pos, 2 * _FAR)
+
+        def touches(distance, g=g, alone=alone, normal=0.0):
+            alone[g] = pos[g] + distance * normal
+            skin.pose(Memory.rest(len(pos)), alone, mat)
+            return not skin.untouched(alone, mat)
+
+        if not touches(0.0):
+            continue
+        normal = skin.normal(skin.search.faces(0.0, 0.0, alone, mat))
+        high = _LEAST
+        while high < _FAR and touches(high, normal=normal):
+            high *= 2
+        low = high / 2
+        while high - low > _PART:
+            middle = (low + high) / 2
+            low, high = (middle, high) if touches(middle, normal=normal) else (low, middle)
+        out[g] = pos[g] + high * normal
+    return skin.at_rest(out, mat, np.zeros_like(out)).memory
