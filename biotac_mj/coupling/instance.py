@@ -236,8 +236,8 @@ class Instance:
         )
 
     def last_energy(self) -> tuple:
-        """Energy [J] that the last step left in the skin at most, and the poses (ngroup, 3), (ngroup, 3, 3) at
-        which it left the bodies; None instead of these before the first step."""
+        """Energy [J] that the last step left in the skin at most, and the poses (ngroup, 3), (ngroup, 3, 3)
+        at which it left the bodies; None instead of these before the first step."""
         head, models, *_ = self.setup.parts(self.state)
         ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[_STARTED] else None
         return float(head[_ENERGY]), ends
@@ -325,6 +325,8 @@ class Instance:
 
     def _as_far_as_known(self, result, before):
         """Of a solve that found no balance: where the way to it ended, or the last step's model."""
+        if self.last_energy()[1] is None:  # the first step: its way came from outside
+            return result
         wrench, tangent, *last = self.last_model()
         if 0.0 < result.reached < 1.0:
             way = displacement(*result.pose, *last)

@@ -78,7 +78,7 @@ class Metric:
         islands = data.map_efc2iefc if data.nisland else None
         for root, here in self._places.items():
             self._rows[root] = here, None if islands is None else islands[here]
-        # MuJoCo adds dJ/dt v of the weld that a row was to the reference acceleration: taken off by the position
+        # MuJoCo adds dJ/dt v of the weld that a row was to its reference: the position takes it off again
         data.efc_KBIP[self._all] = _PLAIN
         data.efc_pos[self._all] = data.efc_margin[self._all]
         data.reference_constraints()

@@ -130,8 +130,8 @@ class World:
     def _restrain(self, skins, outside, acceleration):
         """Withholds so much of a skin's push that it does not give more energy than it has.
 
-        An accepted step may be wrong (friction's tangent is not exact, a solve may have gone part of the way),
-        and nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
+        An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
+        nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
         about the present pose: a damper.
         """
         for skin in [s for s in skins if s.overdraws()]:
