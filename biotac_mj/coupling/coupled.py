@@ -12,6 +12,7 @@ __all__ = ["Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 _DEEPER = 5e-4
+_MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the model that came closest must do
 _TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
 
 
@@ -21,6 +22,7 @@ class Coupled:
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
+      may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
     """
 
@@ -41,7 +43,7 @@ class Coupled:
         self.correction = np.zeros((len(self.wrench0), 6))
         self.asked = self.result = None
         self.written, self.settled = False, True
-        self.push, self.off = 1.0, np.inf
+        self.push, self.off, self.may_go, self._iterations = 1.0, np.inf, True, 0
         self.here = instance.touching.predict(data, 0.0)
 
     def leave_at_rest(self) -> None:
@@ -67,6 +69,8 @@ class Coupled:
             pose = displace(*self.asked, share * displacement(*pose, *self.asked))
         pose = self._within_reach(pose)
         result = self.instance.solve_for_pose(*pose, self._core_motion())
+        self._iterations += result.iterations
+        self.may_go = result.converged and self._iterations < _MOST_ITERATIONS
         self.use(pose, result)
 
     def model(self) -> tuple:

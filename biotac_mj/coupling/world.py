@@ -112,13 +112,13 @@ class World:
                 return acceleration, rounds
             if best is None or not off >= best[0]:
                 best = off, [skin.model() for skin in skins]
-            if rounds == MAX_ROUNDS:
+            going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
+            if rounds == MAX_ROUNDS or not going:
                 break
             share = max(0.5 * share, _LEAST_STEP) if off > _CLOSER * last else min(1.0, 2 * share)
             last = off
-            for skin in skins:
-                if skin.off >= TOLERANCE:
-                    skin.go(share)
+            for skin in going:
+                skin.go(share)
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
         acceleration = self._accelerations(skins, outside)
