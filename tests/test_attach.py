@@ -74,7 +74,7 @@ def test_model_carries_the_skins_parts():
         c: model.sensor(handle.sensor(c)).dim[0]
         for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
     }
-    assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=5)
+    assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=8)
     # the rigid core's mesh lies where the geometry says, whatever frame MuJoCo stores it in
     mujoco.mj_forward(model, data)
     geom = model.geom("tip_core")
@@ -249,7 +249,7 @@ def test_plain_mjcf_loads_without_the_plugin():
         "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else "
         "pathlib.Path(r'{}')\n"
         "m = mujoco.MjModel.from_xml_path(str(folder / 'biotac.xml'))\n"
-        "assert m.nplugin == 0 and m.nsensordata == 55 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) "
+        "assert m.nplugin == 0 and m.nsensordata == 58 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) "
         "< 1e-9\n"
         "mujoco.MjModel.from_xml_path(str(folder / 'scene_press.xml'))\n"
     )

@@ -407,7 +407,7 @@ def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted(
     assert status[0] == 0 and status[1] == failed + 3 and status[3] > 3e-4
     assert np.array_equal(handle.read(data, "contact_force"), force)
     assert np.array_equal(
-        data.plugin_state[4 + 54 :], good[4 + 54 :]
+        data.plugin_state[4 + 66 :], good[4 + 66 :]
     )  # all but the counters and the pose of the one touching body
     data.mocap_pos[0, 2] += 2.2e-3
     mujoco.mj_step(model, data, 3)
