@@ -11,9 +11,10 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..files import replacing, versions
+from ..files import hdf5
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS
+from ..versions import versions
 from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
 
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
@@ -76,7 +77,7 @@ def write_shard(
             )
     length = np.array([len(one.time) for one in interactions])
     stop = np.cumsum(length)
-    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+    with hdf5(path, track_order=True) as file:
         file.attrs.update(
             {
                 "schema": SCHEMA,

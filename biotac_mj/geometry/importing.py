@@ -1,12 +1,11 @@
 """Reads skins made elsewhere: `.tet` with `.obj` rigid bodies (as in NVlabs/biotac_sim), `.msh` and `.vtu`
 through meshio."""
 
-import os
 import pathlib
-import tempfile
 
 import numpy as np
 
+from biotac_mj.files import replacing
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
@@ -165,17 +164,12 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
     """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(
         f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1
     )
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".obj")
-    with os.fdopen(handle, "w") as file:
-        file.write(text)
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)
-    return path
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+    return pathlib.Path(path)
 
 
 def _rigid_bodies(folder):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
-from ..files import replacing
+from ..files import replacing, write_npz
 from ..sensor.channels import FULL_SCALE
 from .arrays import Arrays, load_arrays
 from .config import LearningConfig
@@ -330,7 +330,6 @@ def _write(out, name, arrays, check, rows, both, truth, predictions, report):
         for k, v in predictions.items()
     }
     content = {k: v.detach().cpu().numpy() if torch.is_tensor(v) else v for k, v in content.items()}
-    with replacing(out / f"{name}.npz") as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **content)
+    write_npz(out / f"{name}.npz", **content)
     with replacing(out / f"{name}.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(report, indent=1))

@@ -258,7 +258,8 @@ def _figures(result, drawn, out):
         below.set_ylabel("share of all readings")
         below.legend(fontsize=7)
     paths = [out.with_name(out.stem + "_errors.png"), out.with_name(out.stem + "_traces.png")]
-    figure.savefig(paths[0], dpi=110)
+    with replacing(paths[0]) as temporary:
+        figure.savefig(temporary, dpi=110)
     _traces(result, drawn, splits, paths[1])
     return [str(p) for p in paths]
 
@@ -286,4 +287,5 @@ def _traces(result, drawn, splits, path):
             axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)
             axis.set_xlabel("time [s]"), axis.set_ylabel("change [counts]")
             axis.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

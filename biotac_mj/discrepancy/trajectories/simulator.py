@@ -16,7 +16,7 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
-from ...files import replacing
+from ...files import replacing, write_npz
 from ...skin.settings import plain, read_material, read_settings
 from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
 
@@ -144,8 +144,7 @@ class Simulator:
                 "log_z": np.log(impedance),
             }
             if path is not None:
-                with replacing(path) as temporary:
-                    np.savez(temporary, **out[i])
+                write_npz(path, **out[i])
             if progress:
                 progress()
 
