@@ -35,15 +35,15 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> Non
             raise ValueError(f"{what} has {name!r}: {hint}choose from {', '.join(known)}")
 
 
-def check_types(settings: object, nan: bool = False) -> None:
+def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:
     """Refuses values of a dataclass that are not of its fields' types (ValueError).
 
     Args:
-      nan: whether NaN is a number.
+      names: of the fields; None is all. nan: whether NaN is a number.
     """
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        if not (nan and isinstance(value, float)):
+        if (names is None or field.name in names) and not (nan and isinstance(value, float)):
             _check(field.name, value, field.type)
 
 
@@ -66,8 +66,8 @@ def check_entries(what: str, given: object, wanted: Mapping[str, type], optional
 
 def _check(name, value, kind):
     if not _fits(value, kind):
-        finite = " that is one" if isinstance(value, float) else ""
-        raise ValueError(f"{name} is {reprlib.repr(value)}: pass {_called(kind)}{finite}")
+        called = "a finite number" if value != value else _called(kind)
+        raise ValueError(f"{name} is {reprlib.repr(value)}: pass {called}")
 
 
 def _fits(value, kind):
@@ -77,7 +77,7 @@ def _fits(value, kind):
     if parts:  # tuple[int, ...], list[str], dict[str, float]
         inside = value.values() if isinstance(value, dict) else value
         return _fits(value, typing.get_origin(kind)) and all(
-            _fits(one, parts[-1] if kind is dict else parts[0]) for one in inside
+            _fits(one, parts[-1] if isinstance(value, dict) else parts[0]) for one in inside
         )
     if kind is float:
         return isinstance(value, numbers.Real) and not _is_flag(value) and _is_number(value)

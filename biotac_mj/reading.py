@@ -10,7 +10,17 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-__all__ = ["Array", "check_arrays", "read_hdf5", "read_json", "read_npz", "read_text", "read_yaml", "reading"]
+__all__ = [
+    "Array",
+    "Unfit",
+    "check_arrays",
+    "read_hdf5",
+    "read_json",
+    "read_npz",
+    "read_text",
+    "read_yaml",
+    "reading",
+]
 
 _KINDS = {"finite": "fiu", "number": "fiu", "index": "iu", "flag": "biu", "text": "OSU"}
 
@@ -52,7 +62,11 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
 
 
 def check_arrays(
-    path: pathlib.Path | str, found: Mapping, wanted: Mapping[str, Array], remedy: str, sizes: dict | None = None
+    path: pathlib.Path | str,
+    found: Mapping,
+    wanted: Mapping[str, Array],
+    remedy: str,
+    sizes: dict | None = None,
 ) -> dict:
     """The sizes that the names of the arrays' shapes stand for.
 

@@ -8,6 +8,7 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
+    "arguments": "files",
     "fields": "",
     "files": "",
     "reading": "",
@@ -21,12 +22,12 @@ LAYERS = {
     "coupling": "skin sensor geometry fields learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor geometry learning.serve",
-    "press": "coupling plugin skin sensor geometry fields files versions view.offscreen",
-    "calibration": "geometry skin fields files reading press.indenter press.path",
+    "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
+    "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "data": "geometry skin sensor fields files reading versions press.approach press.indenter press.path",
     "tasks": "coupling sensor geometry files reading data.objects",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
-    "learning": "data sensor geometry fields files reading",
+    "learning": "arguments data sensor geometry fields files reading",
     "discrepancy": "effects data skin sensor geometry fields files reading",
     "biotac_mj": "plugin",
 }

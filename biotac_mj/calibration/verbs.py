@@ -127,7 +127,9 @@ def compare_verb(args: argparse.Namespace) -> None:
         calibration = (
             None
             if given
-            else kept.get("reference of the calibration", Indentation, lambda: stand_in(plan_shear(), **truth))
+            else kept.get(
+                "reference of the calibration", Indentation, lambda: stand_in(plan_shear(), **truth)
+            )
         )
         reference = (
             f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, "
@@ -137,7 +139,9 @@ def compare_verb(args: argparse.Namespace) -> None:
     for body in chosen:
         results.append(
             kept.get(
-                body.name, Comparison, lambda body=body: _compared(body, given, calibration, cases, kept, args)
+                body.name,
+                Comparison,
+                lambda body=body: _compared(body, given, calibration, cases, kept, args),
             )
         )
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
@@ -157,7 +161,9 @@ def _compared(body, given, calibration, cases, kept, args):
     if not given:
         settings = dict(device=args.device, progress=not args.quiet)
         fitted = kept.get(
-            f"calibration of {body.name}", Calibration, lambda: calibrate(body, material("paper"), calibration, **settings)
+            f"calibration of {body.name}",
+            Calibration,
+            lambda: calibrate(body, material("paper"), calibration, **settings),
         )
         if not args.quiet:
             print(f"{body.name}\n{calibration_table(fitted)}", flush=True)

@@ -50,6 +50,10 @@ def export_lerobot(
     out = pathlib.Path(out)
     if out.exists():
         raise ValueError(f"{out} is there already: choose another folder, or delete it")
+    if data.unfinished:
+        raise ValueError(
+            f"{data.path} is unfinished ({data.unfinished}): run its `biotac generate` again, which goes on"
+        )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
     for name in (counts, "indenter_pos", "indenter_quat", "wrench"):

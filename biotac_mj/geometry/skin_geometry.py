@@ -39,7 +39,9 @@ STORED = {
     "electrode_pos": Array((19, 3)),
     "electrode_normal": Array((19, 3)),
 }
-_INTO = {name: f"{name[:-5]}_vert" if name[:-5] in ("core", "nail", "clamp") else "vert" for name in _INT_FIELDS}
+_INTO = {
+    name: f"{name[:-5]}_vert" if name[:-5] in ("core", "nail", "clamp") else "vert" for name in _INT_FIELDS
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +94,8 @@ class SkinGeometry:
             index, count = getattr(self, name), len(getattr(self, vert))
             if index.size and not 0 <= index.min() <= index.max() < count:
                 raise ValueError(
-                    f"{name} of skin {self.name!r} names vertices {index.min()}..{index.max()}, it has {count}: "
+                    f"{name} of skin {self.name!r} names vertices {index.min()}..{index.max()}, "
+                    f"it has {count}: "
                     "indices must be 0-based; import the mesh again"
                 )
 

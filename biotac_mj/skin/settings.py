@@ -49,7 +49,9 @@ def read_settings(
     refuse_unknown(given, _KEYS, "options")
     skin = given.get("skin")
     if not isinstance(skin, SkinOptions):
-        skin = SkinOptions(**{**defaults, **_known(read_dict(skin, "options['skin']"), SkinOptions, "options['skin']")})
+        skin = SkinOptions(
+            **{**defaults, **_known(read_dict(skin, "options['skin']"), SkinOptions, "options['skin']")}
+        )
     return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
 
 
@@ -90,7 +92,8 @@ def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np
         factors = np.array(np.nan)
     if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
         raise ValueError(
-            f"modulus is {reprlib.repr(choice)}: pass a positive factor for each element, or a .npy file of them"
+            f"modulus is {reprlib.repr(choice)}: pass a positive factor for each element, or a .npy "
+            "file of them"
         )
     return factors
 
