@@ -8,6 +8,7 @@ import sys
 import traceback
 
 from .arguments import SEED, Parser, device, output_file, output_folder, real, whole
+from .files import check_output_file
 
 __all__ = ["main", "parser"]
 
@@ -297,6 +298,7 @@ def _import_mesh(args):
     out = pathlib.Path(args.out or f"{source.resolve().stem}.npz")
     if out.suffix != ".npz":
         raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
+    check_output_file(out)
     geometry = import_mesh(source)
     numbers = skin_numbers(geometry)
     units = {"angle": "deg", "volume": "mm3", "thickness": "mm"}

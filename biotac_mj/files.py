@@ -125,8 +125,8 @@ def check_output(folder: pathlib.Path | str, *names: str) -> None:
     """
     folder = pathlib.Path(folder)
     try:
+        _refuse_long(folder, names)
         there = _nearest(folder)
-        _refuse_long(folder, there, names)
         if there == folder:
             for path in (folder / name for name in names):
                 if os.path.lexists(path) and not path.is_file():
@@ -166,8 +166,8 @@ def _nearest(folder):
     raise ValueError(f"{folder} lies nowhere: choose another folder")
 
 
-def _refuse_long(folder, there, names):
-    longest, whole = os.pathconf(there, "PC_NAME_MAX"), os.pathconf(there, "PC_PATH_MAX")
+def _refuse_long(folder, names):
+    longest, whole = os.pathconf("/", "PC_NAME_MAX"), os.pathconf("/", "PC_PATH_MAX")
     for part in (*folder.parts, *names):
         if len(os.fsencode(part)) > longest - _ROOM:
             raise ValueError(f"{part[:40]}... is too long for a name: {longest - _ROOM} letters at most")

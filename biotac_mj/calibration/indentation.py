@@ -207,6 +207,8 @@ def _read_csv(path, indenter, direction):
             rows = list(csv.reader(file))
     if not rows:
         raise ValueError(f"{path} is empty: it needs a header with columns {', '.join(COLUMNS)}")
+    if not rows[1:]:
+        raise ValueError(f"{path} has a header and no rows: one for each sample is needed")
     header = [name.strip() for name in rows[0]]
     columns = {name: _column(path, header, rows[1:], name) for name in COLUMNS}
     value = np.array([columns[name] for name in COLUMNS]).T

@@ -399,7 +399,8 @@ def _check(path, file):
     if "geometry" in file:
         stored = {name: array for name, array in STORED.items() if name != "name"}
         wanted |= {f"geometry/{name}": array for name, array in stored.items()}
-        check_arrays(path, flat, {"geometry/vert": Array(("nvert", 3))}, _AGAIN, sizes)
+        first = {"geometry/vert": Array(("nvert", 3)), "geometry/outer_face": STORED["outer_face"]}
+        check_arrays(path, flat, first, _AGAIN, sizes)
         sizes["nouter"] = len(np.unique(flat["geometry/outer_face"][:]))
     for name, (shape, _, _) in COLUMNS.items():
         if name == "time" or f"step/{name}" in flat:
