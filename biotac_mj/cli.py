@@ -237,7 +237,7 @@ def _add_view(verbs):
         help="write a picture of the ball lying on the pad instead of opening a window",
     )
     verb.add_argument(
-        "--seconds", type=real(0, 3600), default=0.3, help="how long to simulate before --render"
+        "--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render"
     )
     verb.add_argument(
         "--hand",

@@ -76,9 +76,7 @@ def _fits(value, kind):
         return any(_fits(value, one) for one in parts)
     if parts:  # tuple[int, ...], list[str], dict[str, float]
         inside = value.values() if isinstance(value, dict) else value
-        return _fits(value, typing.get_origin(kind)) and all(
-            _fits(one, parts[-1] if isinstance(value, dict) else parts[0]) for one in inside
-        )
+        return _fits(value, typing.get_origin(kind)) and all(_fits(one, _inside(parts)) for one in inside)
     if kind is float:
         return isinstance(value, numbers.Real) and not _is_flag(value) and _is_number(value)
     if kind is int:
@@ -86,6 +84,11 @@ def _fits(value, kind):
     if kind is bool:
         return _is_flag(value)
     return isinstance(value, (tuple, list) if kind in (tuple, list) else kind or type(None))
+
+
+def _inside(parts):
+    """What the values of dict[str, KIND], list[KIND] or tuple[KIND, ...] are."""
+    return parts[0] if parts[-1] is Ellipsis else parts[-1]
 
 
 def _is_flag(value):
@@ -104,5 +107,5 @@ def _called(kind):
     if isinstance(kind, types.UnionType):
         return " or ".join(_called(one) for one in parts)
     if parts:
-        return f"{_CALLED[typing.get_origin(kind)]}, each {_called(parts[0])}"
+        return f"{_CALLED[typing.get_origin(kind)]}, each {_called(_inside(parts))}"
     return _CALLED.get(kind, getattr(kind, "__name__", "None"))

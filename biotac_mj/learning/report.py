@@ -72,10 +72,12 @@ _REPORT = {
     "interactions": int,
     "labelled": int,
     "device": str,
-    "mesh": dict,
-    "inverse": dict,
-    "seconds": dict,
+    "mesh": dict[str, dict],
+    "inverse": dict[str, dict[str, float | list[float]]],
+    "seconds": dict[str, float],
 }
+_MESH = {"all": dict[str, float], "objects": dict[str, dict[str, float]]}
+_ERRORS = {"mean": float, "moved": float}  # [mm]
 _PREDICTIONS = {
     "truth": Array(("n", NELECTRODE)),
     "tare": Array(("n", NELECTRODE)),
@@ -89,6 +91,11 @@ _PREDICTIONS = {
 def _report(path):
     """What `biotac train` says of one split and seed."""
     report = check_entries(str(path), read_json(path, "result of `biotac train`", _AGAIN), _REPORT)
+    for code, found in report["mesh"].items():
+        check_entries(f"mesh {code} of {path}", found, _MESH)
+        check_entries(f"all of mesh {code} of {path}", found["all"], _ERRORS)
+    for code, found in report["inverse"].items():
+        check_entries(f"inverse {code} of {path}", found, _ERRORS)
     if path.stem != f"{report['split']}-{report['seed']}":
         raise ValueError(f"{path} says it is {report['split']}-{report['seed']}: {_AGAIN}")
     return report

@@ -13,6 +13,7 @@ from .indenter import Indenter, add_indenter
 
 __all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
+_DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
 _PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
@@ -70,6 +71,11 @@ class PressOptions:
         for name in ("slide", "hold"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
+        for name, most in (("depth", _DEEPEST), ("slide", _LONGEST)):
+            if getattr(self, name) > most:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} m: the finger ends before {most:g} m; choose less"
+                )
         rests = self.hold * (2 if self.slide else 1)
         steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
         if steps > _MOST_STEPS:
