@@ -236,9 +236,7 @@ def _add_view(verbs):
         metavar="FILE",
         help="write a picture of the ball lying on the pad instead of opening a window",
     )
-    verb.add_argument(
-        "--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render"
-    )
+    verb.add_argument("--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render")
     verb.add_argument(
         "--hand",
         metavar="FILE",

@@ -11,11 +11,13 @@ import shutil
 from collections.abc import Callable
 
 import h5py
+import mujoco
 import numpy as np
 import pytest
 from good_input import ROWS as NROW
 from good_input import make_files
 
+import biotac_mj
 from biotac_mj import cli
 from biotac_mj.data.importers import RUPPEL_COLUMNS
 from biotac_mj.learning.config import LearningConfig
@@ -232,6 +234,12 @@ def files_of_skins():
     yield Row(SKIN, "skin.npz is no skin (Object arrays", "skin.npz", arrays(vert=lambda v: np.array([{}])))
     yield Row(SKIN, "elem has shape", "skin.npz", arrays(elem=lambda v: v[:, :3]))
     yield Row("press --skin mesh", "no skin at mesh: pass 'coarse'")
+    yield Row(SKIN, "a finger in metres is needed", "skin.npz", arrays(vert=lambda v: 1e3 * v))
+    for name in ("electrode_pos", "electrode_normal"):
+        for factor in (0, 9):
+            if (name, factor) != ("electrode_pos", 0):
+                change = arrays(**{name: lambda v, factor=factor: factor * v})
+                yield Row(SKIN, "electrodes of skin skin.npz are not on its core", "skin.npz", change)
 
 
 def files_of_presses():
@@ -263,6 +271,8 @@ def files_of_presses():
         yield Row(WEB, "of press.h5 has shape", "press.h5", put(name, lambda v: v[1:]))
     yield Row(WEB, "faces of missing nodes", "press.h5", put("outer_face", lambda v: v + 99999))
     yield Row(WEB, "times that run back", "press.h5", put("time", lambda v: -v))
+    yield Row(WEB, "these look like mN", "press.h5", put("force", lambda v: 1e4 * v))
+    yield Row(WEB, "raw counts 0..4095 are needed", "press.h5", put("counts", lambda v: v / 1e4))
     yield Row(WEB, "press.h5 has no attribute skin", "press.h5", attribute("skin"))
     yield Row(WEB, "press.h5 is no recording", "press.h5", cut)
 
@@ -636,6 +646,7 @@ def trained_models():
     yield Row("evaluate trained --electrodes electrodes.txt", "one at a time")
     yield Row("evaluate trained --force force.txt", "--force goes with --electrodes")
     yield Row("evaluate --electrodes electrodes.txt --ship out", "--ship copies")
+    yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
     yield Row("train shard.h5 --quiet --out trained", "is of other settings (set, config, models")
 
 
@@ -812,6 +823,26 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
     assert row.text in said and said.startswith("biotac: error: ") and said.count("\n") == 1, said[-2000:]
     assert code == 2
     assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"effects": []}, "options has 'effects': choose from skin, modulus, readings"),
+        ({"skn": {}}, "options has 'skn': did you mean 'skin'?"),
+        ({"skin": {"sample": 3}}, r"options\['skin'\] has 'sample': did you mean 'samples'?"),
+        ({"skin": {"samples": 2.5}}, "samples is 2.5: pass a whole number"),
+        ({"skin": {"contact_law": {"adhesn": 1}}}, "contact_law has 'adhesn': did you mean 'adhesion'?"),
+        ({"readings": {"nose": True}}, r"options\['readings'\] has 'nose': did you mean 'noise'?"),
+        ({"readings": {"noise": 1}}, r"noise of options\['readings'\] is 1: pass true or false"),
+        ({"readings": 3}, r"options\['readings'\] is 3: a dict is needed"),
+        ({"modulus": "nowhere.npy"}, "no modulus at nowhere.npy"),
+        ({"modulus": [1.0, -1.0]}, "pass a positive factor"),
+    ],
+)
+def test_attach_refuses_options_that_nothing_reads(options, said):
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        biotac_mj.attach(mujoco.MjSpec(), skin="coarse", options=options)
 
 
 def test_the_table_is_long():

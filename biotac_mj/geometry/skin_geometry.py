@@ -25,6 +25,8 @@ PARTS = np.array(
         [4, 9, 6, 7],
     ]
 )
+_SMALLEST, _LARGEST = 0.005, 0.1  # [m] that a skin measures
+_OFF = 1e-3  # [m] that an electrode may lie outside the core's box
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
 # how a skin is stored; indices are indices into what _INTO says
 STORED = {
@@ -134,4 +136,21 @@ class SkinGeometry:
         """
         remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
         found = read_npz(path, "skin", remedy, STORED)
-        return cls(**found | {"name": str(found["name"])})
+        skin = cls(**found | {"name": str(found["name"])})
+        size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0
+        if not _SMALLEST <= size <= _LARGEST:
+            raise ValueError(
+                f"skin {path} is {size:.3g} m long: a finger in metres is needed; import it again"
+            )
+        core = skin.core_vert if len(skin.core_vert) else skin.vert
+        low, high = core.min(0) - _OFF, core.max(0) + _OFF
+        length = np.linalg.norm(skin.electrode_normal, axis=1)
+        if (
+            not ((skin.electrode_pos >= low) & (skin.electrode_pos <= high)).all()
+            or (abs(length - 1) > 0.01).any()
+        ):
+            raise ValueError(
+                f"the electrodes of skin {path} are not on its core, or their normals are not of length one: "
+                "import the mesh again"
+            )
+        return skin

@@ -148,6 +148,8 @@ def _evaluate(args):
         raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
     if args.force and not args.electrodes:
         raise ValueError("--force goes with --electrodes: give both, or neither")
+    if args.weights and not args.new_sensor:
+        raise ValueError("--weights goes with --new-sensor: give both, or neither")
     if args.ship and not args.folder:
         raise ValueError("--ship copies what `biotac train` wrote: give its DIR, or leave it out")
     if args.json is None and not args.folder:

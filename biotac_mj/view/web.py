@@ -12,7 +12,7 @@ import numpy as np
 from ..coupling.show import electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5
-from ..sensor.channels import CHANNELS, REST_COUNTS
+from ..sensor.channels import CHANNELS, NELECTRODE, REST_COUNTS, check_counts, check_force
 
 __all__ = ["Finger", "Page", "play_file", "play_model"]
 
@@ -296,6 +296,8 @@ def play_file(
     vert, face, time, counts, force = (found[name] for name in _PRESS)
     if not len(time) or not face.size or face.max() >= vert.shape[1] or not (np.diff(time) > 0).all():
         raise ValueError(f"{path} has no steps, faces of missing nodes or times that run back: {remedy}")
+    check_counts(counts[:, :NELECTRODE], str(path))
+    check_force(force, str(path))
     try:
         geometry = load_skin(str(said["skin"]))
     except (ValueError, FileNotFoundError):
