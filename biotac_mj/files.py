@@ -45,44 +45,50 @@ def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathli
         _remove(temporary)
         raise
     finally:
-        os.close(lock)
+        if lock is not None:
+            os.close(lock)
 
 
 def remove_leftovers(folder: pathlib.Path | str) -> None:
     """Removes the temporaries of processes that have ended from a folder; those of others are locked."""
     for path in pathlib.Path(folder).glob(f"{_MARK}*"):
-        lock = _lock(path)
-        if lock is not None:
+        with contextlib.suppress(OSError):  # locked, gone meanwhile, or on a disk without locks
+            lock = _lock(path)
             _remove(path)
             os.close(lock)
 
 
 def _temporary(path, folder):
-    """A path nobody else has, and the handle that holds it."""
+    """A path nobody else has, and the handle that holds it (None on a disk without locks)."""
     while True:
         if folder:
             made = tempfile.mkdtemp(dir=path.parent, prefix=_MARK)
         else:
             handle, made = tempfile.mkstemp(dir=path.parent, prefix=_MARK, suffix=path.suffix)
             os.close(handle)
-        lock = _lock(made)
-        if lock is not None:
-            if os.path.exists(made):  # not taken for a leftover before it was locked
-                return pathlib.Path(made), lock
-            os.close(lock)
+        try:
+            lock = _lock(made)
+        except (BlockingIOError, FileNotFoundError):  # another process took it for a leftover
+            continue
+        except OSError:
+            return pathlib.Path(made), None
+        if os.path.exists(made):
+            return pathlib.Path(made), lock
+        os.close(lock)
 
 
 def _lock(path):
-    """A handle that holds the file until it is closed or its process ends; None where another one has it."""
-    try:
-        handle = os.open(path, os.O_RDONLY)
-    except OSError:  # gone meanwhile
-        return None
+    """A handle that holds the file until it is closed or its process ends.
+
+    Raises:
+      BlockingIOError: another one has it. OSError: it is gone, or its disk has no locks.
+    """
+    handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(handle)
-        return None
+        raise
     return handle
 
 
