@@ -2,7 +2,13 @@
 verb is used."""
 
 import argparse
+import errno
+import os
 import sys
+import traceback
+
+from .arguments import SEED, Parser, device, output_file, output_folder, real, whole
+from .files import check_output_file
 
 __all__ = ["main", "parser"]
 
@@ -43,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     from . import __version__
 
-    top = argparse.ArgumentParser(prog="biotac", description="A SynTouch BioTac fingertip in MuJoCo.")
+    top = Parser(prog="biotac", description="A SynTouch BioTac fingertip in MuJoCo.")
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     _add_press(verbs)
@@ -85,8 +91,10 @@ def _add_skin(verb, seed="of the sensor's noise"):
         default=None,
         help="liquid under the skin (default: the material's choice)",
     )
-    verb.add_argument("--seed", type=int, default=0, help=seed)
-    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+    verb.add_argument("--seed", type=SEED, default=0, help=seed)
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
     _add_options(verb)
 
 
@@ -107,31 +115,33 @@ def _add_press(verbs):
         "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.",
     )
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=_INDENTER_HELP)
-    verb.add_argument("--location", type=float, nargs="+", default=[-12.0], metavar="MM", help=_LOCATION_HELP)
+    verb.add_argument(
+        "--location", type=real(-1e3, 1e3), nargs="+", default=[-12.0], metavar="MM", help=_LOCATION_HELP
+    )
     verb.add_argument(
         "--direction",
-        type=float,
+        type=real(-1e9, 1e9),
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="of the press (default: inward normal of the skin there)",
     )
-    verb.add_argument("--depth", type=float, default=2.4, metavar="MM", help="travel from first touch")
+    verb.add_argument("--depth", type=real(), default=2.4, metavar="MM", help="travel from first touch")
     verb.add_argument(
-        "--slide", type=float, default=0.0, metavar="MM", help="travel along the skin after the press"
+        "--slide", type=real(), default=0.0, metavar="MM", help="travel along the skin after the press"
     )
     verb.add_argument(
         "--slide-direction",
-        type=float,
+        type=real(-1e9, 1e9),
         nargs=3,
         default=[1.0, 0.0, 0.0],
         metavar=("X", "Y", "Z"),
         help="of the slide",
     )
-    verb.add_argument("--speed", type=float, default=10.0, metavar="MM/S", help="of press and slide")
+    verb.add_argument("--speed", type=real(), default=10.0, metavar="MM/S", help="of press and slide")
     verb.add_argument(
-        "--hold", type=float, default=20.0, metavar="MS", help="rest at the end of press and slide"
+        "--hold", type=real(), default=20.0, metavar="MS", help="rest at the end of press and slide"
     )
-    verb.add_argument("--timestep", type=float, default=4.0, metavar="MS", help="of MuJoCo")
+    verb.add_argument("--timestep", type=real(), default=4.0, metavar="MS", help="of MuJoCo")
     ways = verb.add_mutually_exclusive_group()
     ways.add_argument(
         "--one-way",
@@ -148,10 +158,14 @@ def _add_press(verbs):
         help="a servo with mass pushes the indenter and gives way",
     )
     verb.add_argument(
-        "--mu", type=float, default=None, help="friction between skin and indenter (default: the material's)"
+        "--mu",
+        type=real(0, 100),
+        default=None,
+        help="friction between skin and indenter (default: the material's)",
     )
     _add_skin(verb)
-    verb.add_argument("--out", default="out/press", metavar="DIR", help="folder of the results")
+    files = output_folder("readings.csv", "skin.h5", "press.png")
+    verb.add_argument("--out", type=files, default="out/press", metavar="DIR", help="folder of the results")
     verb.add_argument(
         "--render",
         action=argparse.BooleanOptionalAction,
@@ -192,7 +206,7 @@ def _press(args):
         device=args.device,
         options=args.options,
     )
-    _calm_warp()
+    _start_warp(args)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -218,10 +232,11 @@ def _add_view(verbs):
     _add_skin(verb)
     verb.add_argument(
         "--render",
+        type=output_file(),
         metavar="FILE",
         help="write a picture of the ball lying on the pad instead of opening a window",
     )
-    verb.add_argument("--seconds", type=float, default=0.3, help="how long to simulate before --render")
+    verb.add_argument("--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render")
     verb.add_argument(
         "--hand",
         metavar="FILE",
@@ -235,13 +250,13 @@ def _add_view(verbs):
     verb.add_argument(
         "--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation"
     )
-    verb.add_argument("--port", type=int, default=8080, help="of the page")
+    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
 
 
 def _view(args):
     from .view import view
 
-    _calm_warp()
+    _start_warp(args)
     view(
         skin=args.skin,
         tier=args.tier,
@@ -255,6 +270,7 @@ def _view(args):
         web=args.web,
         recording=args.recording,
         port=args.port,
+        options=args.options,
     )
 
 
@@ -280,6 +296,7 @@ def _import_mesh(args):
     out = pathlib.Path(args.out or f"{source.resolve().stem}.npz")
     if out.suffix != ".npz":
         raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
+    check_output_file(out)
     geometry = import_mesh(source)
     numbers = skin_numbers(geometry)
     units = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
@@ -329,18 +346,18 @@ def _add_calibrate(verbs):
     )
     verb.add_argument(
         "--noise",
-        type=float,
+        type=real(0, 1e3),
         default=0.01,
         metavar="N",
         help="of each synthetic force component, standard deviation",
     )
-    verb.add_argument("--seed", type=int, default=0, help="of that noise")
+    verb.add_argument("--seed", type=SEED, default=0, help="of that noise")
     verb.add_argument(
         "--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {_INDENTER_HELP}"
     )
     verb.add_argument(
         "--direction",
-        type=float,
+        type=real(-1e9, 1e9),
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="the indenter's tip points there (default: +y)",
@@ -376,9 +393,15 @@ def _add_calibrate(verbs):
         metavar="NAME[:LOW:HIGH]",
         help="parameters, with bounds if you like",
     )
-    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
     verb.add_argument(
-        "--out", default="out/calibrate", metavar="DIR", help="folder of calibration.json and calibration.png"
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
+    verb.add_argument(
+        "--out",
+        type=output_folder("calibration.json", "calibration.png", "synthetic.csv"),
+        default="out/calibrate",
+        metavar="DIR",
+        help="folder of calibration.json and calibration.png",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -386,7 +409,7 @@ def _add_calibrate(verbs):
 def _calibrate(args):
     from .calibration import verbs
 
-    _calm_warp()
+    _start_warp(args)
     verbs.calibrate_verb(args)
 
 
@@ -414,8 +437,10 @@ def _add_compare(verbs):
     verb.add_argument(
         "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which"
     )
-    verb.add_argument("--count", type=int, default=1, help="random indentations for each indenter")
-    verb.add_argument("--seed", type=int, default=0, help="of the indentations")
+    verb.add_argument(
+        "--count", type=whole(1, 10_000), default=1, help="random indentations for each indenter"
+    )
+    verb.add_argument("--seed", type=SEED, default=0, help="of the indentations")
     verb.add_argument(
         "--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it"
     )
@@ -437,15 +462,20 @@ def _add_compare(verbs):
     verb.add_argument(
         "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
     )
-    verb.add_argument("--device", default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
-    verb.add_argument("--out", default="out/compare", metavar="DIR", help="folder of compare.json")
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
+    files = output_folder("compare.json", "compare.kept")
+    verb.add_argument(
+        "--out", type=files, default="out/compare", metavar="DIR", help="folder of compare.json"
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _compare(args):
     from .calibration import verbs
 
-    _calm_warp()
+    _start_warp(args)
     verbs.compare_verb(args)
 
 
@@ -462,17 +492,17 @@ def _add_generate(verbs):
         _generate,
         "Make a synthetic data set of random interactions; goes on where it was interrupted.",
     )
-    verb.add_argument("--count", type=int, default=2600, help="interactions")
-    verb.add_argument("--steps", type=int, default=20, help="time steps of each")
-    verb.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="of the time steps")
+    verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="interactions")
+    verb.add_argument("--steps", type=whole(8, 2000), default=20, help="time steps of each")
+    verb.add_argument("--rate", type=real(1e-3, 1e6), default=20.0, metavar="HZ", help="of the time steps")
     verb.add_argument(
         "--labelled",
-        type=int,
+        type=whole(0, 10_000_000),
         help="of them, how many get the synthetic measured sensor's counts too (default: 359)",
     )
     verb.add_argument(
         "--recordings",
-        type=int,
+        type=whole(0, 10_000_000),
         default=0,
         help="further interactions of which only the synthetic sensor's counts are kept",
     )
@@ -494,20 +524,22 @@ def _add_generate(verbs):
     )
     verb.add_argument(
         "--batch",
-        type=int,
+        type=whole(1, 100_000),
         default=160,
         help="worlds at most that are solved together; a shard holds one batch",
     )
     verb.add_argument(
         "--measured-batch",
-        type=int,
+        type=whole(1, 100_000),
         default=90,
         help="the same where the synthetic measured sensor takes part",
     )
-    verb.add_argument("--measured-seed", type=int, default=0, help="number of the synthetic measured sensor")
+    verb.add_argument("--measured-seed", type=SEED, default=0, help="number of the synthetic measured sensor")
     verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
     verb.add_argument(
-        "--workers", type=int, help="processes that compute electrode readings (default: one per core)"
+        "--workers",
+        type=whole(0, 1024),
+        help="processes that compute electrode readings (default: one per core)",
     )
     verb.add_argument(
         "--vary",
@@ -516,14 +548,20 @@ def _add_generate(verbs):
         '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
     )
     _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
-    verb.add_argument("--out", default="out/set", metavar="DIR", help="folder of the set")
+    verb.add_argument(
+        "--out",
+        type=output_folder("generate.json"),
+        default="out/set",
+        metavar="DIR",
+        help="folder of the set",
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _generate(args):
     from .data import verbs
 
-    _calm_warp()
+    _start_warp(args)
     verbs.generate_verb(args)
 
 
@@ -553,7 +591,7 @@ def _add_diagnose(verbs):
     )
     verb.add_argument(
         "--rate",
-        type=float,
+        type=real(1e-3, 1e6),
         default=None,
         metavar="HZ",
         help="rows per second (default: guessed from repeated rows, else 100)",
@@ -562,7 +600,7 @@ def _add_diagnose(verbs):
         "of the data, kept aside for the proof (default: "
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
-    verb.add_argument("--locked", type=float, default=None, metavar="SHARE", help=kept)
+    verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="SHARE", help=kept)
     verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
     verb.add_argument(
         "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
@@ -574,16 +612,17 @@ def _add_diagnose(verbs):
         help="constitutive effects inside the finite elements (full tier) in the proof",
     )
     verb.add_argument(
-        "--device", default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
+        "--device", type=device, default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
     )
-    verb.add_argument("--out", default="out/diagnose", metavar="DIR", help="folder of the report")
+    files = output_folder("report.html", "verdict.json", "sensor_amended.yaml")
+    verb.add_argument("--out", type=files, default="out/diagnose", metavar="DIR", help="folder of the report")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _diagnose(args):
     from .discrepancy import verbs
 
-    _calm_warp()
+    _start_warp(args)
     verbs.diagnose_verb(args)
 
 
@@ -601,16 +640,21 @@ def _add_data(verbs):
         help="(default: by the ending: .hdf5, .csv, others text)",
     )
     verb.add_argument("--force", metavar="FILE", help="text: forces beside it, 3 columns [N]")
-    verb.add_argument("--rate", type=float, metavar="HZ", help="nvidia, text: of the samples (default: 100)")
     verb.add_argument(
-        "--block", type=float, metavar="S", help="text: cut the log into interactions of this length"
+        "--rate", type=real(1e-3, 1e6), metavar="HZ", help="nvidia, text: of the samples (default: 100)"
+    )
+    verb.add_argument(
+        "--block",
+        type=real(1e-3, 1e9),
+        metavar="S",
+        help="text: cut the log into interactions of this length",
     )
     verb.add_argument("--object", metavar="NAME", help="ruppel, text: what touched")
     verb.add_argument(
         "--objects", nargs="+", metavar="NAME", help="nvidia: names of indenter types 0, 1, ..."
     )
-    verb.add_argument("--seed", type=int, default=0, help="of the split by interaction")
-    verb.add_argument("--out", required=True, metavar="DIR", help="folder of the set")
+    verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
+    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
     verb = _verb(
         verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
     )
@@ -620,7 +664,7 @@ def _add_data(verbs):
         action="store_true",
         help="measured counts, of interactions that have them, not simulated ones",
     )
-    verb.add_argument("--out", required=True, metavar="DIR", help="folder to make")
+    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -636,24 +680,69 @@ def _export_data(args):
     verbs.export_verb(args)
 
 
-def _calm_warp():
-    """Hides the list of devices and compiled modules; warnings stay."""
+def _start_warp(args):
+    """Hides the list of devices and compiled modules, warnings stay; refuses devices that are not here."""
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
+    there = [one.alias for one in warp.get_devices()]
+    for name in args.device.split(","):
+        if name not in (*there, *("cuda" for one in there if one != "cpu")):
+            raise ValueError(f"--device {name} is not here: choose one of {', '.join(there)}")
+
+
+# what is said of errors of the system beside their own text
+_REMEDIES = {
+    errno.ENOSPC: "free some space on that disk, or choose another --out",
+    errno.EDQUOT: "free some of your quota, or choose another --out",
+    errno.EFBIG: "choose an --out where larger files may be",
+    errno.EROFS: "choose another --out",
+    errno.EACCES: "choose another place, or ask for the right to it",
+    errno.EPERM: "choose another place, or ask for the right to it",
+    errno.ENAMETOOLONG: "give a shorter name",
+}
+
+
+def _said(error) -> str:
+    """An error in one line: cause and remedy."""
+    if isinstance(error, OSError) and error.errno:
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"{where}{error.strerror}: {_REMEDIES.get(error.errno, 'check the path, then try again')}"
+    elif isinstance(error, MemoryError):
+        text = "this needs more memory than there is: ask for fewer steps, worlds or interactions at once"
+    else:
+        text = str(error)
+    return " ".join(text.split())
 
 
 def main(argv=None) -> int:
-    """Runs a verb; bad input is one line on stderr and exit code 2."""
-    args = parser().parse_args(argv)
+    """Runs a verb; bad input is one line on stderr and exit code 2.
+
+    What nobody expected is one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows all.
+    """
     try:
+        args = parser().parse_args(argv)
         args.run(args)
-    except (ValueError, FileNotFoundError) as error:
-        print(f"biotac: error: {error}", file=sys.stderr)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, MemoryError) as error:
+        print(f"biotac: error: {_said(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("biotac: stopped", file=sys.stderr)
         return 130
+    except Exception as error:
+        if os.environ.get("BIOTAC_TRACEBACK"):
+            raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        print(
+            f"biotac: error: unexpected {type(error).__name__} in {os.path.basename(place.filename)}, line "
+            f"{place.lineno}: {_said(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
+            file=sys.stderr,
+        )
+        return 70
     return 0
 
 

@@ -1,42 +1,181 @@
-"""Files that are written whole or not at all, and the versions of what wrote them."""
+"""Files that are written whole or not at all, and whether they could be, asked before the work."""
 
 import contextlib
+import fcntl
+import io
 import os
 import pathlib
+import shutil
+import stat
 import tempfile
+import typing
+from collections.abc import Iterator
 
 import numpy as np
 
-__all__ = ["replacing", "versions"]
+if typing.TYPE_CHECKING:
+    import h5py
+
+__all__ = ["check_output", "check_output_file", "hdf5", "remove_leftovers", "replacing", "write_npz"]
+
+_MARK = ".biotac-"  # the name of a temporary begins with it
+_ROOM = 32  # letters that a temporary's name needs beyond the ending of the file's
 
 
 @contextlib.contextmanager
-def replacing(path):
+def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathlib.Path]:
     """Gives a temporary path with the same ending in the same folder; renames it to `path` if all went well,
-    else removes it."""
+    else removes it. What a killed process left in the folder is removed first.
+
+    Args:
+      path: of the file, or with `folder` of a folder that is not there yet.
+
+    Raises:
+      OSError: it cannot be written.
+    """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-    os.close(handle)
+    remove_leftovers(path.parent)
+    temporary, lock = _temporary(path, folder)
     try:
-        yield pathlib.Path(temporary)
-        os.chmod(temporary, 0o644)
+        yield temporary
+        os.chmod(temporary, 0o755 if folder else 0o644)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        _remove(temporary)
         raise
+    finally:
+        if lock is not None:
+            os.close(lock)
 
 
-def versions() -> dict:
-    """Versions of what computed the press."""
-    import mujoco
-    import warp
+def remove_leftovers(folder: pathlib.Path | str) -> None:
+    """Removes the temporaries of processes that have ended from a folder; those of others are locked."""
+    for path in pathlib.Path(folder).glob(f"{_MARK}*"):
+        with contextlib.suppress(OSError):  # locked, gone meanwhile, or on a disk without locks
+            lock = _lock(path)
+            _remove(path)
+            os.close(lock)
 
-    from . import __version__
 
-    return {
-        "biotac-mj": __version__,
-        "mujoco": mujoco.__version__,
-        "warp-lang": warp.__version__,
-        "numpy": np.__version__,
-    }
+def _temporary(path, folder):
+    """A path nobody else has, and the handle that holds it (None on a disk without locks)."""
+    while True:
+        if folder:
+            made = tempfile.mkdtemp(dir=path.parent, prefix=_MARK)
+        else:
+            handle, made = tempfile.mkstemp(dir=path.parent, prefix=_MARK, suffix=path.suffix)
+            os.close(handle)
+        try:
+            lock = _lock(made)
+        except (BlockingIOError, FileNotFoundError):  # another process took it for a leftover
+            continue
+        except OSError:
+            return pathlib.Path(made), None
+        if os.path.exists(made):
+            return pathlib.Path(made), lock
+        os.close(lock)
+
+
+def _lock(path):
+    """A handle that holds the file until it is closed or its process ends.
+
+    Raises:
+      BlockingIOError: another one has it. OSError: it is gone, or its disk has no locks.
+    """
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _remove(path):
+    if os.path.isdir(path):
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        pathlib.Path(path).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def hdf5(path: pathlib.Path | str, **settings: object) -> Iterator["h5py.File"]:
+    """A new HDF5 file, which is at `path` as soon as it has been filled.
+
+    It is filled in memory: on a full disk HDF5 fails when it closes, and takes the process with it.
+    """
+    import h5py
+
+    memory = io.BytesIO()
+    with h5py.File(memory, "w", **settings) as file:
+        yield file
+    with replacing(path) as temporary:
+        temporary.write_bytes(memory.getbuffer())
+
+
+def write_npz(path: pathlib.Path | str, **arrays: np.ndarray) -> None:
+    """Arrays as a compressed .npz file."""
+    memory = io.BytesIO()
+    np.savez_compressed(memory, allow_pickle=False, **arrays)
+    with replacing(path) as temporary:
+        temporary.write_bytes(memory.getbuffer())
+
+
+def check_output(folder: pathlib.Path | str, *names: str) -> None:
+    """Refuses a folder in which files of these names could not be written; makes nothing but room: see
+    `remove_leftovers`.
+
+    Raises:
+      ValueError: what is in the way.
+    """
+    folder = pathlib.Path(folder)
+    try:
+        _refuse_long(folder, names)
+        there = _nearest(folder)
+        if there == folder:
+            for path in (folder / name for name in names):
+                if os.path.lexists(path) and not path.is_file():
+                    raise ValueError(f"{path} is there and is no file: remove it, or choose another folder")
+            remove_leftovers(folder)
+        with tempfile.TemporaryFile(dir=there, buffering=0) as file:
+            file.write(bytes(4096))
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot be written to ({error.strerror or error}): choose another place"
+        ) from None
+
+
+def check_output_file(path: pathlib.Path | str, *more: str) -> None:
+    """The same for one file, and for others beside it."""
+    path = pathlib.Path(path)
+    if os.path.isdir(path) or not path.name:
+        raise ValueError(f"{path} is a folder: give the name of a file")
+    check_output(path.parent, path.name, *more)
+
+
+def _nearest(folder):
+    """The folder, or what is there of the way to it."""
+    for path in (folder, *folder.parents):
+        try:
+            mode = os.stat(path).st_mode
+        except FileNotFoundError:
+            if os.path.islink(path):
+                raise ValueError(f"{path} is a link to nothing: choose another folder") from None
+            continue
+        except NotADirectoryError:
+            continue
+        if not stat.S_ISDIR(mode):
+            under = "is a file" if path == folder else f"lies under {path}, which is a file"
+            raise ValueError(f"{folder} {under}: choose another folder")
+        return path
+    raise ValueError(f"{folder} lies nowhere: choose another folder")
+
+
+def _refuse_long(folder, names):
+    longest, whole = os.pathconf("/", "PC_NAME_MAX"), os.pathconf("/", "PC_PATH_MAX")
+    for part in (*folder.parts, *names):
+        if len(os.fsencode(part)) > longest - _ROOM:
+            raise ValueError(f"{part[:40]}... is too long for a name: {longest - _ROOM} letters at most")
+    if len(os.fsencode(folder.absolute())) + max(map(len, ("", *names))) > whole - _ROOM:
+        raise ValueError(f"{str(folder)[:40]}... is too long for a path: {whole - _ROOM} letters at most")

@@ -199,7 +199,7 @@ def test_room_for_more_bodies_must_be_there():
         (dict(geoms=["cups"]), r"no geom 'cups' to touch: the model has arm, hand, cup"),
         (dict(rounding={"edge": 1e-3}), r"no geom 'edge' to touch"),
         (dict(friction=-1.0), r"the skin's friction is -1.0: give a number >= 0"),
-        (dict(friction=float("nan")), r"the skin's friction is nan"),
+        (dict(friction=float("nan")), r"friction is nan"),
         (dict(stepper="femm"), r"unknown stepper 'femm': choose one of .*springs"),
         (dict(readings="volts"), r"unknown readings 'volts': choose one of biotac, "),
         (dict(skin="/no/such/skin.npz"), r"no skin at .*skin.npz"),

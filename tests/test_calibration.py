@@ -2,6 +2,8 @@
 closed forms, error texts."""
 
 import dataclasses
+import pathlib
+import pickle
 
 import numpy as np
 import pytest
@@ -22,11 +24,14 @@ from biotac_mj.calibration import (
     stand_in,
     write_indentation,
 )
-from biotac_mj.calibration.fit import forces_and_jacobian
-from biotac_mj.calibration.report import read_material, write_json
+from biotac_mj.calibration.comparison import Comparison
+from biotac_mj.calibration.fit import Calibration, forces_and_jacobian
+from biotac_mj.calibration.kept import Kept
+from biotac_mj.calibration.report import write_json
 from biotac_mj.calibration.statistics import covariance, ljung_box
 from biotac_mj.geometry.tet_mesh import TetMesh
-from biotac_mj.skin import Material
+from biotac_mj.skin import Material, SkinOptions
+from biotac_mj.skin.settings import read_material
 
 TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5, liquid=False)
 
@@ -261,7 +266,7 @@ def test_error_texts(way, shell, tmp_path):
         calibrate(shell, TRUTH, dataclasses.replace(way, force=way.force + 1), ["E:10:20"])
     with pytest.raises(ValueError, match="fewer"):
         covariance(np.ones((5, 3, 2)), np.ones((5, 3)))
-    with pytest.raises(FileNotFoundError, match="no calibration"):
+    with pytest.raises(FileNotFoundError, match="no material"):
         read_material(tmp_path / "none.json")
     write_json({"material": TRUTH}, tmp_path / "fit.json")
     assert read_material(tmp_path / "fit.json") == TRUTH
@@ -286,7 +291,7 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
         calls.append(body.name)
         if body.name == "shell_with_core" and calls.count(body.name) == 1:
             raise KeyboardInterrupt
-        return Fitted()
+        return fitted()
 
     monkeypatch.setattr(verbs, "calibrate", calibrated)
     monkeypatch.setattr(verbs, "calibration_table", lambda fitted: "fitted")
@@ -316,21 +321,84 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
     assert calls[3:] == ["shell_with_core"] and "goes on after reference" in capsys.readouterr().out
     assert cli.main([*given, "--seed", "1"]) == 0
     assert calls[4:] == ["reference", "deformable_shell", "shell_with_core"]
-    (tmp_path / "compare.kept").write_bytes(b"cut short")
-    assert cli.main(given) == 0 and calls[7:] == ["reference", "deformable_shell", "shell_with_core"]
+    for damage in (b"cut short", pickle.dumps(Touches(tmp_path / "executed"))):
+        (tmp_path / "compare.kept").write_bytes(damage)
+        before = len(calls)
+        assert cli.main(given) == 0 and calls[before:] == ["reference", "deformable_shell", "shell_with_core"]
+    assert not (tmp_path / "executed").exists()
 
 
-@dataclasses.dataclass
-class Fitted:
-    """In place of a Calibration, which takes minutes."""
+class Touches:
+    """A pickle that makes a file when it is loaded."""
 
-    material: Material = TRUTH
-    mean: float = 0.1
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return pathlib.Path.touch, (self.path,)
+
+
+def test_parts_are_kept_bit_for_bit(tmp_path):
+    path, plan = tmp_path / "parts.kept", plan_shear(skin="coarse")
+    made = {
+        "plan": plan,
+        "fit": fitted(),
+        "compared": _compared("solid", TRUTH),
+    }
+    first = Kept(path, {"seed": 1, "names": ("a", "b")})
+    for name, part in made.items():
+        first.get(name, type(part), lambda part=part: part)
+    again = Kept(path, {"seed": 1, "names": ["a", "b"]})
+    assert again.names == list(made)
+    for name, part in made.items():
+        found = again.get(name, type(part), None)
+        for field in dataclasses.fields(part):
+            left, right = getattr(found, field.name), getattr(part, field.name)
+            if isinstance(right, np.ndarray):
+                np.testing.assert_array_equal(left, right)
+                assert left.dtype == right.dtype
+            elif not dataclasses.is_dataclass(right):
+                assert left == right or left != left and right != right  # NaN
+    assert again.get("fit", Comparison, lambda: made["compared"]) is made["compared"]  # of another type
+    assert Kept(path, {"seed": 2}).names == []
+
+
+def fitted():
+    """A Calibration that nobody made: a real one takes minutes."""
+    two, n = np.array([0.1, 1 / 3]), 3
+    return Calibration(
+        configuration="shell_with_core",
+        skin="coarse",
+        law="neo_hookean",
+        element="linear",
+        liquid=False,
+        indenter="sphere_7mm",
+        parameters=["youngs_modulus", "friction"],
+        start=two,
+        value=two,
+        interval=np.stack([two, two], 1),
+        standard_error=two,
+        standard_error_robust=two,
+        lags=1,
+        correlation=np.eye(2),
+        at_bound=np.array([True, False]),
+        rms=0.1,
+        mean=0.1,
+        peak=1.0,
+        whiteness={"p_value": [0.1, 0.2, 0.3], "white": True, "lags": 1},
+        material=TRUTH,
+        options=SkinOptions(contact_law={"adhesion": 0.05}),
+        time=np.arange(n) / 3,
+        measured=np.ones((n, 3)),
+        fitted=np.ones((n, 3)),
+        evaluations=1,
+        success=True,
+        message="",
+        nonconverged=0,
+    )
 
 
 def _compared(name, material):
-    from biotac_mj.calibration.comparison import Comparison
-
     return Comparison(
-        name, Fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, 1e-5, 0, 1, []
+        name, fitted(), material, {"sphere_7mm": 0.1}, {"sphere_7mm": 0.2}, 1e-5, float("nan"), 0, 1, []
     )

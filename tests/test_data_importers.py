@@ -87,10 +87,10 @@ def test_nvidia_set_splits_by_trajectory(tmp_path):
 @pytest.mark.parametrize(
     "changes, text",
     [
-        (dict(electrode_vals=None), "has no electrode_vals/data: it is not one of NVIDIA's"),
-        (dict(force_vec=np.zeros((22, 6))), r"force_vec/data of .* has shape \(22, 6\): \(22, 3\) is needed"),
+        (dict(electrode_vals=None), "has no electrode_vals/data: give an HDF5 file with"),
+        (dict(force_vec=np.zeros((22, 6))), r"force_vec/data of .* has shape \(22, 6\), \(22, 3\) is needed"),
         (dict(indenter_type=np.zeros(7)), "indenter_type/data .* has 7 entries for 22 samples"),
-        (dict(electrode_vals=np.full((22, 19), -3.5)), "e1 of row 0 is -3.5: raw counts between 0 and 4095"),
+        (dict(electrode_vals=np.full((22, 19), -3.5)), "e1 of row 0 is -3.5: raw counts 0..4095"),
     ],
 )
 def test_bad_nvidia_files_are_named(tmp_path, changes, text):
@@ -100,10 +100,10 @@ def test_bad_nvidia_files_are_named(tmp_path, changes, text):
 
 
 def test_missing_and_foreign_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no recording at .*a.hdf5"):
+    with pytest.raises(FileNotFoundError, match="no recording of NVIDIA.s at .*a.hdf5"):
         read_nvidia(tmp_path / "a.hdf5")
     (tmp_path / "a.hdf5").write_text("no")
-    with pytest.raises(ValueError, match="it is no HDF5 file"):
+    with pytest.raises(ValueError, match="is no recording of NVIDIA.s"):
         read_nvidia(tmp_path / "a.hdf5")
     nvidia(tmp_path / "b.hdf5")
     with pytest.raises(ValueError, match="has indenter type 2, but 2 object names were given"):

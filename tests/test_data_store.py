@@ -189,7 +189,7 @@ def test_bad_sets_are_named(skin, tmp_path):
     with pytest.raises(FileNotFoundError, match="no shards"):
         TactileSet(tmp_path / "absent.h5")
     (tmp_path / "shard-00000.h5").write_bytes(b"not a file of this kind")
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match="is no readable shard"):
         TactileSet(tmp_path)
     write_shard(shard_path(tmp_path, 0), [make(skin, 0)], skin)
     with h5py.File(shard_path(tmp_path, 0), "a") as file:

@@ -99,8 +99,12 @@ def test_weights_are_shipped_with_a_card(trained, tmp_path):
 
 def test_training_goes_on_where_it_was_interrupted(trained, folder):
     stamp = (trained / "trajectory-0.json").stat().st_mtime_ns
-    train_all(folder, trained, (0,), ("trajectory",), SMALL, paper=False, progress=False)
+    same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
+    train_all(folder, trained, (0,), ("trajectory",), SMALL, **same)
     assert (trained / "trajectory-0.json").stat().st_mtime_ns == stamp
+    for name, changes in (("models", same | {"only": None}), ("limit", same | {"limit": 9})):
+        with pytest.raises(ValueError, match=rf"json is of other settings \({name}\): choose another --out"):
+            train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
 
 
 @pytest.mark.slow
@@ -140,7 +144,7 @@ def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
         load_forward(weights, load_skin("default"))
     with pytest.raises(ValueError, match="holds no inverse model"):
         load_inverse(weights, skin)
-    with pytest.raises(FileNotFoundError, match="no weights"):
+    with pytest.raises(FileNotFoundError, match="no file of weights"):
         load_forward(weights.with_name("none.safetensors"), skin)
     with pytest.raises(ValueError, match=r"reads \(n, 2741, 3\)|this model reads"):
         model.log_change(torch.zeros(1, 5, 3))
@@ -153,7 +157,7 @@ def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
 def test_damaged_weights_are_named(weights, tmp_path):
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(weights.read_bytes()[:2000])
-    with pytest.raises(ValueError, match="not a readable safetensors file"):
+    with pytest.raises(ValueError, match="is no file of weights"):
         load_forward(broken, load_skin("coarse"))
 
 
@@ -337,7 +341,7 @@ def test_contact_patch_finds_the_touch(trained, tmp_path):
     assert one["row"] == 2 and (tmp_path / "out/contact.png").stat().st_size > 20_000
     with pytest.raises(ValueError, match="--row 9"):
         contact_patch(source, tmp_path / "out", row=9)
-    with pytest.raises(ValueError, match="pass raw counts"):
+    with pytest.raises(ValueError, match="raw counts 0..4095 are needed"):
         log_change_of(np.full((1, 19), np.nan), rest)
     with pytest.raises(ValueError, match="19 electrodes"):
         log_change_of(np.zeros((1, 18)), rest)

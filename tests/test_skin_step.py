@@ -286,7 +286,7 @@ def test_numbers_of_worlds(model):
     (dict(tolerance=0.0), "tolerance is 0.0: pass a positive finite number"),
     (dict(stick_ratio=float("nan")), "stick_ratio is nan: pass a positive finite number"),
     (dict(contact_stiffness=0.0), "contact_stiffness is 0.0: pass a positive number of Pa/m, or None"),
-    (dict(max_newton=0), "samples, max_newton and max_cg must be at least 1"),
+    (dict(max_newton=0), "max_newton is 0: pass a number from 1"),
     (dict(mass_damping=-1.0), "mass_damping is -1.0: pass a finite number >= 0"),
     (dict(stiffness_damping=float("nan")), "stiffness_damping is nan: pass a finite number >= 0"),
     (dict(core_clearance=float("nan")), "core_clearance is nan: pass a finite number >= 0"),

@@ -8,23 +8,27 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
-    "files": "biotac_mj",  # the version
+    "arguments": "files",
+    "fields": "",
+    "files": "",
+    "reading": "",
     "threads": "",
-    "geometry": "",
-    "skin": "geometry threads",
+    "versions": "biotac_mj",
+    "geometry": "files reading",
+    "skin": "geometry fields files reading threads",
     "features": "",
     "sensor": "geometry threads",
     "effects": "skin sensor geometry",
-    "coupling": "skin sensor geometry learning.serve",
+    "coupling": "skin sensor geometry fields learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor geometry learning.serve",
-    "press": "coupling plugin skin sensor geometry files view.offscreen",
-    "calibration": "geometry skin files press.indenter press.path",
-    "data": "geometry skin sensor files press.approach press.indenter press.path",
-    "tasks": "coupling sensor geometry data.objects",
-    "view": "coupling plugin skin sensor geometry files tasks press.approach press.scene",
-    "learning": "data sensor geometry files",
-    "discrepancy": "effects data skin sensor geometry files",
+    "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
+    "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
+    "data": "geometry skin sensor fields files reading versions press.approach press.indenter press.path",
+    "tasks": "coupling sensor geometry files reading data.objects",
+    "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
+    "learning": "arguments data sensor geometry fields files reading",
+    "discrepancy": "effects data skin sensor geometry fields files reading",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

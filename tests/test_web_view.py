@@ -176,7 +176,7 @@ def test_a_model_is_shown_while_it_steps():
             ["view", "--web", "--recording", "/no/such.h5"],
             "no recording at /no/such.h5: make one with `biotac press --out DIR`",
         ),
-        (["view", "--web", "--recording", __file__], "is no recorded press"),
+        (["view", "--web", "--recording", __file__], "is no recording"),
         (
             ["view", "--web", "--hand", "/no/hand.xml"],
             "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand",

@@ -3,11 +3,15 @@ press's skin.h5."""
 
 import csv
 import dataclasses
+import json
 import pathlib
 
 import numpy as np
 
+from ..fields import check_entries
 from ..files import replacing
+from ..reading import Array, read_hdf5, reading
+from ..sensor.channels import check_force
 
 __all__ = [
     "COLUMNS",
@@ -20,6 +24,7 @@ __all__ = [
 
 COLUMNS = ("time_s", "tip_x_m", "tip_y_m", "tip_z_m", "force_x_N", "force_y_N", "force_z_N")
 _ORIENTATION = ("quat_w", "quat_x", "quat_y", "quat_z")
+_PRESS = {"time": Array(("n",)), "force": Array(("n", 3)), "indenter_pose": Array(("n", 7))}
 _REACH = 0.2  # [m] a tip further from the BioTac's origin than this is not in metres
 
 
@@ -65,7 +70,8 @@ class Indentation:
             raise ValueError(
                 f"indentation {self.name!r} has {n} samples: at least 4 are needed, some of them under load"
             )
-        if not (np.diff(self.time) > 0).all():
+        check_force(self.force, f"indentation {self.name!r}")
+        if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
             raise ValueError(
                 f"time_s of indentation {self.name!r} does not increase: "
                 "sort the rows and remove repeated ones"
@@ -196,10 +202,13 @@ def _read_csv(path, indenter, direction):
         raise ValueError(
             f"{path} does not say what pressed: name it with --indenter, as in --indenter sphere_7mm"
         )
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = list(csv.reader(file))
+    with reading(path, "CSV file", f"it needs columns {', '.join(COLUMNS)}"):
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
     if not rows:
         raise ValueError(f"{path} is empty: it needs a header with columns {', '.join(COLUMNS)}")
+    if not rows[1:]:
+        raise ValueError(f"{path} has a header and no rows: one for each sample is needed")
     header = [name.strip() for name in rows[0]]
     columns = {name: _column(path, header, rows[1:], name) for name in COLUMNS}
     value = np.array([columns[name] for name in COLUMNS]).T
@@ -261,14 +270,12 @@ def _orientation(path, header, rows, direction):
 
 
 def _read_press(path, indenter):
-    import json
-
-    import h5py
-
-    with h5py.File(path) as file:
-        missing = {"time", "force", "indenter_pose"} - set(file)
-        if missing:
-            raise ValueError(f"{path} has no {', '.join(sorted(missing))}: it is not the skin.h5 of a press")
-        known = json.loads(file.attrs["parameters"])
-        pose, force, time = file["indenter_pose"][:], file["force"][:], file["time"][:]
-    return Indentation(path.stem, indenter or known["indenter"], time, pose[:, :3], pose[0, 3:], force)
+    remedy = "give the skin.h5 that `biotac press` writes"
+    found, said = read_hdf5(path, "recorded press", remedy, _PRESS, ["parameters"])
+    with reading(path, "recorded press", remedy):
+        known = check_entries("parameters", json.loads(said["parameters"]), {"indenter": str})
+    pose = found["indenter_pose"]
+    if not len(pose):
+        raise ValueError(f"{path} has no steps: {remedy}")
+    name = indenter or known["indenter"]
+    return Indentation(path.stem, name, found["time"], pose[:, :3], pose[0, 3:], found["force"])

@@ -1,13 +1,30 @@
 """Finished parts of a long comparison, in a file: stopped and called again with the same settings, it goes on
-where it was."""
+where it was. The file is JSON and makes nothing but the dataclasses named here."""
 
+import dataclasses
+import json
 import pathlib
-import pickle
 from collections.abc import Callable
 
+import numpy as np
+
+from ..fields import check_types
 from ..files import replacing
+from ..reading import read_json
+from ..skin.contact.law import ContactLaw
+from ..skin.model import SkinOptions
+from ..skin.rubber.material import Material
+from .comparison import Comparison
+from .fit import Calibration
+from .indentation import Indentation
 
 __all__ = ["Kept"]
+
+_MADE = {
+    kind.__name__: kind for kind in (Calibration, Comparison, ContactLaw, Indentation, Material, SkinOptions)
+}
+_TYPE, _DATA = "type", "data"  # of a dict that stands for an array or a dataclass
+_ARRAY = "array"
 
 
 class Kept:
@@ -15,36 +32,56 @@ class Kept:
 
     Args:
       path: file; one of other settings, or that cannot be read, is started anew.
-      settings: what the results depend on, compared with `==`.
+      settings: what the results depend on, compared as JSON has them.
     """
 
     def __init__(self, path: pathlib.Path | str, settings: dict):
-        self._path, self._content = pathlib.Path(path), {"settings": settings, "parts": {}}
+        self._path = pathlib.Path(path)
+        self._settings, self._parts = _plain(settings), {}
         try:
-            content = pickle.loads(self._path.read_bytes())
-            if content["settings"] == settings:
-                self._content = content
-        except (
-            OSError,
-            pickle.UnpicklingError,
-            EOFError,
-            AttributeError,
-            ImportError,
-            IndexError,
-            KeyError,
-            TypeError,
-        ):
+            content = read_json(self._path, "kept comparison", "leave it out")
+            if content["settings"] == self._settings:
+                self._parts = {name: _made(part) for name, part in content["parts"].items()}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
             pass  # nothing there, cut short, or of another version of this package
 
     @property
     def names(self) -> list:
-        return list(self._content["parts"])
+        return list(self._parts)
 
-    def get(self, name: str, make: Callable) -> object:
-        """The part of this name, made by `make()` unless it is there."""
-        parts = self._content["parts"]
-        if name not in parts:
-            parts[name] = make()
+    def get(self, name: str, kind: type, make: Callable) -> object:
+        """The part of this name and type, made by `make()` unless it is there."""
+        if not isinstance(self._parts.get(name), kind):
+            self._parts[name] = make()
+            content = {"settings": self._settings, "parts": _plain(self._parts)}
             with replacing(self._path) as temporary:
-                temporary.write_bytes(pickle.dumps(self._content))
-        return parts[name]
+                temporary.write_text(json.dumps(content))
+        return self._parts[name]
+
+
+def _plain(value):
+    """As JSON has it, so that `_made` makes it again."""
+    if type(value).__name__ in _MADE:
+        fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {_TYPE: type(value).__name__, _DATA: fields}
+    if isinstance(value, np.ndarray):
+        return {_TYPE: _ARRAY, _DATA: value.tolist()}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {str(name): _plain(one) for name, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+def _made(value):
+    if isinstance(value, list):
+        return [_made(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) != {_TYPE, _DATA}:
+        return {name: _made(one) for name, one in value.items()}
+    if value[_TYPE] == _ARRAY:
+        return np.asarray(value[_DATA])
+    made = _MADE[value[_TYPE]](**_made(value[_DATA]))
+    check_types(made, nan=True)  # a comparison with measured data has no nodal error
+    return made

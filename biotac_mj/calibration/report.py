@@ -7,10 +7,9 @@ import pathlib
 import numpy as np
 
 from ..files import replacing
-from ..skin.rubber.material import Material
 from .fit import Calibration
 
-__all__ = ["calibration_table", "read_material", "write_json", "write_picture"]
+__all__ = ["calibration_table", "write_json", "write_picture"]
 
 _UNITS = {
     "youngs_modulus": "Pa",
@@ -73,30 +72,6 @@ def write_json(content: dict, path: pathlib.Path | str) -> None:
     null."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
-
-
-def read_material(path: pathlib.Path | str) -> Material:
-    """The material in a calibration's JSON.
-
-    Raises:
-      FileNotFoundError: no such file.
-      ValueError: not the JSON of `biotac calibrate`.
-    """
-    import pathlib
-
-    from ..skin.rubber.material import Material
-
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no calibration at {path}: give the JSON that `biotac calibrate` wrote, or a preset's name"
-        )
-    try:
-        return Material(**json.loads(path.read_text())["material"])
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(
-            f"{path} is not a calibration ({error!r}): give the JSON that `biotac calibrate` wrote"
-        ) from error
 
 
 def write_picture(result: Calibration, path: pathlib.Path | str) -> None:

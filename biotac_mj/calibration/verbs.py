@@ -7,10 +7,10 @@ import tqdm
 
 from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
-from .comparison import PAPER, comparison_table, evaluate, plan_indentations, references
+from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
-from .fit import calibrate
-from .indentation import plan_shear, read_indentation, write_indentation
+from .fit import Calibration, calibrate
+from .indentation import Indentation, plan_shear, read_indentation, write_indentation
 from .kept import Kept
 from .reference import STAND_IN, stand_in
 from .refinement import refined
@@ -123,11 +123,13 @@ def compare_verb(args: argparse.Namespace) -> None:
         )
         plans = plan_indentations(args.count, args.indenters, args.seed, skin=args.skin)
         with _bar("reference", len(plans), args.quiet) as bar:
-            cases = kept.get("reference", lambda: references(plans, bar.update, **truth))
+            cases = kept.get("reference", list, lambda: references(plans, bar.update, **truth))
         calibration = (
             None
             if given
-            else kept.get("reference of the calibration", lambda: stand_in(plan_shear(), **truth))
+            else kept.get(
+                "reference of the calibration", Indentation, lambda: stand_in(plan_shear(), **truth)
+            )
         )
         reference = (
             f"{STAND_IN} ({args.reference_material}, {args.reference_element} elements, "
@@ -136,7 +138,11 @@ def compare_verb(args: argparse.Namespace) -> None:
     results = []
     for body in chosen:
         results.append(
-            kept.get(body.name, lambda body=body: _compared(body, given, calibration, cases, kept, args))
+            kept.get(
+                body.name,
+                Comparison,
+                lambda body=body: _compared(body, given, calibration, cases, kept, args),
+            )
         )
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
     for result in results:
@@ -155,7 +161,9 @@ def _compared(body, given, calibration, cases, kept, args):
     if not given:
         settings = dict(device=args.device, progress=not args.quiet)
         fitted = kept.get(
-            f"calibration of {body.name}", lambda: calibrate(body, material("paper"), calibration, **settings)
+            f"calibration of {body.name}",
+            Calibration,
+            lambda: calibrate(body, material("paper"), calibration, **settings),
         )
         if not args.quiet:
             print(f"{body.name}\n{calibration_table(fitted)}", flush=True)

@@ -145,6 +145,10 @@ def attach(
         **({} if friction is None else {"friction": float(friction)}),
     )
     check_names(config)
+    if stepper == "fem":
+        from .fem import skin_settings
+
+        skin_settings(config)  # refuses unknown or wrong ones
     if stepper == "fem" and tier == "condensed":
         _refuse_condensed(config)
     names = [g.name for g in spec.geoms]

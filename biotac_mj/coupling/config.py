@@ -2,13 +2,19 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
+
+from ..fields import check_entries, check_types, refuse_unknown
 
 __all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
 
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
+# what options["readings"] may have
+_SENSOR = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float}
+READINGS = {"biotac": _SENSOR, "latent_projection": {"weights": str | None, **_SENSOR}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Config:
     tier: str = "full"
     readings: str = "biotac"
     material: str | dict | None = None
-    liquid: bool = True
+    liquid: bool | None = True
     coupling: str = "two-way"
     geoms: tuple | None = None
     rounding: dict = dataclasses.field(default_factory=dict)
@@ -53,6 +59,9 @@ class Config:
     options: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
+        if self.geoms is not None:
+            object.__setattr__(self, "geoms", tuple(self.geoms))
+        check_types(self)
         if self.coupling not in COUPLINGS:
             raise ValueError(f"unknown coupling {self.coupling!r}: choose one of {', '.join(COUPLINGS)}")
         if self.tier not in TIERS:
@@ -62,10 +71,13 @@ class Config:
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
-        if not self.friction >= 0:
+        if not 0 <= self.friction < math.inf:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
-        if self.geoms is not None:
-            object.__setattr__(self, "geoms", tuple(self.geoms))
+        if self.stepper == "fem" and self.readings in READINGS:  # others have options of their own
+            refuse_unknown(self.options, ("skin", "modulus", "readings"), "options")
+            wanted = READINGS[self.readings]
+            given = check_entries("options['readings']", self.options.get("readings", {}), wanted, wanted)
+            refuse_unknown(given, wanted, "options['readings']")
 
     def strings(self) -> dict:
         """Attribute name -> JSON text; `parse` reads it back."""

@@ -9,10 +9,11 @@ import time
 
 import numpy as np
 
+from ..fields import check_types
 from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
-from ..skin.settings import plain, read_dict
+from ..skin.settings import plain, read_dict, read_settings
 from .objects import OBJECTS
 from .plan import KINDS
 from .store import TactileSet, shard_path
@@ -22,6 +23,7 @@ __all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "gener
 
 # folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
 RECORDINGS = "recordings"
+_MOST_STEPS = 2000  # a batch lies in memory with all its nodes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,11 +85,14 @@ class GenerateOptions:
         for name in ("options", "vary"):
             value = getattr(self, name)
             object.__setattr__(self, name, None if value is None else plain(read_dict(value, name)))
+        check_types(self)
         check_vary(self.vary or {})
         if self.vary and self.tier == "condensed":
             raise ValueError(
                 "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
             )
+        if not 8 <= self.steps <= _MOST_STEPS:
+            raise ValueError(f"steps is {self.steps}: take from 8 to {_MOST_STEPS} for an interaction")
         if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
             raise ValueError(
                 f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: "
@@ -107,8 +112,9 @@ class GenerateOptions:
             raise ValueError(f"recordings is {self.recordings}: it must not be negative")
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ValueError(f"rate is {self.rate} Hz: it must be a positive number")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}: it must not be negative")
+        for name in ("seed", "measured_seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if self.tier not in ("full", "condensed"):
             raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
         unknown = [name for name in self.objects if name not in OBJECTS]
@@ -117,6 +123,9 @@ class GenerateOptions:
                 f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: "
                 f"choose from {', '.join(OBJECTS)}"
             )
+        unknown = [name for name in self.kinds if name not in KINDS]
+        if unknown or not self.kinds:
+            raise ValueError(f"unknown kind of interaction {unknown}: choose from {', '.join(KINDS)}")
         if self.labelled and not set(self.objects) & set(INDENTERS):
             raise ValueError(
                 "labelled interactions are made with the eight indenters: "
@@ -209,7 +218,11 @@ def generate(
     from .making import make_shards
 
     out = pathlib.Path(out)
-    load_skin(options.skin)  # refuses one that is not there
+    read_settings(options.material, options.options)  # these refuse what is wrong or not there
+    for skin in (
+        {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
+    ):
+        load_skin(skin)
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {
         "device": options.device.split(":")[0]
     }

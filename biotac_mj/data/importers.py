@@ -7,7 +7,8 @@ import pathlib
 import h5py
 import numpy as np
 
-from ..sensor.channels import CHANNELS, ELECTRODES, FULL_SCALE, NELECTRODE
+from ..reading import Array, read_hdf5, reading
+from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE, check_counts, check_force
 from .columns import read_columns
 from .schema import Interaction
 from .splits import assign
@@ -15,7 +16,12 @@ from .store import shard_path, write_shard
 
 __all__ = ["FORMATS", "RUPPEL_COLUMNS", "import_recordings", "read_nvidia", "read_ruppel", "read_text"]
 
-_NVIDIA = {"electrode_vals": NELECTRODE, "contact_loc": 3, "force_vec": 3, "indenter_type": 1}
+_NVIDIA = {
+    "electrode_vals/data": Array(("n", NELECTRODE)),
+    "contact_loc/data": Array(("n", 3)),
+    "force_vec/data": Array(("n", 3)),
+}
+_REACH = 0.5  # [m] a contact further from the file's origin is not in metres
 _JUMP = 0.5e-3  # [m] between two samples of one trajectory of NVIDIA's files
 _GAP = 0.5  # [s] without a sample ends an interaction of a log with times
 RUPPEL_COLUMNS = (
@@ -57,31 +63,17 @@ def read_nvidia(
     Raises:
       FileNotFoundError, ValueError: no such file, or one of another layout; the text names the key.
     """
-    path = _file(
-        path, "an HDF5 file with electrode_vals/data, contact_loc/data, force_vec/data and indenter_type/data"
-    )
-    try:
-        with h5py.File(path) as file:
-            data = {name: file[f"{name}/data"][:] for name in _NVIDIA if f"{name}/data" in file}
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error}): it is no HDF5 file or it is damaged; fetch it again"
-        ) from error
-    missing = [f"{name}/data" for name in _NVIDIA if name not in data and name != "indenter_type"]
-    if missing:
-        raise ValueError(f"{path} has no {', '.join(missing)}: it is not one of NVIDIA's BioTac files")
-    n = len(data["electrode_vals"])
-    kind = data.pop("indenter_type", np.zeros(n)).reshape(-1).astype(int)
-    for name, value in data.items():
-        if value.shape != (n, _NVIDIA[name]):
-            raise ValueError(
-                f"{name}/data of {path} has shape {value.shape}: ({n}, {_NVIDIA[name]}) is needed"
-            )
-    if len(kind) != n:
-        raise ValueError(
-            f"indenter_type/data of {path} has {len(kind)} entries for {n} samples: it must have one each"
-        )
-    jump = np.linalg.norm(np.diff(data["contact_loc"], axis=0), axis=1) > _JUMP
+    path, what = pathlib.Path(path), "recording of NVIDIA's"
+    remedy = f"give an HDF5 file with {', '.join(_NVIDIA)} and indenter_type/data, one row for each sample"
+    data, _ = read_hdf5(path, what, remedy, _NVIDIA)
+    electrodes, place, force = data.values()
+    n = len(electrodes)
+    if not n:
+        raise ValueError(f"{path} has no samples: {remedy}")
+    kind = _indenter_types(path, n)
+    if np.abs(place).max() > _REACH:
+        raise ValueError(f"contact_loc/data of {path} reaches {np.abs(place).max():.3g}: metres are needed")
+    jump = np.linalg.norm(np.diff(place, axis=0), axis=1) > _JUMP
     pieces = _pieces(jump | (np.diff(kind) != 0), n)
     out = []
     for number, (a, b) in enumerate(pieces):
@@ -96,14 +88,27 @@ def read_nvidia(
                 f"{path.stem}-{number:05d}",
                 name,
                 np.arange(b - a) / rate,
-                data["electrode_vals"][a:b],
-                data["force_vec"][a:b],
-                data["contact_loc"][a:b],
+                electrodes[a:b],
+                force[a:b],
+                place[a:b],
                 {"format": "nvidia", "rows": [a, b], "rate": rate, "frame": "the file's"},
                 path,
             )
         )
     return out
+
+
+def _indenter_types(path, n):
+    """(n,) whole numbers; zeros where the file has none."""
+    name = "indenter_type/data"
+    with reading(path, "recording of NVIDIA's", "fetch it again"), h5py.File(path) as file:
+        kind = np.asarray(file[name][()], float).reshape(-1) if name in file else np.zeros(n)
+    if len(kind) != n or not (np.isfinite(kind) & (kind == np.rint(kind))).all():
+        raise ValueError(
+            f"{name} of {path} has {len(kind)} entries for {n} samples, or some that are no whole numbers: "
+            "it must have the number of the indenter for each sample"
+        )
+    return kind.astype(int)
 
 
 def read_ruppel(path: pathlib.Path | str, object: str = "sphere_4mm") -> list[Interaction]:  # noqa: A002 - the column's name
@@ -117,9 +122,10 @@ def read_ruppel(path: pathlib.Path | str, object: str = "sphere_4mm") -> list[In
       FileNotFoundError, ValueError: no such file, a missing column, a row that is no numbers; the text names
         it.
     """
-    path = _file(path, f"a CSV file with columns {', '.join(RUPPEL_COLUMNS)}")
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = [row for row in csv.reader(file) if row]
+    path = pathlib.Path(path)
+    with reading(path, "recording", f"give a CSV file with columns {', '.join(RUPPEL_COLUMNS)}"):
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row]
     if not rows:
         raise ValueError(
             f"{path} is empty: it needs {len(RUPPEL_COLUMNS)} columns, {', '.join(RUPPEL_COLUMNS)}"
@@ -133,6 +139,8 @@ def read_ruppel(path: pathlib.Path | str, object: str = "sphere_4mm") -> list[In
                 f"{path} has no column {', '.join(missing)}: its header must have {', '.join(RUPPEL_COLUMNS)}"
             )
         order = [header.index(name) for name in RUPPEL_COLUMNS]
+    if not rows[first:]:
+        raise ValueError(f"{path} has a header and no rows: one for each sample is needed")
     value = _numbers(
         path,
         [[row[i] if i < len(row) else "" for i in order] for row in rows[first:]],
@@ -237,6 +245,8 @@ def import_recordings(
       ValueError, FileNotFoundError: see the readers.
     """
     paths, out = [pathlib.Path(path) for path in paths], pathlib.Path(out)
+    if len(set(paths)) < len(paths):
+        raise ValueError("a file is given twice: give each once")
     if list(out.glob("shard-*.h5")):
         raise ValueError(f"{out} holds a set already: choose another folder, or delete it")
     if format is None:
@@ -256,14 +266,9 @@ def import_recordings(
 
 def _recorded(name, what, time, electrodes, force, point, parameters, path, extra=None):
     """An Interaction of measured things only."""
-    bad = (electrodes < 0) | (electrodes > FULL_SCALE) | ~np.isfinite(electrodes)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise ValueError(
-            f"{path}: {CHANNELS[column]} of row {parameters['rows'][0] + row} is "
-            f"{electrodes[row, column]:g}: raw counts between "
-            "0 and 4095 are needed; undo scaling and tare"
-        )
+    check_counts(electrodes, str(path), parameters["rows"][0])
+    if force is not None:
+        check_force(force, str(path))
     counts = np.full((len(time), len(CHANNELS)), np.nan, np.float32)
     counts[:, :NELECTRODE] = electrodes
     for channel, value in (extra or {}).items():
@@ -291,13 +296,6 @@ def _pieces(cut, n):
     """Pieces (first, beyond) of n rows; cut (n - 1,) says after which rows one ends."""
     edge = np.flatnonzero(cut) + 1
     return list(zip(np.r_[0, edge].tolist(), np.r_[edge, n].tolist())) if n else []
-
-
-def _file(path, what):
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no recording at {path}: give {what}")
-    return path
 
 
 def _numbers(path, rows, first, names):

@@ -6,12 +6,11 @@ meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet and data/chunk-000/
 
 import json
 import pathlib
-import shutil
-import tempfile
 
 import numpy as np
 import tqdm
 
+from ..files import replacing
 from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE
 
 __all__ = ["VERSION", "export_lerobot"]
@@ -51,6 +50,10 @@ def export_lerobot(
     out = pathlib.Path(out)
     if out.exists():
         raise ValueError(f"{out} is there already: choose another folder, or delete it")
+    if data.unfinished:
+        raise ValueError(
+            f"{data.path} is unfinished ({data.unfinished}): run its `biotac generate` again, which goes on"
+        )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
     for name in (counts, "indenter_pos", "indenter_quat", "wrench"):
@@ -58,15 +61,8 @@ def export_lerobot(
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
     if not len(chosen):
         raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    building = pathlib.Path(tempfile.mkdtemp(dir=out.parent, prefix=".lerobot-"))
-    try:
+    with replacing(out, folder=True) as building:
         _Export(data, building, counts, chosen).write(progress)
-        building.chmod(0o755)
-        building.rename(out)
-    except BaseException:
-        shutil.rmtree(building)
-        raise
     return out
 
 

@@ -11,10 +11,12 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..files import replacing, versions
-from ..geometry.skin_geometry import SkinGeometry
+from ..files import hdf5
+from ..geometry.skin_geometry import STORED, SkinGeometry
+from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import CHANNELS
-from .schema import COLUMNS, DISPLACEMENT_SCALE, SCHEMA, Interaction, nodes_of
+from ..versions import versions
+from .schema import COLUMNS, DISPLACEMENT_SCALE, KINDS, SCHEMA, SPLITS, Interaction, nodes_of
 
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
 
@@ -31,6 +33,9 @@ _TABLE = (
     "stop",
 )  # of each interaction
 _TEXT = ("id", "object", "kind", "split", "parameters")
+_TYPES = dict.fromkeys(_TEXT, "text") | {"labelled": "flag", "seed": "number"}
+_AGAIN = "generate or import it again"
+_REMEDY = "it is damaged, or another file; delete it and run the command again"
 
 
 def shard_path(folder: pathlib.Path | str, number: int) -> pathlib.Path:
@@ -76,7 +81,7 @@ def write_shard(
             )
     length = np.array([len(one.time) for one in interactions])
     stop = np.cumsum(length)
-    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+    with hdf5(path, track_order=True) as file:
         file.attrs.update(
             {
                 "schema": SCHEMA,
@@ -168,12 +173,16 @@ class Column:
         if part is None:
             return np.full((len(rows), *self.shape[1:]), np.nan, self.dtype)
         low, high = int(rows.min()), int(rows.max()) + 1
-        if high - low == len(rows):  # one piece
-            value = part[low:high]
-            value = value if (np.diff(rows) > 0).all() else value[rows - low]
-        else:
-            ordered, inverse = np.unique(rows, return_inverse=True)
-            value = np.concatenate([part[a:b] for a, b in _runs(ordered)])[inverse]
+        path = part.file.filename
+        with reading(path, "readable shard", _REMEDY):
+            if high - low == len(rows):  # one piece
+                value = part[low:high]
+                value = value if (np.diff(rows) > 0).all() else value[rows - low]
+            else:
+                ordered, inverse = np.unique(rows, return_inverse=True)
+                value = np.concatenate([part[a:b] for a, b in _runs(ordered)])[inverse]
+            if not self.name.startswith("measured"):  # those are NaN where nothing was measured
+                check_arrays(path, {self.name: value}, {self.name: Array((None,) * value.ndim)}, _AGAIN)
         return value * np.float32(DISPLACEMENT_SCALE) if self.name == "displacement" else value
 
 
@@ -225,10 +234,9 @@ class TactileSet:
     def _read_tables(self):
         first = self._files[0]
         self.attributes, self.versions = (
-            json.loads(first.attrs["attributes"]),
-            json.loads(first.attrs["versions"]),
+            json.loads(first.attrs.get(name, "{}")) for name in ("attributes", "versions")
         )
-        self.geometry = _geometry(first)
+        self.geometry = _geometry(first.filename, first)
         self.columns = tuple(name for name in COLUMNS if any(name in f["step"] for f in self._files))
         for file in self._files[1:]:
             missing = [
@@ -262,6 +270,14 @@ class TactileSet:
                 f"interaction {str(names[count > 1][0])!r} occurs in two shards of {self.path}: "
                 "one of them is left from another run"
             )
+
+    @property
+    def unfinished(self) -> str:
+        """What a generated set still lacks, "" where it is whole."""
+        settings = self.attributes.get("settings")
+        wanted = settings.get("count") if isinstance(settings, dict) else None
+        short = self.path.is_dir() and isinstance(wanted, int) and len(self) < wanted
+        return f"{len(self)} of {wanted} interactions" if short else ""
 
     def __len__(self):
         return len(self.id)
@@ -347,36 +363,80 @@ class TactileSet:
 
 
 def _open(path):
-    try:
+    with reading(path, "readable shard", _REMEDY):
         file = h5py.File(path)
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error}): it is no HDF5 file, or damaged; "
-            "delete it and run the command again"
-        ) from error
     try:
-        if file.attrs.get("schema") != SCHEMA:
-            raise ValueError(
-                f"{path} has schema {file.attrs.get('schema')!r}: this version reads {SCHEMA!r}; "
-                "generate or import it again"
-            )
-        channels = tuple(str(name) for name in file.attrs["channels"])
-        if channels != CHANNELS:
-            raise ValueError(
-                f"{path} has its channels in the order {' '.join(channels)}: "
-                f"{' '.join(CHANNELS)} is needed; reorder the counts"
-            )
+        with reading(path, "readable shard", _REMEDY):
+            _check(path, file)
     except BaseException:
         file.close()
         raise
     return file
 
 
-def _geometry(file):
+def _check(path, file):
+    """Refuses (ValueError) what is no shard: schema, names, types, shapes and numbers of rows; what only
+    reading a whole column would show is found there."""
+    schema = file.attrs.get("schema")
+    if schema != SCHEMA:
+        raise Unfit(f"{path} has schema {schema!r}: this version reads {SCHEMA!r}; {_AGAIN}")
+    channels = tuple(str(name) for name in file.attrs.get("channels", ()))
+    if channels != CHANNELS:
+        raise Unfit(
+            f"{path} has its channels in the order {' '.join(channels)}: "
+            f"{' '.join(CHANNELS)} is needed; reorder the counts"
+        )
+    for name in ("attributes", "versions"):
+        if not isinstance(json.loads(file.attrs.get(name, "{}")), dict):
+            raise Unfit(f"attribute {name} of {path} is no dict: {_AGAIN}")
+    flat = {}
+    for group in ("interaction", "step", *(("geometry",) if "geometry" in file else ())):
+        if not isinstance(file.get(group), h5py.Group):
+            raise Unfit(f"{path} has no group {group}: {_AGAIN}")
+        flat |= {f"{group}/{name}": file[group][name] for name in file[group]}
+    wanted = {f"interaction/{name}": Array(("k",), _TYPES.get(name, "index")) for name in _TABLE}
+    sizes = {}
+    if "geometry" in file:
+        stored = {name: array for name, array in STORED.items() if name != "name"}
+        wanted |= {f"geometry/{name}": array for name, array in stored.items()}
+        first = {"geometry/vert": Array(("nvert", 3)), "geometry/outer_face": STORED["outer_face"]}
+        check_arrays(path, flat, first, _AGAIN, sizes)
+        sizes["nouter"] = len(np.unique(flat["geometry/outer_face"][:]))
+    for name, (shape, _, _) in COLUMNS.items():
+        if name == "time" or f"step/{name}" in flat:
+            wanted[f"step/{name}"] = Array(("n", *shape), "number")
+    check_arrays(path, flat, wanted, _AGAIN, sizes)
+    start, stop = flat["interaction/start"][:], flat["interaction/stop"][:]
+    if (
+        not len(start)
+        or (start >= stop).any()
+        or (start != np.r_[0, stop[:-1]]).any()
+        or stop[-1] != sizes["n"]
+    ):
+        raise Unfit(
+            f"start and stop of the interactions of {path} do not divide its {sizes['n']} steps: {_AGAIN}"
+        )
+    if not np.isfinite(flat["step/time"][:]).all():
+        raise Unfit(f"step/time of {path} has values that are not finite: {_AGAIN}")
+    for text in flat["interaction/parameters"].asstr()[:]:
+        if not isinstance(json.loads(text), dict):
+            raise Unfit(f"interaction/parameters of {path} are no dicts: {_AGAIN}")
+    for name, known in (("kind", KINDS), ("split", SPLITS)):
+        strange = set(flat[f"interaction/{name}"].asstr()[:]) - set(known)
+        if strange:
+            raise Unfit(
+                f"interaction/{name} of {path} is {min(strange)!r}: one of {', '.join(known)} is needed"
+            )
+
+
+def _geometry(path, file):
     if "geometry" not in file:
         return None
-    group = file["geometry"]
-    return SkinGeometry(name=str(group.attrs["name"]), **{name: group[name][:] for name in _GEOMETRY})
+    with reading(path, "readable shard", _REMEDY):
+        group = file["geometry"]
+        found = {name: group[name][:] for name in _GEOMETRY}
+        check_arrays(path, found, {name: STORED[name] for name in _GEOMETRY}, _AGAIN)
+        return SkinGeometry(name=str(group.attrs["name"]), **found)
 
 
 def _same_skin(a, b):

@@ -1,10 +1,10 @@
 """The card of a skin: what it is, in numbers."""
 
-import os
 import pathlib
 
 import numpy as np
 
+from biotac_mj.files import replacing
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 
@@ -96,8 +96,6 @@ def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathl
         "The shape is `biotac_mj.geometry.BioTacDimensions`, which gives the source of each number.",
         "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
     ])  # fmt: skip
-    path = pathlib.Path(path)
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
-    return path
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+    return pathlib.Path(path)

@@ -1,15 +1,18 @@
 """Reads skins made elsewhere: `.tet` with `.obj` rigid bodies (as in NVlabs/biotac_sim), `.msh` and `.vtu`
 through meshio."""
 
-import os
+import contextlib
+import io
+import math
 import pathlib
-import tempfile
 
 import numpy as np
 
+from biotac_mj.files import replacing
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
+from biotac_mj.reading import read_text, reading
 
 __all__ = ["import_mesh", "read_obj", "read_tet_mesh", "write_obj"]
 
@@ -68,11 +71,15 @@ def read_tet_mesh(path: pathlib.Path | str) -> TetMesh:
         raise ValueError(f"{path.name} is no mesh this can read: convert it to one of {', '.join(_MESHES)}")
     import meshio
 
-    try:
-        mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio raises many kinds, and exits on some
-        raise ValueError(f"{path} cannot be read ({error}): export it again as {path.suffix}") from error
-    elem = mesh.cells_dict.get("tetra")
+    with (
+        reading(path, "mesh", f"export it again as {path.suffix}"),
+        contextlib.redirect_stderr(io.StringIO()),
+    ):
+        try:
+            mesh = meshio.read(path)
+        except SystemExit:  # after saying why on stderr
+            raise ValueError("it cannot be read") from None
+        elem = mesh.cells_dict.get("tetra")
     if elem is None:
         raise ValueError(
             f"{path} holds no linear tetrahedra, only {sorted(mesh.cells_dict) or 'nothing'}: "
@@ -106,6 +113,8 @@ def _read_tet(path) -> TetMesh:
             raise ValueError(
                 f"{path}, line {number} is cut short: lines must read `v x y z w` or `t a b c d`"
             )
+    if elem and max(map(max, elem)) > len(vert):  # before numbers too large for arrays
+        raise ValueError(f"{path} names vertex {max(map(max, elem))} of {len(vert)}: indices must be 0-based")
     if not vert or not elem:
         raise ValueError(
             f"{path} holds {len(vert)} vertices and {len(elem)} tetrahedra: "
@@ -115,10 +124,7 @@ def _read_tet(path) -> TetMesh:
 
 
 def _lines(path):
-    try:
-        return pathlib.Path(path).read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file ({error}): export it again") from error
+    return read_text(path, "text file", "export it again").splitlines()
 
 
 def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -136,6 +142,8 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
         try:
             if word and word[0] == "v":
                 x, y, z = (float(w) for w in word[1:4])
+                if not math.isfinite(x + y + z):
+                    raise ValueError(f"vertex {line.strip()[:60]!r} is not finite")
                 vert.append((x, y, z))
             elif word and word[0] == "f":
                 corner = [int(w.split("/")[0]) for w in word[1:]]
@@ -165,17 +173,12 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
     """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(
         f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1
     )
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".obj")
-    with os.fdopen(handle, "w") as file:
-        file.write(text)
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)
-    return path
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+    return pathlib.Path(path)
 
 
 def _rigid_bodies(folder):

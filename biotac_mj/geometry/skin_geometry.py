@@ -2,13 +2,14 @@
 electrodes."""
 
 import dataclasses
-import os
 import pathlib
-import tempfile
 
 import numpy as np
 
-__all__ = ["PARTS", "SkinGeometry"]
+from ..files import write_npz
+from ..reading import Array, read_npz
+
+__all__ = ["PARTS", "STORED", "SkinGeometry"]
 
 # the eight four-node tetrahedra that ten nodes make: four at the corners, four around the octahedron's
 # diagonal 4-9
@@ -24,7 +25,25 @@ PARTS = np.array(
         [4, 9, 6, 7],
     ]
 )
+_SMALLEST, _LARGEST = 0.005, 0.1  # [m] that a skin measures
+_OFF = 1e-3  # [m] that an electrode may lie outside the core's box
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
+# how a skin is stored; indices are indices into what _INTO says
+STORED = {
+    "name": Array((), "text"),
+    "vert": Array((None, 3)),
+    "elem": Array((None, None), "index"),
+    "outer_face": Array((None, 3), "index"),
+    "inner_face": Array((None, 3), "index"),
+    "fixed": Array((None,), "index"),
+    **{f"{part}_vert": Array((None, 3)) for part in ("core", "nail", "clamp")},
+    **{f"{part}_face": Array((None, 3), "index") for part in ("core", "nail", "clamp")},
+    "electrode_pos": Array((19, 3)),
+    "electrode_normal": Array((19, 3)),
+}
+_INTO = {
+    name: f"{name[:-5]}_vert" if name[:-5] in ("core", "nail", "clamp") else "vert" for name in _INT_FIELDS
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +92,14 @@ class SkinGeometry:
             raise ValueError(
                 f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices"
             )
+        for name, vert in _INTO.items():
+            index, count = getattr(self, name), len(getattr(self, vert))
+            if index.size and not 0 <= index.min() <= index.max() < count:
+                raise ValueError(
+                    f"{name} of skin {self.name!r} names vertices {index.min()}..{index.max()}, "
+                    f"it has {count}: "
+                    "indices must be 0-based; import the mesh again"
+                )
 
     @property
     def nvert(self) -> int:
@@ -96,18 +123,8 @@ class SkinGeometry:
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
         bit-equal."""
-        path = pathlib.Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **dataclasses.asdict(self))
-            os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner may read
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
-        return path
+        write_npz(path, **dataclasses.asdict(self))
+        return pathlib.Path(path)
 
     @classmethod
     def load(cls, path: pathlib.Path | str) -> "SkinGeometry":
@@ -117,20 +134,23 @@ class SkinGeometry:
           FileNotFoundError: no such file.
           ValueError: the file is not a stored skin.
         """
-        path = pathlib.Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"no skin at {path}: pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
-            )
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                return cls(
-                    **{
-                        f.name: file[f.name] if f.name != "name" else str(file["name"])
-                        for f in dataclasses.fields(cls)
-                    }
-                )
-        except (KeyError, OSError, ValueError) as error:
+        remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
+        found = read_npz(path, "skin", remedy, STORED)
+        skin = cls(**found | {"name": str(found["name"])})
+        size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0
+        if not _SMALLEST <= size <= _LARGEST:
             raise ValueError(
-                f"{path} is not a stored skin ({error}): make one with `biotac import-mesh`"
-            ) from error
+                f"skin {path} is {size:.3g} m long: a finger in metres is needed; import it again"
+            )
+        core = skin.core_vert if len(skin.core_vert) else skin.vert
+        low, high = core.min(0) - _OFF, core.max(0) + _OFF
+        length = np.linalg.norm(skin.electrode_normal, axis=1)
+        if (
+            not ((skin.electrode_pos >= low) & (skin.electrode_pos <= high)).all()
+            or (abs(length - 1) > 0.01).any()
+        ):
+            raise ValueError(
+                f"the electrodes of skin {path} are not on its core, or their normals are not of length one: "
+                "import the mesh again"
+            )
+        return skin

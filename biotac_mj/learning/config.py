@@ -2,7 +2,13 @@
 
 import dataclasses
 
+import numpy as np
+
+from ..fields import check_types
+
 __all__ = ["LearningConfig"]
+
+_MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,15 +53,15 @@ class LearningConfig:
     mesh_kl: float = 1e-3
     electrode_kl: float = 1e-5
     mesh_first: int = 128
-    mesh_channels: tuple = (128, 128, 256, 64)
-    mesh_factors: tuple = (4, 4, 4, 2)
+    mesh_channels: tuple[int, ...] = (128, 128, 256, 64)
+    mesh_factors: tuple[int, ...] = (4, 4, 4, 2)
     mesh_last: int = 64
     mesh_hidden: int = 512
     mesh_latent: int = 128
-    electrode_hidden: tuple = (256, 128, 64)
+    electrode_hidden: tuple[int, ...] = (256, 128, 64)
     electrode_latent: int = 8
-    forward_hidden: tuple = (256, 128, 128)
-    inverse_hidden: tuple = (128, 128, 256)
+    forward_hidden: tuple[int, ...] = (256, 128, 128)
+    inverse_hidden: tuple[int, ...] = (128, 128, 256)
     sample_codes: bool = False
     projection_loss: str = "latent"
     dropout: float = 0.3
@@ -72,7 +78,7 @@ class LearningConfig:
     pod: int = 128
     width: int = 128
     mirror: bool = True
-    window: tuple = (0.5, 4.0)
+    window: tuple[float, ...] = (0.5, 4.0)
     members: int = 3
     graphs: bool = True
 
@@ -81,8 +87,18 @@ class LearningConfig:
             value = getattr(self, field.name)
             if isinstance(value, list):
                 object.__setattr__(self, field.name, tuple(value))
-            if isinstance(value, int | float) and not isinstance(value, bool) and value < 0:
-                raise ValueError(f"{field.name} is {value}: it must not be negative")
+        check_types(self)
+        for field in dataclasses.fields(self):
+            value = np.asarray(getattr(self, field.name))
+            most = _MOST.get(field.name, np.inf)
+            if value.dtype.kind in "if" and not (np.isfinite(value) & (value >= 0) & (value < most)).all():
+                limit = f" and below {most:g}" if np.isfinite(most) else ""
+                raise ValueError(f"{field.name} is {value.tolist()}: it must not be negative{limit}")
+            if value.dtype.kind == "i" and not value.all():
+                raise ValueError(f"{field.name} is {value.tolist()}: it must be at least 1")
+        for name in ("mesh_scale", "learning_rate", "scale", "decay"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} is 0: it must be positive")
         for name, allowed in (
             ("reconstruction", ("mse", "l1")),
             ("projection_loss", ("latent", "decoded")),

@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from ..data import Split, TactileSet, split_by_interaction, split_by_object
-from ..files import replacing
+from ..fields import refuse_unknown
+from ..files import replacing, write_npz
+from ..reading import read_json
 from ..sensor.channels import FULL_SCALE
 from .arrays import Arrays, load_arrays
 from .config import LearningConfig
@@ -63,17 +65,24 @@ def train_all(
 
     config = config or LearningConfig()
     out = pathlib.Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    names = list(FORWARD) if only is None else list(only)
+    refuse_unknown(names, FORWARD, "the list of models")
+    settings = {
+        "set": str(pathlib.Path(path).resolve()),
+        "config": dataclasses.asdict(config),
+        "models": names,
+        "paper": paper,
+        "limit": limit,
+    }
+    _refuse_others(out, json.loads(json.dumps(settings)))
     jobs = [(s, k) for s in splits for k in seeds if not (out / f"{s}-{k}.json").exists()]
     if not jobs:
         return
     begun = time.time()
     arrays = load_arrays(path, device, limit)
+    for split in splits:
+        _division(path, split, 0, len(arrays.objects))  # refuses what cannot be divided
     features = Features(arrays, config)
-    names = list(FORWARD) if only is None else list(only)
-    for name in names:
-        if name not in FORWARD:
-            raise ValueError(f"unknown model {name!r}: choose from {', '.join(FORWARD)}")
     print(
         f"{len(arrays.objects)} interactions, "
         f"{len(arrays.owner)} time steps read in {time.time() - begun:.0f} s"
@@ -91,7 +100,21 @@ def train_all(
                 out,
                 names,
                 paper,
+                settings=settings,
                 step=lambda text: bar.set_postfix_str(text),
+            )
+
+
+def _refuse_others(out, settings):
+    """Refuses a folder that holds results of other settings (ValueError)."""
+    for path in sorted(out.glob("*-*.json")):
+        found = read_json(path, "result of `biotac train`", f"remove it, or choose another folder than {out}")
+        found = found.get("settings", {})
+        differ = [name for name, value in settings.items() if not found or found.get(name) != value]
+        if differ:
+            raise ValueError(
+                f"{path} is of other settings ({', '.join(differ)}): "
+                "choose another --out, or remove that folder"
             )
 
 
@@ -105,10 +128,11 @@ def train_split(
     out: pathlib.Path,
     names: list[str],
     paper: bool = True,
+    settings: dict | None = None,
     step: Callable[[str], object] | None = None,
 ) -> None:
     """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
-    and last SPLIT-SEED.json."""
+    and last SPLIT-SEED.json, which keeps the settings of the whole training."""
     division = _division(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -176,6 +200,7 @@ def train_split(
     report = {
         "split": split,
         "seed": seed,
+        "settings": settings or {},
         "config": dataclasses.asdict(config),
         "set": str(path),
         "interactions": len(arrays.objects),
@@ -330,7 +355,6 @@ def _write(out, name, arrays, check, rows, both, truth, predictions, report):
         for k, v in predictions.items()
     }
     content = {k: v.detach().cpu().numpy() if torch.is_tensor(v) else v for k, v in content.items()}
-    with replacing(out / f"{name}.npz") as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **content)
+    write_npz(out / f"{name}.npz", **content)
     with replacing(out / f"{name}.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(report, indent=1))

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from ..sensor.channels import NELECTRODE, log_impedance
+from ..sensor.channels import NELECTRODE, check_counts, log_impedance
 from .electrode_vae import mlp
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
@@ -181,8 +181,5 @@ def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:
             f"counts have shape {counts.shape} and the tare {tare.shape}: 19 electrodes e1..e19 are needed"
         )
     for name, value in (("counts", counts), ("tare", tare)):
-        if not np.isfinite(value).all() or value.min() < 0 or value.max() > 4095:
-            raise ValueError(
-                f"{name} hold values that are not finite or outside 0..4095: pass raw counts, not tared ones"
-            )
+        check_counts(np.atleast_2d(value), name)
     return log_impedance(counts) - log_impedance(tare)

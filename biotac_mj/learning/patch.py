@@ -197,4 +197,5 @@ def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
     right.set_xlabel("electrode"), right.set_title("measured change [counts]", fontsize=10)
     what = f"row {one['row']}: force about {one['force']:.2f} N, patch {one['area_mm2']:.1f} mm2"
     figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120)

@@ -221,4 +221,5 @@ def _plot(recording, ntrain, reconstructed, predicted, result, path):
         axis.axvspan(ntrain, len(t), color="C2", alpha=0.08, lw=0)
         axis.legend(loc="upper left", fontsize=7, framealpha=0.8)
     axes[-1].set_xlabel("row")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

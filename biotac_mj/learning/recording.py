@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 
 from ..data.columns import read_columns
-from ..sensor.channels import ELECTRODES, FULL_SCALE
+from ..sensor.channels import ELECTRODES, FULL_SCALE, check_counts, check_force
 
 __all__ = ["Recording", "load_recording"]
 
@@ -41,14 +41,8 @@ def load_recording(electrodes: pathlib.Path | str, force: pathlib.Path | str | N
         that differ, or a log too short.
     """
     counts = read_columns(electrodes, ELECTRODES)
-    low, high = counts.min(0), counts.max(0)
-    if (low < 0).any() or (high > FULL_SCALE).any():
-        bad = [f"e{i + 1} ({low[i]:g}..{high[i]:g})" for i in np.flatnonzero((low < 0) | (high > FULL_SCALE))]
-        raise ValueError(
-            f"{electrodes}: counts of {', '.join(bad)} are outside 0..4095: "
-            "raw 12-bit counts are needed, not tared or scaled ones"
-        )
-    if not (low < high).any():
+    check_counts(counts, str(electrodes))
+    if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{electrodes}: no channel changes: this is not a recording of a touch")
     if len(counts) < _SHORTEST:
         raise ValueError(
@@ -61,4 +55,5 @@ def load_recording(electrodes: pathlib.Path | str, force: pathlib.Path | str | N
                 f"{electrodes} has {len(counts)} rows and the force file {len(force)}: "
                 "they must be samples of the same instants"
             )
+        check_force(force, "the force file")
     return Recording(counts, force, ((counts <= 0) | (counts >= FULL_SCALE)).mean(0))

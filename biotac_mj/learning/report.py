@@ -6,8 +6,10 @@ import pathlib
 
 import numpy as np
 
+from ..fields import check_entries
 from ..files import replacing
-from ..sensor.channels import electrode_noise
+from ..reading import Array, check_arrays, read_json, read_npz
+from ..sensor.channels import NELECTRODE, electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 
 __all__ = ["PAPER", "evaluate_models", "table"]
@@ -35,9 +37,7 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
       ValueError: seeds that were trained on different sets.
     """
     folder = pathlib.Path(folder)
-    reports = [
-        json.loads(p.read_text()) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()
-    ]
+    reports = [_report(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
     if not reports:
         raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
@@ -62,6 +62,54 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
     with replacing(out) as temporary:
         pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
     return result
+
+
+_AGAIN = "remove it and run `biotac train` again"
+_REPORT = {
+    "split": str,
+    "seed": int,
+    "set": str,
+    "interactions": int,
+    "labelled": int,
+    "device": str,
+    "mesh": dict[str, dict],
+    "inverse": dict[str, dict[str, float | list[float]]],
+    "seconds": dict[str, float],
+}
+_MESH = {"all": dict[str, float], "objects": dict[str, dict[str, float]]}
+_ERRORS = {"mean": float, "moved": float}  # [mm]
+_PREDICTIONS = {
+    "truth": Array(("n", NELECTRODE)),
+    "tare": Array(("n", NELECTRODE)),
+    "time": Array(("n",)),
+    "owner": Array(("n",), "index"),
+    "object": Array(("n",), "text"),
+    "test": Array(("n",), "flag"),
+}
+
+
+def _report(path):
+    """What `biotac train` says of one split and seed."""
+    report = check_entries(str(path), read_json(path, "result of `biotac train`", _AGAIN), _REPORT)
+    for code, found in report["mesh"].items():
+        check_entries(f"mesh {code} of {path}", found, _MESH)
+        check_entries(f"all of mesh {code} of {path}", found["all"], _ERRORS)
+    for code, found in report["inverse"].items():
+        check_entries(f"inverse {code} of {path}", found, _ERRORS)
+    if path.stem != f"{report['split']}-{report['seed']}":
+        raise ValueError(f"{path} says it is {report['split']}-{report['seed']}: {_AGAIN}")
+    return report
+
+
+def _predictions(path):
+    """Its predictions, each (n, 19)."""
+    what = "file of predictions"
+    found = read_npz(path, what, _AGAIN)
+    wanted = {name: Array(("n", NELECTRODE)) for name in found if name.startswith("predicted_")}
+    check_arrays(path, found, _PREDICTIONS | wanted, _AGAIN)
+    if not wanted or not found["test"].any() or found["test"].all():
+        raise ValueError(f"{path} has no predictions, or none of both parts: {_AGAIN}")
+    return found
 
 
 def table(result: dict) -> str:
@@ -131,9 +179,8 @@ def _split(folder, split, reports):
     errors, pooled, seconds = {}, {}, {}
     coverage, intervals, noise, example = {}, {}, [], None
     for report in reports:
-        with np.load(folder / f"{split}-{report['seed']}.npz") as file:
-            data = {k: file[k] for k in file.files}
-        test = data["test"]
+        data = _predictions(folder / f"{split}-{report['seed']}.npz")
+        test = data["test"].astype(bool)
         truth, owner = data["truth"][test].astype(float), data["owner"][test]
         raw = truth + data["tare"][test]
         noise.append(np.sqrt((electrode_noise(raw) ** 2).mean(1)))
@@ -258,7 +305,8 @@ def _figures(result, drawn, out):
         below.set_ylabel("share of all readings")
         below.legend(fontsize=7)
     paths = [out.with_name(out.stem + "_errors.png"), out.with_name(out.stem + "_traces.png")]
-    figure.savefig(paths[0], dpi=110)
+    with replacing(paths[0]) as temporary:
+        figure.savefig(temporary, dpi=110)
     _traces(result, drawn, splits, paths[1])
     return [str(p) for p in paths]
 
@@ -286,4 +334,5 @@ def _traces(result, drawn, splits, path):
             axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)
             axis.set_xlabel("time [s]"), axis.set_ylabel("change [counts]")
             axis.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -4,6 +4,11 @@ beside it."""
 import argparse
 from collections.abc import Callable
 
+from ..arguments import SEED, device, output_file, output_folder, real, whole
+from ..fields import refuse_unknown
+from ..files import check_output_file
+from ..reading import read_json
+
 __all__ = ["add_verbs"]
 
 
@@ -22,10 +27,14 @@ def _add_train(verbs, verb):
         "set", metavar="SET", help="data set with labelled interactions, made by `biotac generate`"
     )
     v.add_argument(
-        "--out", default="out/train", metavar="DIR", help="folder of predictions, errors and weights"
+        "--out",
+        type=output_folder(),
+        default="out/train",
+        metavar="DIR",
+        help="folder of predictions, errors and weights",
     )
     v.add_argument(
-        "--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of divisions, weights and batches"
+        "--seeds", type=SEED, nargs="+", default=[0, 1, 2, 3, 4], help="of divisions, weights and batches"
     )
     v.add_argument(
         "--splits",
@@ -43,26 +52,23 @@ def _add_train(verbs, verb):
         help="latent projection and PointNet++; slow without a GPU",
     )
     v.add_argument("--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/learning.md)")
-    v.add_argument("--steps", type=int, help="of each training (default: the config's)")
-    v.add_argument("--limit", type=int, help="interactions to read, the first ones")
-    v.add_argument("--device", default="cpu", help="of torch: cpu, cuda")
+    v.add_argument("--steps", type=whole(1, 10_000_000), help="of each training (default: the config's)")
+    v.add_argument("--limit", type=whole(1, 10_000_000), help="interactions to read, the first ones")
+    v.add_argument("--device", type=device, default="cpu", help="of torch: cpu, cuda")
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _train(args):
     import dataclasses
-    import json
-    import pathlib
 
     from .config import LearningConfig
     from .experiment import train_all
 
-    settings = json.loads(pathlib.Path(args.config).read_text()) if args.config else {}
-    unknown = set(settings) - {f.name for f in dataclasses.fields(LearningConfig)}
-    if unknown:
-        raise ValueError(
-            f"{args.config} sets {', '.join(sorted(unknown))}: LearningConfig has no such settings"
-        )
+    _check_device(args.device)
+    settings = (
+        read_json(args.config, "config", "give a file of JSON (docs/learning.md)") if args.config else {}
+    )
+    refuse_unknown(settings, [f.name for f in dataclasses.fields(LearningConfig)], args.config)
     if args.steps:
         settings |= {"steps": args.steps, "paper_steps": 4 * args.steps, "mesh_steps": 4 * args.steps}
     train_all(
@@ -78,6 +84,17 @@ def _train(args):
         progress=not args.quiet,
     )
     print(f"written: {args.out}; judge it with `biotac evaluate {args.out}`")
+
+
+def _check_device(name):
+    import torch
+
+    if name != "cpu" and not (
+        torch.cuda.is_available() and torch.device(name).index in (None, *range(torch.cuda.device_count()))
+    ):
+        raise ValueError(
+            f"--device {name} is not here: torch finds {torch.cuda.device_count()} GPUs; take cpu"
+        )
 
 
 def _add_evaluate(verbs, verb):
@@ -107,25 +124,45 @@ def _add_evaluate(verbs, verb):
     v.add_argument(
         "--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)"
     )
-    v.add_argument("--ship", metavar="FOLDER", help="copy the trained weights there, each with a card")
-    v.add_argument("--fraction", type=float, default=0.7, help="of the recording's rows, in time, that train")
-    v.add_argument("--seed", type=int, default=0, help="of the recording's networks")
     v.add_argument(
-        "--json", metavar="FILE", help="where the numbers go, a plot beside them (default: out/evaluate/...)"
+        "--ship",
+        type=output_folder(),
+        metavar="FOLDER",
+        help="copy the trained weights there, each with a card",
+    )
+    v.add_argument(
+        "--fraction", type=real(), default=0.7, help="of the recording's rows, in time, that train"
+    )
+    v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
+    v.add_argument(
+        "--json",
+        type=output_file(),
+        metavar="FILE",
+        help="where the numbers go, a plot beside them (default: out/evaluate/...)",
     )
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _evaluate(args):
+    if sum(map(bool, (args.electrodes, args.new_sensor, args.folder))) > 1:
+        raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
+    if args.force and not args.electrodes:
+        raise ValueError("--force goes with --electrodes: give both, or neither")
+    if args.weights and not args.new_sensor:
+        raise ValueError("--weights goes with --new-sensor: give both, or neither")
+    if args.ship and not args.folder:
+        raise ValueError("--ship copies what `biotac train` wrote: give its DIR, or leave it out")
+    if args.json is None and not args.folder:
+        name = "recording" if args.electrodes else "new_sensor"
+        args.json = f"out/evaluate/{name}.json"
+        check_output_file(args.json)
     if args.electrodes:
         _evaluate_recording(args)
     elif args.new_sensor:
         from .few_shot import evaluate_new_sensor
         from .weights import shipped
 
-        one = evaluate_new_sensor(
-            args.new_sensor, args.weights or shipped("forward"), args.json or "out/evaluate/new_sensor.json"
-        )
+        one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json)
         same = one["as_it_is_on_the_same_touches"]
         for name, value in one["median_rms_counts_after_touches"].items():
             text = "predict the tare" if name == "tare" else f"{name} touches"
@@ -172,7 +209,11 @@ def _add_contact_patch(verbs, verb):
         help="inverse weights (default: those that come with the package, trained on synthetic data)",
     )
     v.add_argument(
-        "--out", default="out/contact", metavar="DIR", help="folder of contact.png and contact.json"
+        "--out",
+        type=output_folder("contact.png", "contact.json"),
+        default="out/contact",
+        metavar="DIR",
+        help="folder of contact.png and contact.json",
     )
 
 
@@ -194,7 +235,7 @@ def _evaluate_recording(args):
     result = evaluate_recording(
         args.electrodes,
         args.force,
-        args.json or "out/evaluate/recording.json",
+        args.json,
         args.fraction,
         args.seed,
         progress=not args.quiet,
@@ -218,4 +259,4 @@ def _evaluate_recording(args):
             print(f"  {name:<28}" + "".join(f"{e:>10.3f}" for e in row["rmse"]))
     for note in result["notes"]:
         print(f"  note: {note}")
-    print(f"written: {args.json or 'out/evaluate/recording.json'}, {result['plot']} ({result['seconds']} s)")
+    print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")

@@ -9,7 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from ..fields import check_entries
 from ..files import replacing
+from ..reading import reading
 from ..sensor.channels import ELECTRODES, NELECTRODE
 
 if typing.TYPE_CHECKING:
@@ -30,7 +32,14 @@ __all__ = [
     "window_of",
 ]
 
+_DAMAGED = "it is damaged: train again, or copy it again"
 _FORMAT = "biotac_mj.learning.weights/1"
+# what a file says of itself
+_SAID = {"mesh": str, "skin": str, "channels": list, "nvert": int}
+_SAID_OF = {
+    "forward": {"kind": dict, "members": int, "window": list[float], "width": int, "scale": float},
+    "inverse": {"nouter": int},
+}
 
 
 def mesh_key(geometry: "SkinGeometry") -> str:
@@ -94,7 +103,7 @@ def save_inverse(
 
 
 def _save(path, tensors, geometry, meta):
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
     tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()}
@@ -104,10 +113,8 @@ def _save(path, tensors, geometry, meta):
         "skin": geometry.name,
         "channels": list(ELECTRODES),
     }
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        save_file(tensors, str(temporary), {"biotac_mj": json.dumps(meta, sort_keys=True)})
+        temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
 
 def describe(path: pathlib.Path | str) -> dict:
@@ -119,29 +126,28 @@ def _read(path, names=None):
     """Description and tensors (all, or of these names) of a file."""
     from safetensors import safe_open
 
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no weights {path}: give a file that `biotac train` wrote, "
-            "forward-SPLIT or inverse-SPLIT.safetensors"
-        )
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
-            return meta, {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}
-    except Exception as error:
-        raise ValueError(
-            f"{path} is not a readable safetensors file ({error}): train again, or copy it again"
-        ) from error
+    remedy = (
+        "give a file that `biotac train` wrote, forward-SPLIT or inverse-SPLIT.safetensors, or copy it again"
+    )
+    with reading(path, "file of weights", remedy), safe_open(str(path), framework="pt") as file:
+        meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
+        tensors = {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}
+    for name, value in tensors.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(
+                f"{name} of {path} has weights that are not finite: train again, or copy it again"
+            )
+    return meta, tensors
 
 
 def _load(path, geometry, direction):
     meta, tensors = _read(path)
-    if meta.get("format") != _FORMAT or meta.get("direction") != direction:
+    if not isinstance(meta, dict) or meta.get("format") != _FORMAT or meta.get("direction") != direction:
         raise ValueError(
             f"{path} holds no {direction} model of {_FORMAT}: "
             f"it says {meta.get('format')}, {meta.get('direction')}"
         )
+    check_entries(f"the description of {path}", meta, _SAID | _SAID_OF[direction])
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
@@ -165,7 +171,8 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
     from .predictor import ForwardModel
 
     meta, tensors = _load(path, geometry, "forward")
-    model = ForwardModel(geometry, meta, tensors["pod.scale"].numel())
+    with reading(path, "file of weights that fit together", _DAMAGED):
+        model = ForwardModel(geometry, meta, tensors["pod.scale"].numel())
     _fill(
         model,
         {k.replace("member", "members.", 1) if k.startswith("member") else k: v for k, v in tensors.items()},
@@ -189,9 +196,12 @@ def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Inverse
     from .inverse import InverseHead
 
     meta, tensors = _load(path, geometry, "inverse")
-    head = InverseHead(
-        Pod(geometry.nvert, tensors["pod.scale"].numel()), tensors["force_scale"].numel(), meta["nouter"]
-    )
+    with reading(path, "file of weights that fit together", _DAMAGED):
+        modes = tensors["pod.scale"].numel(), tensors["force_scale"].numel()
+        outer = len(np.unique(geometry.outer_face))
+        if meta["nouter"] != outer:
+            raise ValueError(f"{meta['nouter']} outer nodes, the skin has {outer}")
+        head = InverseHead(Pod(geometry.nvert, modes[0]), modes[1], outer)
     _fill(head, tensors, path)
     return head.eval()
 

@@ -4,7 +4,6 @@ An indenter's frame has its tip in front and +y along the way it goes, as the pa
 """
 
 import dataclasses
-import pathlib
 
 import mujoco
 import numpy as np
@@ -12,6 +11,7 @@ import trimesh
 
 from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
+from ..reading import reading
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
@@ -89,18 +89,11 @@ def _from_geom(text):
 
 
 def _from_file(path):
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no indenter mesh at {path}: give mesh:FILE of a closed surface (obj, stl, ply) in metres"
-        )
-    try:
-        mesh = trimesh.load(path, force="mesh")
-    except Exception as error:  # readers raise what they like
-        raise ValueError(
-            f"cannot read the indenter mesh {path} ({error}): give an obj, stl or ply file"
-        ) from error
-    if not len(getattr(mesh, "faces", ())) or not np.isfinite(mesh.vertices).all():
+    with reading(path, "indenter mesh", "give mesh:FILE of a closed surface (obj, stl, ply) in metres"):
+        raw = trimesh.load(path, force="mesh", process=False)  # which would drop what is not finite
+        sound = len(getattr(raw, "faces", ())) and np.isfinite(raw.vertices).all()
+        mesh = trimesh.Trimesh(raw.vertices, raw.faces) if sound else None
+    if not sound:
         raise ValueError(
             f"the indenter mesh {path} has no faces or vertices that are not finite: "
             "give a closed surface in metres"

@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from ..fields import check_types
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
 from . import approach
@@ -12,6 +13,9 @@ from .indenter import Indenter, add_indenter
 
 __all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
+_DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
+_MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
+_PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
 
 
@@ -60,12 +64,28 @@ class PressOptions:
     options: str | dict | None = None
 
     def __post_init__(self):
-        for name, least in (("depth", 0), ("timestep", 0), ("speed", 0)):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > least):
+        check_types(self, _PLAIN)
+        for name in ("depth", "timestep", "speed"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be a positive number")
         for name in ("slide", "hold"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
+        for name, most in (("depth", _DEEPEST), ("slide", _LONGEST)):
+            if getattr(self, name) > most:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} m: the finger ends before {most:g} m; choose less"
+                )
+        rests = self.hold * (2 if self.slide else 1)
+        steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
+        if steps > _MOST_STEPS:
+            raise ValueError(
+                f"this press takes {steps:.3g} steps of {self.timestep:g} s: {_MOST_STEPS} at most; "
+                "shorten hold, "
+                "depth or slide, or raise speed or timestep"
+            )
+        if self.friction is not None and not 0 <= self.friction < np.inf:
+            raise ValueError(f"friction is {self.friction}: pass a Coulomb coefficient >= 0, or None")
         if len(self.location) not in (2, 3):
             raise ValueError(
                 f"location {self.location} has {len(self.location)} numbers: "
@@ -73,6 +93,8 @@ class PressOptions:
             )
         for name in ("location", "direction", "slide_direction"):
             value = getattr(self, name)
+            if value is not None and np.asarray(value).dtype.kind not in "fiu":
+                raise ValueError(f"{name} is {value!r}: pass numbers")
             if value is not None and not np.isfinite(value).all():
                 raise ValueError(f"{name} {value} contains NaN or infinite numbers")
         for name in ("direction", "slide_direction"):

@@ -7,9 +7,10 @@ import pathlib
 
 import numpy as np
 
-from ..files import replacing, versions
+from ..files import hdf5, replacing
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS
+from ..versions import versions
 
 __all__ = ["CSV_COLUMNS", "PressRecord", "write_readings", "write_skin"]
 
@@ -100,8 +101,6 @@ def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
 def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
     """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and
     versions as JSON attributes."""
-    import h5py
-
     geometry = record.geometry
     pose = np.concatenate([record.indenter_pos, record.indenter_quat], axis=1)
     columns = dict(
@@ -121,7 +120,7 @@ def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
         indenter_vert=(record.indenter_vert, "m"),
         indenter_face=(record.indenter_face, "vertex"),
     )
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5(path) as file:
         shape = record.vert_xpos.shape
         file.create_dataset(
             "vert_xpos",

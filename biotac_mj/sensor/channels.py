@@ -37,6 +37,8 @@ __all__ = [
     "temperature_exponent",
     "temperature_from_counts",
     "thermistor_counts",
+    "check_counts",
+    "check_force",
 ]
 
 NELECTRODE, NPAC = 19, 22  # sensing electrodes; PAC's samples of a frame
@@ -181,3 +183,41 @@ def _thermistor_log(counts):
 
 
 _STEADY = float(_TAC_SCALE / _thermistor_log(_MIDDLE))  # what the manual's formula gives where TAC rests
+
+
+_LEAST, _MOST_FORCE = 8, 100.0  # a resting electrode shows thousands of counts; a BioTac bears 50 N
+
+
+def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
+    """Refuses what are no raw counts of electrodes (ValueError).
+
+    Args:
+      counts: (n, 19). where: they come from, first: number of the first row, for the text.
+    """
+    bad = ~((counts >= 0) & (counts <= FULL_SCALE))
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise ValueError(
+            f"{where}: {ELECTRODES[column]} of row {first + row} is {counts[row, column]:g}: "
+            "raw counts 0..4095 "
+            "are needed, not tared, scaled or in ohm"
+        )
+    if counts.size and counts.max() <= _LEAST:
+        raise ValueError(
+            f"{where}: no electrode exceeds {counts.max():g} counts: these look like volts or normalised "
+            "values; raw counts 0..4095 are needed"
+        )
+
+
+def check_force(force: np.ndarray, where: str) -> None:
+    """Refuses what are no newtons (ValueError).
+
+    Args:
+      force: any shape, NaN where it was not measured. where: it comes from, for the text.
+    """
+    largest = np.nanmax(np.abs(force), initial=0)
+    if not largest <= _MOST_FORCE:
+        raise ValueError(
+            f"{where}: the force reaches {largest:.4g}: a BioTac bears {_MOST_FORCE:g} N; give newtons, "
+            "these look like mN or raw counts"
+        )

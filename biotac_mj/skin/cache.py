@@ -10,13 +10,14 @@ import io
 import os
 import pathlib
 import sys
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import BinaryIO
 
 import numpy as np
+
+from ..files import replacing
 
 __all__ = ["cache_folder", "digest", "kept", "replace_file", "report_damage"]
 
@@ -108,22 +109,8 @@ def report_damage(path: pathlib.Path) -> None:
 def replace_file(path: pathlib.Path, write: Callable[[BinaryIO], object]) -> bool:
     """Writes a file all at once; False where that is not possible."""
     try:
-        with _temporary(path) as (file, name):
+        with replacing(path) as temporary, open(temporary, "wb") as file:
             write(file)
-            file.close()
-            os.replace(name, path)
     except OSError:
         return False
     return True
-
-
-@contextlib.contextmanager
-def _temporary(path) -> Iterator:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            yield file, name
-    finally:
-        with contextlib.suppress(OSError):  # it is gone where it was renamed
-            os.unlink(name)

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import liquid
@@ -89,6 +90,8 @@ class SkinOptions:
     element: str | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "contact_law", contact_law(self.contact_law))
+        check_types(self)
         if self.dynamics not in ("quasistatic", "implicit"):
             raise ValueError(f"unknown dynamics {self.dynamics!r}: choose 'quasistatic' or 'implicit'")
         if self.element not in (None, *ELEMENTS):
@@ -107,7 +110,6 @@ class SkinOptions:
                 f"fill_volume is {self.fill_volume} and rest_pressure {self.rest_pressure}: pass one of "
                 "them, a finite number"
             )
-        object.__setattr__(self, "contact_law", contact_law(self.contact_law))
         for name in ("stick_ratio", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -127,8 +129,9 @@ class SkinOptions:
                 "mass_damping and stiffness_damping act on a skin in motion: "
                 "add dynamics='implicit', or leave them out"
             )
-        if self.samples < 1 or self.max_newton < 1 or self.max_cg < 1:
-            raise ValueError("samples, max_newton and max_cg must be at least 1")
+        for name, most in (("samples", 16), ("max_newton", 100_000), ("max_cg", 100_000)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} is {getattr(self, name)}: pass a number from 1 to {most}")
 
 
 def stiffness_of_contact(material: Material) -> float:

@@ -3,13 +3,16 @@
 import dataclasses
 import json
 import pathlib
+import reprlib
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..fields import refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
+from ..reading import read_json, reading
 from .contact.law import ContactLaw
 from .model import SkinOptions
 from .rubber.material import PRESETS, Material
@@ -43,14 +46,12 @@ def read_settings(
       ValueError: unknown keys, or values that cannot be. FileNotFoundError: no such file.
     """
     given = read_dict(options, "options")
-    unknown = set(given) - set(_KEYS)
-    if unknown:
-        raise ValueError(
-            f"options has {', '.join(map(repr, sorted(unknown)))}: pass some of {', '.join(_KEYS)}"
-        )
-    skin = given.get("skin") or {}
+    refuse_unknown(given, _KEYS, "options")
+    skin = given.get("skin")
     if not isinstance(skin, SkinOptions):
-        skin = SkinOptions(**{**defaults, **_known(skin, SkinOptions, "options['skin']")})
+        skin = SkinOptions(
+            **{**defaults, **_known(read_dict(skin, "options['skin']"), SkinOptions, "options['skin']")}
+        )
     return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
 
 
@@ -71,7 +72,7 @@ def read_material(choice: Material | dict | str | pathlib.Path | None) -> Materi
             "Material's fields"
         )
     fields = read_dict(choice, "material")
-    return Material(**_known(fields.get("material", fields), Material, "material"))
+    return Material(**_known(read_dict(fields.get("material", fields), "material"), Material, "material"))
 
 
 def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np.ndarray | Callable | None:
@@ -83,15 +84,18 @@ def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np
     if choice is None or callable(choice):
         return choice
     if isinstance(choice, (str, pathlib.Path)):
-        if not pathlib.Path(choice).is_file():
-            raise FileNotFoundError(f"no modulus at {choice}: write one factor per element with numpy.save")
-        choice = np.load(choice)
+        with reading(choice, "modulus", "write one factor per element with numpy.save"):
+            choice = np.asarray(np.load(choice, allow_pickle=False), float)
     try:
-        return np.asarray(choice, float)
+        factors = np.asarray(choice, float)
     except (TypeError, ValueError):
+        factors = np.array(np.nan)
+    if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
         raise ValueError(
-            f"modulus is {type(choice).__name__}: pass a factor for each element, or a .npy file of them"
-        ) from None
+            f"modulus is {reprlib.repr(choice)}: pass a positive factor for each element, or a .npy "
+            "file of them"
+        )
+    return factors
 
 
 def read_dict(choice: dict | str | pathlib.Path | None, what: str) -> dict:
@@ -105,13 +109,10 @@ def read_dict(choice: dict | str | pathlib.Path | None, what: str) -> dict:
     if isinstance(choice, (str, pathlib.Path)):
         text = str(choice)
         if not text.lstrip().startswith("{"):
-            path = pathlib.Path(text)
-            if not path.is_file():
-                raise FileNotFoundError(f"no {what} at {text}: give a file of JSON, or the JSON itself")
-            text = path.read_text()
+            return read_json(text, what, "give a file of JSON, or the JSON itself")
         try:
             choice = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{what} is no JSON ({error}): write {{...}} with names in quotes") from None
     if not isinstance(choice, dict):
         raise ValueError(f"{what} is {type(choice).__name__}: pass a dict, or JSON of one")
@@ -140,10 +141,5 @@ def plain(value: object, geometry: SkinGeometry | None = None) -> object:
 
 
 def _known(fields, kind, what):
-    names = [f.name for f in dataclasses.fields(kind)]
-    unknown = set(fields) - set(names)
-    if unknown:
-        raise ValueError(
-            f"{what} has {', '.join(map(repr, sorted(unknown)))}: choose from {', '.join(names)}"
-        )
+    refuse_unknown(fields, [f.name for f in dataclasses.fields(kind)], what)
     return fields

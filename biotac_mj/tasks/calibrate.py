@@ -9,13 +9,14 @@ import argparse
 import functools
 import hashlib
 import json
-import os
 import pathlib
 
 import numpy as np
 from tqdm import tqdm
 
 from ..data.objects import OBJECTS
+from ..files import write_npz
+from ..reading import read_npz
 from . import suite
 from .biotac import BioTac
 from .scripted import SCRIPTED, make_controller
@@ -83,13 +84,10 @@ def record_explore(seed: int, name: str, biotac: dict | None = None) -> np.ndarr
 def _kept(path, make):
     """Arrays of a recording, made if it is not there."""
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
         arrays = make()
-        temporary = path.with_suffix(".part.npz")
-        np.savez(temporary, *(arrays if isinstance(arrays, tuple) else (arrays,)))
-        temporary.rename(path)
-    with np.load(path) as file:
-        return [file[name] for name in file.files]
+        arrays = arrays if isinstance(arrays, tuple) else (arrays,)
+        write_npz(path, **{f"arr_{i}": array for i, array in enumerate(arrays)})
+    return list(read_npz(path, "recording of a task", "remove it: it is made again").values())
 
 
 def _discriminant(presses, label, shrink=0.05):
@@ -126,13 +124,8 @@ def _explore(folder, episodes, biotac):
 
 def _add(path, found):
     """Adds arrays to a file of others."""
-    stored = {}
-    if path.exists():
-        with np.load(path) as file:
-            stored = {name: file[name] for name in file.files}
-    temporary = path.with_suffix(f".part{os.getpid()}.npz")
-    np.savez_compressed(temporary, **stored | found)
-    temporary.rename(path)
+    stored = read_npz(path, "calibration", "remove it: it is made again") if path.exists() else {}
+    write_npz(path, **stored | found)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..reading import read_npz
 from ..sensor.channels import FULL_SCALE
 
 if typing.TYPE_CHECKING:
@@ -183,8 +184,7 @@ def load_calibration(path: str | None = None) -> dict:
     if path is None:
         with importlib.resources.as_file(importlib.resources.files(__package__) / "calibration.npz") as own:
             return load_calibration(str(own))
-    with np.load(path) as file:
-        return {name: file[name] for name in file.files}
+    return read_npz(path, "calibration", "make one with `python -m biotac_mj.tasks.calibrate`")
 
 
 def load_estimator(task: str, stored: dict | None = None) -> Estimator:

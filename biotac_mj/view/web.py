@@ -11,9 +11,18 @@ import numpy as np
 
 from ..coupling.show import electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
+from ..reading import Array, read_hdf5
+from ..sensor.channels import CHANNELS, NELECTRODE, REST_COUNTS, check_counts, check_force
 
 __all__ = ["Finger", "Page", "play_file", "play_model"]
 
+_PRESS = {
+    "vert_xpos": Array(("n", "nvert", 3)),
+    "outer_face": Array((None, 3), "index"),
+    "time": Array(("n",)),
+    "counts": Array(("n", len(CHANNELS))),
+    "force": Array(("n", 3)),
+}
 _WINDOW = 200  # samples that a trace shows
 _MAP = (150, 220)  # of the electrode map, (angle, x) [pixel]
 _FROM = np.array([-0.55, -0.75, 0.35])  # where the camera looks from: the tip's side, pad in sight
@@ -62,7 +71,7 @@ class Page:
       server: the ViserServer; url: of the page.
 
     Raises:
-      ValueError: viser is not installed; the text says what to do.
+      ValueError: viser is not installed, or a port that is none; the text says what to do.
     """
 
     def __init__(self, fingers: dict[str, Finger], host: str = "127.0.0.1", port: int = 8080):
@@ -70,6 +79,8 @@ class Page:
             import viser
         except ImportError as error:
             raise ValueError("the page in the browser needs viser: pip install 'biotac-mj[web]'") from error
+        if not 0 < port < 65536:
+            raise ValueError(f"port {port} is none: choose one from 1 to 65535")
         self.fingers = fingers
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
@@ -219,7 +230,6 @@ def play_model(
     """
     from .. import plugin
     from ..geometry import load_skin
-    from ..sensor.channels import REST_COUNTS
     from .web_scene import Scene
 
     if page is None:
@@ -279,25 +289,17 @@ def play_file(
       FileNotFoundError: no such file.
       ValueError: it is no recorded press.
     """
-    import h5py
-
     from ..geometry import load_skin
 
-    if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(
-            f"no recording at {path}: make one with `biotac press --out DIR` and give DIR/skin.h5"
-        )
+    remedy = "make one with `biotac press --out DIR` and give DIR/skin.h5"
+    found, said = read_hdf5(path, "recording", remedy, _PRESS, ["skin"])
+    vert, face, time, counts, force = (found[name] for name in _PRESS)
+    if not len(time) or not face.size or face.max() >= vert.shape[1] or not (np.diff(time) > 0).all():
+        raise ValueError(f"{path} has no steps, faces of missing nodes or times that run back: {remedy}")
+    check_counts(counts[:, :NELECTRODE], str(path))
+    check_force(force, str(path))
     try:
-        with h5py.File(path) as file:
-            names = ("vert_xpos", "outer_face", "time", "counts", "force")
-            vert, face, time, counts, force = (file[name][()] for name in names)
-            skin = file.attrs["skin"]
-    except (OSError, KeyError) as error:
-        raise ValueError(
-            f"{path} is no recorded press ({error}): give the skin.h5 that `biotac press` writes"
-        ) from error
-    try:
-        geometry = load_skin(skin)
+        geometry = load_skin(str(said["skin"]))
     except (ValueError, FileNotFoundError):
         geometry = load_skin("default")  # of another skin only core and electrodes are lent: all share them
     node, local = np.unique(face, return_inverse=True)

@@ -116,7 +116,7 @@ def build_hand(
 
 def view(
     skin: str | pathlib.Path | SkinGeometry = "default",
-    material: str = "default",
+    material: str | dict = "default",
     liquid: bool | None = None,
     seed: int = 0,
     device: str = "cpu",
@@ -127,12 +127,13 @@ def view(
     web: bool = False,
     recording: pathlib.Path | str | None = None,
     port: int = 8080,
+    options: dict | str | None = None,
 ) -> object:
     """Opens the viewer and steps in real time as far as the machine goes; or renders; or serves a page.
 
     Args:
-      skin, material, liquid, seed, device, tier: see `biotac_mj.attach`; liquid None takes the material's
-        choice.
+      skin, material, liquid, seed, device, tier, options: see `biotac_mj.attach`; liquid None takes the
+        material's choice.
       render: path of a picture to write after `seconds` [s] instead.
       hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
       web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`.
@@ -140,7 +141,7 @@ def view(
     Raises:
       ValueError: no display for a window, or no GL library to render with.
     """
-    from ..skin.rubber.material import material as preset
+    from ..skin.settings import plain, read_dict, read_material
 
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add --web")
@@ -158,9 +159,14 @@ def view(
         raise ValueError(
             "no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY"
         )
-    liquid = preset(material).liquid if liquid is None else liquid
+    rubber = read_material(material)
     settings = dict(
-        material=material, liquid=liquid, friction=preset(material).friction, seed=seed, device=device
+        material=plain(material),
+        liquid=rubber.liquid if liquid is None else liquid,
+        friction=rubber.friction,
+        seed=seed,
+        device=device,
+        options=read_dict(options, "options"),
     )
     if hand is None:
         spec, handle = build_scene(skin, tier=tier, **settings)

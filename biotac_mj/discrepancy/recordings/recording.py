@@ -8,7 +8,7 @@ import pathlib
 import numpy as np
 
 from ...data.columns import read_columns
-from ...sensor.channels import CHANNELS, FULL_SCALE, REST_COUNTS, log_impedance
+from ...sensor.channels import CHANNELS, REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "Recording", "read_recording"]
 
@@ -52,16 +52,7 @@ class Recording:
                 f"{len(e)} rows are too few to fit on one part and check on another: "
                 f"record at least {MIN_ROWS}"
             )
-        if e.min() < 0 or e.max() > FULL_SCALE:
-            raise ValueError(
-                f"electrodes reach from {e.min():g} to {e.max():g}, raw counts are 0..4095: give the raw "
-                "values, not tared, scaled or in ohm"
-            )
-        if e.max() <= 8:
-            raise ValueError(
-                f"no electrode exceeds {e.max():g} counts: these look like volts or normalised values; "
-                "give raw counts 0..4095"
-            )
+        check_counts(e, self.name)
         for label, width in (("force", 3), ("tdc", None)):
             value = getattr(self, label)
             if value is None:
@@ -76,12 +67,8 @@ class Recording:
                 )
             _check_numbers(value.reshape(len(e), -1), label)
             setattr(self, label, value)
-        if self.force is not None and np.abs(self.force).max() > 1000:
-            raise ValueError(
-                f"force reaches {np.abs(self.force).max():.3g}: a BioTac is pressed with a few newtons; "
-                "give newtons (Fx Fy Fz), "
-                "not millinewtons or raw counts"
-            )
+        if self.force is not None:
+            check_force(self.force, self.name)
         if self.rate is None:
             share = self.repeated.mean()
             if 0.02 < share < 0.98:

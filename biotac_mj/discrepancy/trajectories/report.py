@@ -2,6 +2,7 @@
 summary for the terminal."""
 
 import argparse
+import dataclasses
 import html
 import json
 import pathlib
@@ -35,14 +36,14 @@ def diagnose_data(args: argparse.Namespace) -> None:
             f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: "
             "in_skin` into it, or leave --in-skin out"
         )
-    sim.device = args.device
+    changes = {"device": args.device, "cache": str(out / "fields")}  # run again after an interruption
+    if args.material:
+        changes["material"] = args.material
+    if args.options:
+        changes["options"] = read_dict(args.options, "options")
+    sim = dataclasses.replace(sim, **changes)
     if args.device != "cpu" and sim.tier != "full":
         raise ValueError(f"--device {args.device} is for the full tier: add --tier full, or leave it out")
-    if args.material:
-        sim.material = args.material
-    if args.options:
-        sim.options = read_dict(args.options, "options")
-    sim.cache = str(out / "fields")  # solved fields stay: run again after an interruption
     report = diagnose(sim, data, locked=0.25 if args.locked is None else args.locked, progress=not args.quiet)
     files = write_report(report, sim, out)
     print(summary(report))

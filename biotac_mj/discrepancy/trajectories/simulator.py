@@ -16,7 +16,10 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
-from ...files import replacing
+from ...fields import check_types
+from ...files import replacing, write_npz
+from ...reading import Array, read_npz
+from ...sensor.channels import REST_COUNTS
 from ...skin.settings import plain, read_material, read_settings
 from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
 
@@ -26,6 +29,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["SCHEMA", "Fields", "Simulator", "placed"]
 
 SCHEMA = "biotac_mj.sensor/1"
+TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
 _RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
 _AIR = 101325.0  # [Pa]
@@ -56,7 +60,17 @@ class Simulator:
     device: str = "cpu"
     intervals: dict = dataclasses.field(default_factory=dict)
     options: dict = dataclasses.field(default_factory=dict)
+
     constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
+
+    def __post_init__(self):
+        check_types(self, ("skin", "tier", "sensor", "modulus", "device"))
+        for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, tuple(REST_COUNTS))):
+            if value not in known:
+                raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
+        if not 0 < self.modulus < np.inf:
+            raise ValueError(f"the factor on the modulus is {self.modulus}: pass a positive finite number")
+        read_settings(self.material, self.options)  # refuses what cannot be
 
     def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
         """A copy with these effects added."""
@@ -106,8 +120,9 @@ class Simulator:
             ).hexdigest()[:24]
             path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"
             if path is not None and path.exists():
-                with np.load(path) as file:
-                    out[i] = {k: file[k] for k in ("force", "pressure", "log_z")}
+                n = len(t.time)
+                shapes = {"force": Array((n, 3)), "pressure": Array((n,)), "log_z": Array((n, 19))}
+                out[i] = read_npz(path, "solved field", "remove it, it is solved again", shapes)
                 if progress:
                     progress()
             else:
@@ -144,8 +159,7 @@ class Simulator:
                 "log_z": np.log(impedance),
             }
             if path is not None:
-                with replacing(path) as temporary:
-                    np.savez(temporary, **out[i])
+                write_npz(path, **out[i])
             if progress:
                 progress()
 

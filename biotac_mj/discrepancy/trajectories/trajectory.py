@@ -5,6 +5,7 @@ import pathlib
 
 import numpy as np
 
+from ...sensor.channels import check_counts, check_force
 from ..noise import noise_level
 
 __all__ = ["Trajectory", "measurement_noise", "read_trajectories", "write_trajectories"]
@@ -78,17 +79,9 @@ class Trajectory:
                 f"pos of trajectory {self.id!r} reaches {np.abs(self.pos).max():.3g}: "
                 "metres are needed, these look like millimetres"
             )
-        if self.electrodes.min() < 0 or self.electrodes.max() > 4095 or self.electrodes.max() <= 8:
-            raise ValueError(
-                f"electrodes of trajectory {self.id!r} lie in "
-                f"{self.electrodes.min():g}..{self.electrodes.max():g}: "
-                "raw counts 0..4095 are needed"
-            )
-        if self.force is not None and np.abs(self.force).max() > 500:
-            raise ValueError(
-                f"force of trajectory {self.id!r} reaches {np.abs(self.force).max():.3g}: "
-                "newtons are needed, these look like mN"
-            )
+        check_counts(self.electrodes, f"trajectory {self.id!r}")
+        if self.force is not None:
+            check_force(self.force, f"trajectory {self.id!r}")
 
     @property
     def heading(self) -> np.ndarray:

@@ -23,6 +23,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ...fields import check_types, refuse_unknown
 from ..types import real
 from .faces import Laws
 
@@ -61,6 +62,7 @@ class ContactLaw:
     adhesion_range: float | None = None
 
     def __post_init__(self):
+        check_types(self)
         if not -1 <= self.friction_exponent <= 2:
             raise ValueError(
                 f"friction_exponent is {self.friction_exponent}: pass a number from -1 to 2; 0 is Coulomb's "
@@ -89,11 +91,9 @@ def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:
     """
     if choice is None or isinstance(choice, ContactLaw):
         return choice
-    fields = [f.name for f in dataclasses.fields(ContactLaw)]
-    if not isinstance(choice, dict) or set(choice) - set(fields):
-        raise ValueError(
-            f"contact_law is {choice!r}: pass a ContactLaw, or a dict with some of {', '.join(fields)}"
-        )
+    if not isinstance(choice, dict):
+        raise ValueError(f"contact_law is {choice!r}: pass a ContactLaw, or a dict of its fields")
+    refuse_unknown(choice, [f.name for f in dataclasses.fields(ContactLaw)], "contact_law")
     return ContactLaw(**choice)
 
 

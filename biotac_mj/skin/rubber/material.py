@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from ...fields import check_types
 from .law import LAWS
 
 __all__ = ["ELEMENTS", "PRESETS", "Material", "material"]
@@ -50,6 +51,7 @@ class Material:
     def __post_init__(self):
         self._check_memory()
         self._check_hysteresis()
+        check_types(self)
         if self.law not in LAWS:
             raise ValueError(f"unknown material law {self.law!r}: choose one of {', '.join(LAWS)}")
         if self.element not in (None, *ELEMENTS):

@@ -1,0 +1,74 @@
+"""What the command line's arguments may be: each says what is wrong with its text before any work begins."""
+
+import argparse
+import math
+import re
+from collections.abc import Callable
+
+from .files import check_output, check_output_file
+
+__all__ = ["SEED", "Parser", "device", "output_file", "output_folder", "real", "whole"]
+
+
+class Parser(argparse.ArgumentParser):
+    """Its errors are one line, and end with exit code 2."""
+
+    def error(self, message: str) -> None:
+        text = " ".join(message.split())
+        self.exit(2, f"biotac: error: {text} (`{self.prog} --help` shows what can be given)\n")
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """A whole number in a range."""
+    return _number(int, "a whole number", low, high)
+
+
+def real(low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
+    """A finite number in a range."""
+    return _number(float, "a finite number", low, high)
+
+
+def _number(kind, called, low, high):
+    limits = f" from {low:g} to {high:g}" if math.isfinite(low) or math.isfinite(high) else ""
+
+    def read(text):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high or value in (math.inf, -math.inf):
+            raise argparse.ArgumentTypeError(f"{text[:40]!r} is not {called}{limits}")
+        return value
+
+    return read
+
+
+SEED = whole(0, 2**31 - 1)
+
+
+def device(text: str) -> str:
+    """The name of a device; whether it is there is known to what computes."""
+    if not re.fullmatch(r"cpu|cuda(:\d{1,3})?(,cuda:\d{1,3})*", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no device: give cpu, or cuda:0")
+    return text
+
+
+def output_folder(*names: str) -> Callable[[str], str]:
+    """A folder in which files of these names can be written."""
+    return _output(lambda text: check_output(text, *names))
+
+
+def output_file(*more: str) -> Callable[[str], str]:
+    """A file that can be written, others beside it."""
+    return _output(lambda text: check_output_file(text, *more))
+
+
+def _output(check):
+    def read(text):
+        try:
+            check(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return text
+
+    return read

@@ -1,0 +1,111 @@
+"""Settings as dicts and files give them: names that are known, values of the right type."""
+
+import dataclasses
+import difflib
+import math
+import numbers
+import reprlib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+__all__ = ["check_entries", "check_types", "refuse_unknown"]
+
+_CALLED = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    dict: "a dict",
+    tuple: "a list",
+    list: "a list",
+    type(None): "None",
+}
+
+
+def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> None:
+    """Refuses names that are not known (ValueError), with the known one that is nearest."""
+    known = list(known)
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise ValueError(f"{what} has {name!r}: {hint}choose from {', '.join(known)}")
+
+
+def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:
+    """Refuses values of a dataclass that are not of its fields' types (ValueError).
+
+    Args:
+      names: of the fields; None is all. nan: whether NaN is a number.
+    """
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if (names is None or field.name in names) and not (nan and isinstance(value, float)):
+            _check(field.name, value, field.type)
+
+
+def check_entries(what: str, given: object, wanted: Mapping[str, type], optional: Iterable = ()) -> dict:
+    """The dict itself, with at least the wanted entries and each of its type.
+
+    Raises:
+      ValueError: it is no dict, or an entry is missing or of another type.
+    """
+    if not isinstance(given, dict):
+        raise ValueError(f"{what} is {reprlib.repr(given)}: a dict is needed")
+    missing = [name for name in wanted if name not in given and name not in optional]
+    if missing:
+        raise ValueError(f"{what} has no {', '.join(missing)}: add what is missing, or write it again")
+    for name, kind in wanted.items():
+        if name in given:
+            _check(f"{name} of {what}", given[name], kind)
+    return given
+
+
+def _check(name, value, kind):
+    if not _fits(value, kind):
+        called = "a finite number" if value != value else _called(kind)
+        raise ValueError(f"{name} is {reprlib.repr(value)}: pass {called}")
+
+
+def _fits(value, kind):
+    parts = typing.get_args(kind)
+    if isinstance(kind, types.UnionType):
+        return any(_fits(value, one) for one in parts)
+    if parts:  # tuple[int, ...], list[str], dict[str, float]
+        inside = value.values() if isinstance(value, dict) else value
+        return _fits(value, typing.get_origin(kind)) and all(_fits(one, _inside(parts)) for one in inside)
+    if kind is float:
+        return isinstance(value, numbers.Real) and not _is_flag(value) and _is_number(value)
+    if kind is int:
+        return isinstance(value, numbers.Integral) and not _is_flag(value)
+    if kind is bool:
+        return _is_flag(value)
+    return isinstance(value, (tuple, list) if kind in (tuple, list) else kind or type(None))
+
+
+def _inside(parts):
+    """What the values of dict[str, KIND], list[KIND] or tuple[KIND, ...] are."""
+    return parts[0] if parts[-1] is Ellipsis else parts[-1]
+
+
+def _is_flag(value):
+    return isinstance(value, bool | np.bool_)
+
+
+def _is_number(value):
+    try:
+        return not math.isnan(float(value))
+    except OverflowError:
+        return False
+
+
+def _called(kind):
+    parts = typing.get_args(kind)
+    if isinstance(kind, types.UnionType):
+        return " or ".join(_called(one) for one in parts)
+    if parts:
+        return f"{_CALLED[typing.get_origin(kind)]}, each {_called(_inside(parts))}"
+    return _CALLED.get(kind, getattr(kind, "__name__", "None"))

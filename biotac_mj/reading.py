@@ -1,0 +1,157 @@
+"""Files that others made: whatever is wrong with one is an error of one line, which names file, cause and
+remedy."""
+
+import contextlib
+import json
+import os
+import pathlib
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+
+__all__ = [
+    "Array",
+    "Unfit",
+    "check_arrays",
+    "read_hdf5",
+    "read_json",
+    "read_npz",
+    "read_text",
+    "read_yaml",
+    "reading",
+]
+
+_KINDS = {"finite": "fiu", "number": "fiu", "index": "iu", "flag": "biu", "text": "OSU"}
+
+
+class Array(typing.NamedTuple):
+    """What an array in a file must be.
+
+    shape: numbers, names (the same size wherever they occur) or None (any). kind: "finite" numbers, "number"
+    (NaN allowed), "index" (integers >= 0), "flag" or "text".
+    """
+
+    shape: tuple
+    kind: str = "finite"
+
+
+class Unfit(ValueError):
+    """Of a file that can be read and holds something else: its text is complete."""
+
+
+@contextlib.contextmanager
+def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathlib.Path]:
+    """Calls of a library that reads `path`; whatever they raise becomes one line.
+
+    Args:
+      what: the file should be, as in "recorded press". remedy: what to do.
+
+    Raises:
+      FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
+    """
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"no {what} at {path}: {remedy}")
+    try:
+        yield pathlib.Path(path)
+    except Unfit:
+        raise
+    except Exception as error:  # libraries raise what they like for broken files
+        lines = str(error).strip("'\" \n").splitlines() or [type(error).__name__]
+        raise ValueError(f"{path} is no {what} ({lines[0][:200]}): {remedy}") from error
+
+
+def check_arrays(
+    path: pathlib.Path | str,
+    found: Mapping,
+    wanted: Mapping[str, Array],
+    remedy: str,
+    sizes: dict | None = None,
+) -> dict:
+    """The sizes that the names of the arrays' shapes stand for.
+
+    Args:
+      path: of the file, for the text. found: name -> array, or a data set of HDF5; values of "finite" and
+        "index" are checked where they are numpy's. sizes: known before.
+
+    Raises:
+      ValueError: an array is missing, or has another shape, type or values.
+    """
+    sizes = {} if sizes is None else sizes
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise Unfit(f"{path} has no {', '.join(missing)}: {remedy}")
+    for name, (shape, kind) in wanted.items():
+        value = found[name]
+        if not hasattr(value, "dtype"):
+            raise Unfit(f"{name} of {path} is no array: {remedy}")
+        if value.dtype.kind not in _KINDS[kind]:
+            raise Unfit(f"{name} of {path} holds {value.dtype}, not {kind} values: {remedy}")
+        same = value.shape is not None and len(value.shape) == len(shape)
+        for size, needed in zip(value.shape, shape) if same else ():
+            needed = sizes.setdefault(needed, size) if isinstance(needed, str) else needed
+            same &= needed in (None, size)
+        if not same:
+            text = ", ".join(str(sizes.get(s, s) if isinstance(s, str) else s or "any") for s in shape)
+            raise Unfit(f"{name} of {path} has shape {value.shape}, ({text}) is needed: {remedy}")
+        if isinstance(value, np.ndarray) and kind == "finite" and not np.isfinite(value).all():
+            raise Unfit(f"{name} of {path} has values that are not finite: {remedy}")
+        if isinstance(value, np.ndarray) and kind == "index" and value.size and value.min() < 0:
+            raise Unfit(f"{name} of {path} has negative numbers: {remedy}")
+    return sizes
+
+
+def read_hdf5(
+    path: pathlib.Path | str, what: str, remedy: str, wanted: Mapping[str, Array], attributes: Iterable = ()
+) -> tuple[dict, dict]:
+    """Arrays and attributes of an HDF5 file; see `check_arrays`."""
+    import h5py
+
+    with reading(path, what, remedy), h5py.File(path) as file:
+        there = {name: file[name] for name in wanted if name in file}
+        check_arrays(path, there, wanted, remedy)  # before anything is read
+        found = {name: value[()] for name, value in there.items()}
+        check_arrays(path, found, wanted, remedy)
+        missing = [name for name in attributes if name not in file.attrs]
+        if missing:
+            raise Unfit(f"{path} has no attribute {', '.join(missing)}: {remedy}")
+        return found, {name: file.attrs[name] for name in attributes}
+
+
+def read_npz(
+    path: pathlib.Path | str, what: str, remedy: str, wanted: Mapping[str, Array] | None = None
+) -> dict:
+    """Arrays of an .npz file, the wanted ones or all; see `check_arrays`."""
+    with reading(path, what, remedy), np.load(path, allow_pickle=False) as file:
+        names = file.files if wanted is None else [name for name in wanted if name in file.files]
+        found = {name: file[name] for name in names}
+        check_arrays(path, found, wanted or {}, remedy)
+    return found
+
+
+def read_text(path: pathlib.Path | str, what: str, remedy: str) -> str:
+    """A file of text."""
+    with reading(path, what, remedy):
+        return pathlib.Path(path).read_text(encoding="utf-8-sig")
+
+
+def read_json(path: pathlib.Path | str, what: str, remedy: str) -> dict:
+    """A dict in a file of JSON."""
+    text = read_text(path, what, remedy)
+    with reading(path, what, remedy):
+        return _dict(path, what, remedy, json.loads(text))
+
+
+def read_yaml(path: pathlib.Path | str, what: str, remedy: str) -> dict:
+    """A dict in a file of YAML."""
+    import yaml
+
+    text = read_text(path, what, remedy)
+    with reading(path, what, remedy):
+        return _dict(path, what, remedy, yaml.safe_load(text))
+
+
+def _dict(path, what, remedy, found):
+    if not isinstance(found, dict):
+        raise Unfit(f"{path} is no {what} (it holds {type(found).__name__}, not names with values): {remedy}")
+    return found

@@ -1,0 +1,20 @@
+"""Versions of what computed a result, kept with it."""
+
+import numpy as np
+
+__all__ = ["versions"]
+
+
+def versions() -> dict:
+    """Name of the package -> version."""
+    import mujoco
+    import warp
+
+    from . import __version__
+
+    return {
+        "biotac-mj": __version__,
+        "mujoco": mujoco.__version__,
+        "warp-lang": warp.__version__,
+        "numpy": np.__version__,
+    }
