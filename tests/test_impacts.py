@@ -1,0 +1,178 @@
+"""What no impact may do: gain energy, pass through the finger, lose the skin's force."""
+
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+import spring_skin
+
+import biotac_mj
+from biotac_mj import plugin
+
+PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
+GHOST = 'contype="0" conaffinity="0"'
+EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+
+
+def finger_under(thrown, timestep, free=None, integrator="implicitfast", gravity="0 0 0", **settings):
+    """A finger with its pad up, fixed or of `free` [kg], and a body over it."""
+    finger = '<body name="finger"/>'
+    if free:
+        box = f'<geom type="box" size=".008 .008 .008" pos="0.02 0 -.01" mass="{free}" {GHOST}/>'
+        finger = f'<body name="finger"><freejoint/>{box}</body>'
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" integrator="{integrator}" gravity="{gravity}"/>'
+        f"<worldbody>{finger}{thrown}</worldbody></mujoco>"
+    )
+    handle = biotac_mj.attach(
+        spec, body="finger", quat=PAD_UP, pos=[6.2e-3, 0, 0], readings="none", **settings
+    )
+    model = spec.compile()
+    return model, mujoco.MjData(model), handle
+
+
+def kinetic(model, data):
+    mujoco.mj_energyVel(model, data)
+    return data.energy[1]
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    plugin.clear_errors()
+    yield
+    plugin.check()
+
+
+def thrown_body(rng, height):
+    kind, size = rng.choice(["sphere", "box"]), 10 ** rng.uniform(-2.5, -1.8, 3)
+    quat, (x, y) = rng.normal(size=4), rng.uniform(-0.004, 0.004, 2)
+    geom = (
+        f'<geom type="{kind}" size="{size[0]} {size[1]} {size[2]}" mass="{10 ** rng.uniform(-3, 0)}" '
+        f'friction="{rng.uniform(0.1, 1.2)}"/>'
+    )
+    pos, quat = f"{x} {y} {height + 1.75 * size.max()}", " ".join(map(str, quat))
+    return f'<body name="thrown" pos="{pos}" quat="{quat}"><freejoint/>{geom}</body>'
+
+
+def most_energy(model, data, seconds):
+    """Largest kinetic energy on the way over that at the start."""
+    start = kinetic(model, data)
+    most = 0.0
+    for _ in range(int(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        plugin.check()
+        most = max(most, kinetic(model, data))
+    assert np.isfinite(data.qpos).all()
+    return most / start
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_spinning_body_gains_no_energy_from_springs(seed):
+    rng = np.random.default_rng([20, seed])
+    free = 10 ** rng.uniform(-2, -0.7) if seed % 2 else None
+    model, data, _ = finger_under(
+        thrown_body(rng, 0.008),
+        [0.001, 0.002, 0.004][seed % 3],
+        free,
+        str(rng.choice(["Euler", "implicitfast", "implicit"])),
+        skin=spring_skin.pad_geometry(15),
+        stepper="springs",
+        options={"stiffness": float(10 ** rng.uniform(1, 3))},
+    )
+    model.geom_contype[:], model.geom_conaffinity[:] = 0, 0  # the springs alone, without the core
+    j = 6 if free else 0
+    data.qvel[j + 2] = -rng.uniform(0.05, 1.0)
+    data.qvel[j + 3 : j + 6] = rng.normal(size=3) * 10 ** rng.uniform(0, 1.3)
+    mujoco.mj_forward(model, data)
+    assert most_energy(model, data, 0.1) < 1 + 1e-4
+
+
+def test_the_rows_have_no_reference_acceleration():
+    """MuJoCo gives a weld's rows dJ/dt v: 300 m/s^2 at 20 rad/s here, from its anchor far away."""
+    model, data, _ = finger_under(
+        '<body pos="0 0 .0179"><freejoint/><geom size=".01" mass=".02"/></body>',
+        0.002,
+        0.05,
+        skin=spring_skin.pad_geometry(),
+        stepper="springs",
+    )
+    data.qvel[[3, 4, 9, 10, 11]] = 5, 20, 20, -10, 5
+    mujoco.mj_forward(model, data)
+    rows = data.efc_type == EQUALITY
+    assert rows.sum() == 6 and np.abs(data.efc_J[: 6 * model.nv]).max() > 0
+    assert np.abs(data.efc_aref[rows]).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    "tier, seed",
+    [
+        *(("condensed", seed) for seed in range(3)),
+        ("full", 1),
+        *(pytest.param("full", seed, marks=pytest.mark.slow) for seed in (0, 2)),
+    ],
+)
+def test_a_skin_keeps_what_hits_it_out_and_gives_nothing(tier, seed):
+    rng = np.random.default_rng([21, seed])
+    free = 0.05 if seed == 1 else None
+    model, data, handle = finger_under(
+        thrown_body(rng, 8.31e-3), [0.004, 0.002, 0.001][seed], free, skin="coarse", tier=tier
+    )
+    j = 6 if free else 0
+    data.qvel[j + 2], data.qvel[j + 3 : j + 6] = -0.8, rng.normal(size=3) * 10
+    mujoco.mj_forward(model, data)
+    assert most_energy(model, data, 0.06) < 1.01
+
+
+@pytest.mark.parametrize("mass, speed, timestep", [(0.02, 3.0, 0.004), (0.5, 2.0, 0.001), (5.0, 1.0, 0.002)])
+def test_nothing_passes_through_the_core(mass, speed, timestep):
+    model, data, handle = finger_under(
+        f'<body name="thrown" pos="0 0 .0193"><joint type="slide" axis="0 0 1"/>'
+        f'<geom size=".008" mass="{mass}"/></body>',
+        timestep,
+        skin="coarse",
+        tier="condensed",
+    )
+    data.qvel[0] = -speed
+    mujoco.mj_forward(model, data)
+    assert most_energy(model, data, 0.03) < 1.01
+    assert data.body("thrown").xpos[2] > 0.012
+
+
+def test_a_body_that_is_put_into_the_core_is_pushed_out():
+    model, data, handle = finger_under(
+        '<body name="ball" pos="0 0 .0125"><joint type="slide" axis="0 0 1" damping="2"/>'
+        '<geom size=".008" mass=".05"/></body>',
+        0.002,
+        skin="coarse",
+        tier="condensed",
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mujoco.mj_step(model, data)
+    converged, *_, reached, _ = handle.read(data, "status")
+    assert converged == 0 and reached < 1
+    mujoco.mj_step(model, data, 150)
+    assert data.body("ball").xpos[2] > 0.0155 and handle.read(data, "status")[0] == 1
+
+
+def test_the_core_meets_what_the_skin_meets():
+    """Named geoms alone where they are named; the solid parts of another BioTac are none of the skin's."""
+    objects = "".join(
+        f'<body pos="0 0 {z}"><geom name="{name}" size=".01"/></body>' for name, z in (("a", 0.1), ("b", 0.2))
+    )
+    model, _, _ = finger_under(objects, 0.002, skin="coarse", tier="condensed", geoms=["a"])
+    assert model.npair == 3 and {int(g) for g in model.pair_geom2} | {int(g) for g in model.pair_geom1} == {
+        *(model.geom(f"biotac_{n}").id for n in ("core", "nail", "clamp")),
+        model.geom("a").id,
+    }
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body name='l'/><body name='r' pos='.1 0 0'/></worldbody></mujoco>"
+    )
+    for side in "lr":
+        biotac_mj.attach(spec, body=side, prefix=side, skin="coarse", tier="condensed", readings="none")
+    model = spec.compile()
+    from biotac_mj.coupling.instance import Setup
+    from biotac_mj.coupling.structs import ModelView
+
+    assert len(Setup(ModelView(model._address), 0).touching.geom) == 0
