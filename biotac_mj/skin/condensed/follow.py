@@ -47,7 +47,7 @@ def _go(skin, memory, pos, mat, effort):
     turn = Rotation.from_matrix(mat @ memory.geom_mat.transpose(0, 2, 1)).as_rotvec()
     move = pos - memory.geom_pos
     length = max(float((np.linalg.norm(move, axis=1) + _LEVER * np.linalg.norm(turn, axis=1)).max()), 1e-12)
-    at, part, found, blocked, iterations = 0.0, min(0.5, _PART / length), None, False, 0
+    at, part, found, blocked, iterations = 0.0, min(1.0, _PART / length), None, False, 0
     spent, from_pos, from_mat = _SPENT * effort.left, memory.geom_pos, memory.geom_mat
     u = None
     while at < 1:
@@ -56,9 +56,9 @@ def _go(skin, memory, pos, mat, effort):
         if to > 1 - 1e-9:
             to, pose = 1.0, (pos, mat)
         effort.allow(_EACH)
-        new = skin.attempt(memory, u, *pose, effort)
+        new = skin.attempt(memory, u, *pose, effort, coupled=True)
         if new:
-            found, at, part = new, to, min(2 * part, _PART / length)
+            found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]
             iterations += found[0].iterations
             continue

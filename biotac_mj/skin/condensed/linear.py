@@ -16,6 +16,7 @@ __all__ = ["Compliance", "Lumped", "Springs", "solve"]
 
 _ROUNDING = 3e-4  # of entries of W, which come in half precision
 _SLIP = 1e-6  # of a node's stiffness, along the direction in which it slips: Coulomb friction has none there
+_COUPLED = 400
 _DIRECT = 120  # so many coordinates are solved directly
 _MAX_CG, _CG_TOLERANCE = 40, 0.1
 # of the stiffest node, by which the lumped springs of an old factor may differ where a tangent is asked for
@@ -162,7 +163,7 @@ class Lumped:
 
 
 def solve(
-    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None
+    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None, coupled: bool = False
 ) -> tuple[np.ndarray, np.ndarray, Lumped | None]:
     """Solves (1 + D W) df = r.
 
@@ -172,7 +173,7 @@ def solve(
     Returns:
       df (n,), W df (n,), and the factor to go on with.
     """
-    if len(springs.on) <= _DIRECT:
+    if len(springs.on) <= (_COUPLED if coupled else _DIRECT):
         return *_solve_direct(W, springs, r), None
     lumped = lumped or Lumped(springs, W)
     df, du, iterations = _solve_iterative(W, springs, r, lumped)

@@ -254,7 +254,13 @@ class CondensedSkin:
         return out
 
     def attempt(
-        self, memory: Memory, u: np.ndarray | None, pos: np.ndarray, mat: np.ndarray, effort: Effort
+        self,
+        memory: Memory,
+        u: np.ndarray | None,
+        pos: np.ndarray,
+        mat: np.ndarray,
+        effort: Effort,
+        coupled: bool = False,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
@@ -270,7 +276,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort)
+        step = self._step(memory, u, pos, mat, motion, effort, coupled)
         try:
             for _ in range(4):
                 step.run()
@@ -311,10 +317,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort):
+    def _step(self, memory, u, pos, mat, motion, effort, coupled=False):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort)
+        return Step(self, memory, u, pos, mat, motion, effort, coupled)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -14,7 +14,7 @@ __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
-_MAX_NEWTON, _PASSES = 30, 4
+_MAX_NEWTON, _PASSES = 20, 4
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
 _PREPARE = 5  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
@@ -132,8 +132,9 @@ class Step:
         geom_mat: np.ndarray,
         motion: np.ndarray,
         effort: Effort,
+        coupled: bool = False,
     ):
-        self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
+        self.skin, self.memory, self.u, self.effort, self.coupled = skin, memory, u, effort, coupled
         self.pose = geom_pos, geom_mat
         moved = np.abs(motion).max(initial=0.0)
         self.reach = _REACH + 2 * moved
@@ -211,6 +212,8 @@ class Step:
         if m:
             s._x[self.outer, 0] = s.rest[self.outer] + u[:m].reshape(-1, 3)
             s.faces.evaluate()
+            if self.coupled:
+                s.faces.couple()
             f[:m] = s.faces.force.ravel()
         if len(self.inner):
             f[m:], self.closed = self.meeting.force(u[m:])
@@ -244,11 +247,9 @@ class Step:
         f = self._at_candidates(self.force)
         if self.force is self.memory.force:
             f += self.repeat * self._at_candidates(self.memory.change)
-        failed = 0
         for number in range(_PASSES):
             f = self.last = self._newton(f)
-            failed += not self.converged
-            if failed > 1:
+            if not self.converged:
                 break
             if not f.any():  # nothing touches any more
                 self.bulge = 0.0
@@ -304,9 +305,10 @@ class Step:
             if not self.effort.spend(len(f)):
                 break
             r = g - f
-            df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped)
+            df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped, self.coupled)
             slope = float(r @ du)
-            self.error = math.sqrt(max(slope, 0.0) / (abs(float((f + df) @ (u + du))) + 1e-14))
+            left = max(abs(slope), float(df @ du)) if self.coupled else max(slope, 0.0)
+            self.error = math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
             if self.error < _TOLERANCE:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
@@ -318,12 +320,13 @@ class Step:
     def _search(self, f, u, df, du, slope):
         """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi
         where the step overshoots)."""
-        low, high, at_low, at_high = 0.0, None, slope, None
+        along = -du if self.coupled and slope < 0 else du
+        low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
         for _ in range(10):
             new_f, new_u = f + alpha * df, u + alpha * du
             g = self._evaluate(new_u)
-            now = float((g - new_f) @ du)
+            now = float((g - new_f) @ along)
             if abs(now) <= 0.5 * abs(slope):
                 break
             if now > 0:
