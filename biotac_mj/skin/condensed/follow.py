@@ -15,7 +15,7 @@ _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
 _FAR = 1.0  # geoms are moved out of the skin by no more [m]
-_EFFORT = 1.2e5  # of a step, for each outer node: a fifth of a second on the coarse skin
+_EFFORT = 6.5e4  # of a step, for each outer node: a tenth of a second on the coarse skin
 _FIRST, _EACH = 0.4, 0.3  # shares of the effort left that the step at once and each part may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
@@ -56,7 +56,7 @@ def _go(skin, memory, pos, mat, effort):
         if to > 1 - 1e-9:
             to, pose = 1.0, (pos, mat)
         effort.allow(_EACH)
-        new = skin.attempt(memory, u, *pose, effort, coupled=True)
+        new = skin.attempt(memory, u, *pose, effort, (to - at) * length)
         if new:
             found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]

@@ -260,13 +260,14 @@ class CondensedSkin:
         pos: np.ndarray,
         mat: np.ndarray,
         effort: Effort,
-        coupled: bool = False,
+        moved: float | None = None,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
         Args:
           memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
           effort: what it may cost.
+          moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -276,7 +277,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort, coupled)
+        step = self._step(memory, u, pos, mat, motion, effort, moved)
         try:
             for _ in range(4):
                 step.run()
@@ -317,10 +318,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort, coupled=False):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, coupled)
+        return Step(self, memory, u, pos, mat, motion, effort, moved)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -15,8 +15,8 @@ MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 20, 4
-_ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
-_PREPARE = 5  # iterations that candidates cost before the first one
+_ITERATION, _SOLVE = 1.5e5, 0.1  # of a Newton iteration's cost, where what grows with n^2 counts as n^2
+_PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
 
@@ -104,7 +104,8 @@ class Effort:
     """What a step may cost, counted so that it is the same on every machine.
 
     Args:
-      most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2.
+      most: of the whole step; a Newton iteration over n candidate coordinates, k of which touch, costs
+        `_ITERATION` + n^2 + `_SOLVE` k^3.
     """
 
     def __init__(self, most: float):
@@ -114,9 +115,9 @@ class Effort:
         """Lets what comes next take a share of what is left."""
         self._until = (1 - share) * self.left
 
-    def spend(self, n: int, times: float = 1.0) -> bool:
-        """Counts iterations over n coordinates; whether there is something left."""
-        self.left -= times * (_ITERATION + n * n)
+    def spend(self, n: int, k: int, times: int = 1) -> bool:
+        """Counts iterations over n coordinates of which k touch; whether there is something left."""
+        self.left -= times * (_ITERATION + n * n + _SOLVE * k**3)
         return self.left > self._until
 
 
@@ -132,13 +133,14 @@ class Step:
         geom_mat: np.ndarray,
         motion: np.ndarray,
         effort: Effort,
-        coupled: bool = False,
+        moved: float | None = None,
     ):
-        self.skin, self.memory, self.u, self.effort, self.coupled = skin, memory, u, effort, coupled
+        self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
-        moved = np.abs(motion).max(initial=0.0)
-        self.reach = _REACH + 2 * moved
-        self.share = min(1.0, 3 * moved / max(u.max(), -u.min(), 1e-9))
+        self.coupled = moved is not None
+        moved = moved if self.coupled else 2 * np.abs(motion).max(initial=0.0)
+        self.reach = _REACH + moved
+        self.share = min(1.0, 1.5 * moved / max(u.max(), -u.min(), 1e-9))
         self.faces = np.zeros(0, int)
         self.inner = np.zeros(0, int)
         self.meeting = None
@@ -241,7 +243,7 @@ class Step:
             s._measure_volume()
             return
         self.converged = False
-        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), _PREPARE):
+        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), 0, _PREPARE):
             return
         self._set()
         f = self._at_candidates(self.force)
@@ -302,10 +304,11 @@ class Step:
         g = self._evaluate(u)
         self.converged, self.lumped = False, None
         for _ in range(_MAX_NEWTON):
-            if not self.effort.spend(len(f)):
+            springs = self._springs()
+            if not self.effort.spend(len(f), len(springs.on)):
                 break
             r = g - f
-            df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped, self.coupled)
+            df, du, self.lumped = solve(self.W, springs, r, self.lumped, self.coupled)
             slope = float(r @ du)
             left = max(abs(slope), float(df @ du)) if self.coupled else max(slope, 0.0)
             self.error = math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
