@@ -15,8 +15,8 @@ _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
 _FAR = 1.0  # geoms are moved out of the skin by no more [m]
-_EFFORT = 6.5e4  # of a step, for each outer node: a tenth of a second on the coarse skin
-_FIRST, _EACH = 0.4, 0.3  # shares of the effort left that the step at once and each part may take
+_EFFORT = 8e4  # of a step, for each outer node: about 0.12 s on the coarse skin
+_FIRST, _EACH = 0.4, 0.5  # shares of the effort left that the step at once and each part may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
 

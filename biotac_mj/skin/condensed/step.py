@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..rigid import rigid_motions
-from .linear import Compliance, Lumped, Springs, solve
+from .linear import Compliance, Lumped, Springs, cost, solve
 
 __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 
@@ -15,7 +15,7 @@ MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 20, 4
-_ITERATION, _SOLVE = 1.5e5, 0.1  # of a Newton iteration's cost, where what grows with n^2 counts as n^2
+_ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
 _PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
@@ -104,8 +104,8 @@ class Effort:
     """What a step may cost, counted so that it is the same on every machine.
 
     Args:
-      most: of the whole step; a Newton iteration over n candidate coordinates, k of which touch, costs
-        `_ITERATION` + n^2 + `_SOLVE` k^3.
+      most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2 and
+        the linear solve.
     """
 
     def __init__(self, most: float):
@@ -115,9 +115,10 @@ class Effort:
         """Lets what comes next take a share of what is left."""
         self._until = (1 - share) * self.left
 
-    def spend(self, n: int, k: int, times: int = 1) -> bool:
-        """Counts iterations over n coordinates of which k touch; whether there is something left."""
-        self.left -= times * (_ITERATION + n * n + _SOLVE * k**3)
+    def spend(self, n: int, linear: float = 0.0, times: int = 1) -> bool:
+        """Counts iterations over n coordinates with what their linear solves cost; whether there is something
+        left."""
+        self.left -= times * (_ITERATION + n * n + linear)
         return self.left > self._until
 
 
@@ -243,7 +244,7 @@ class Step:
             s._measure_volume()
             return
         self.converged = False
-        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), 0, _PREPARE):
+        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), times=_PREPARE):
             return
         self._set()
         f = self._at_candidates(self.force)
@@ -273,11 +274,19 @@ class Step:
             self.softening, self.swelling = self.after.tolist()
 
     def hold(self) -> None:
-        """Instead of `run`: takes the forces that the memory has for those of this step."""
+        """Instead of `run`: the balance that the memory holds, to the last digits, which contact's stiffness
+        needs."""
+        memory = self.memory
+        self.softening, self.swelling = memory.softening, memory.swelling
+        self.share = 1.0  # all that may touch the core, wherever it was before
+        self._choose()
         self._set()
-        self.last = self._at_candidates(self.force)
+        f = self.last = self._at_candidates(self.force)
+        self._scaled()
+        if self.a is not None:  # what it was when the pressure was found
+            self.bulge = -memory.pressure / self.share - float(self.along @ f)
         self.W, shift = self._scaled()
-        self._evaluate(self.W @ self.last + shift)
+        self._evaluate(self.W @ f + shift)
         self.lumped, self.converged = None, False
         self._place(self.u)
         self.skin._measure_volume()
@@ -305,7 +314,7 @@ class Step:
         self.converged, self.lumped = False, None
         for _ in range(_MAX_NEWTON):
             springs = self._springs()
-            if not self.effort.spend(len(f), len(springs.on)):
+            if not self.effort.spend(len(f), cost(len(springs.on), self.coupled)):
                 break
             r = g - f
             df, du, self.lumped = solve(self.W, springs, r, self.lumped, self.coupled)
