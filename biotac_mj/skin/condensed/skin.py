@@ -299,12 +299,16 @@ class CondensedSkin:
         return dataclasses.replace(step.outcome(), memory=memory), step.u
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether no sample of the resting skin touches the geoms, posed so."""
+        """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
         self._x[:, 0] = self.rest
-        return not len(self.search.faces(0.0, 0.0, pos, mat))
+        return not len(self.search.faces(0.0, 0.0, pos, mat)) and not self.search.deep(pos, mat)
 
-    def normal(self, faces: np.ndarray) -> np.ndarray:
-        """Mean outward normal (3,) of outer faces (n,) at rest."""
+    def outward(self, point: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Mean outward normal (3,) of outer faces (n,) at rest; without any, of the one next to
+        a point (3,)."""
+        if not len(faces):
+            away = self.rest[self._face].mean(1) - point
+            faces = np.array([np.einsum("ij,ij->i", away, away).argmin()])
         a, b, c = (self.rest[self._face[faces, i]] for i in range(3))
         total = np.cross(b - a, c - a).sum(0)
         return total / max(np.linalg.norm(total), 1e-30)
