@@ -278,8 +278,11 @@ class Step:
         needs."""
         memory = self.memory
         self.softening, self.swelling = memory.softening, memory.swelling
-        self.share = 1.0  # all that may touch the core, wherever it was before
-        self._choose()
+        if self.skin._core:
+            first = 3 * len(self.skin._outer)
+            loaded = memory.coordinate[memory.coordinate >= first] - first
+            self.meeting = self.skin._core.meet(self.u, 0.0, None, loaded)
+            self.inner = self.meeting.node
         self._set()
         f = self.last = self._at_candidates(self.force)
         self._scaled()
