@@ -14,6 +14,7 @@ from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.rigid import rotation
 from biotac_mj.press.approach import nearest_point, surface_point
 from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
@@ -21,7 +22,7 @@ from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.cache import cache_folder, kept
-from biotac_mj.skin.condensed import CondensedSkin, Memory, linear
+from biotac_mj.skin.condensed import CondensedSkin, Memory, follow, linear
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
@@ -663,3 +664,122 @@ def test_a_geom_deep_in_the_core_squeezes_the_skin_as_far_as_it_goes(coarse, sta
     slow = walk(skin, start + np.outer(np.arange(1, 6) * 2e-4, direction))[-1]
     assert out.converged and squeezed(out) == pytest.approx(squeezed(slow), rel=0.05)
     assert squeezed(skin.solve(again.memory, (start - 1e-3 * direction)[None], EYE)) == 0
+
+
+def test_force_grows_as_a_geom_goes_into_the_core_and_goes_to_nothing_on_the_way_out(coarse):
+    skin, memory = CondensedSkin(coarse, sphere()), Memory.rest(1)
+    start, direction = touch(coarse.geometry)
+    inwards, outwards = np.linspace(1e-4, 4e-3, 14), np.linspace(4e-3, -1e-4, 14)
+    force, reached = [], []
+    for depth in [*inwards, *outwards]:
+        out = skin.solve(memory, (start + depth * direction)[None], EYE)
+        memory = out.memory
+        force.append(squeezed(out))
+        reached.append(out.reached)
+        assert out.wrench[0, :3] @ direction <= 1e-3 * force[-1]  # never pulls
+    assert (np.diff(force[:14]) > -0.02 * np.array(force[:13])).all() and force[13] > 4 * force[5]
+    assert reached[12] < 1 and (np.array(reached[:6]) == 1).all()
+    assert (np.diff(force[14:]) < 0.02 * max(force)).all() and force[-1] == 0
+
+
+def test_a_skin_that_has_lost_its_geom_lets_go_of_it(coarse):
+    """Thrown through the finger: what is behind it is not held by what was in front."""
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    memory = skin.solve(Memory.rest(1), (start + 6e-3 * direction)[None], EYE).memory
+    assert len(memory.force)
+    for away in (-5e-2, 5e-2):
+        out = skin.solve(memory, (start + away * direction)[None], EYE)
+        assert out.converged and squeezed(out) == 0 and out.iterations == 0
+
+
+def test_what_is_held_is_the_balance_that_was_found(coarse):
+    """To the digits that the stiffness of contact needs, with liquid, core and friction."""
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    along = np.array([1.0, 0, 0]) - direction[0] * direction
+    path = (
+        start + np.outer(np.linspace(2e-4, 2e-3, 10), direction) + np.outer(np.linspace(0, 4e-4, 10), along)
+    )
+    for out in walk(skin, path):
+        held, u = skin.hold(out.memory)
+        assert np.allclose(held.wrench, out.wrench, rtol=1e-9, atol=1e-9)
+        assert squeezed(dataclasses.replace(held, reached=0.0)) > 0 and held.memory is out.memory
+        assert np.abs(u - skin.displacement(out.memory)).max() < 1e-9
+        assert 0.5 < np.trace(held.tangent[0, :3, :3]) / np.trace(out.tangent[0, :3, :3]) < 10
+
+
+@pytest.mark.parametrize("jump", [2e-3, 12e-3])
+def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
+    """Counted in products of matrices, not in seconds; turned and sideways besides, onto an edge."""
+    left = []
+
+    class Counted(follow.Effort):
+        def __init__(self, most):
+            super().__init__(most)
+            left.append(self)
+            self.most = most
+
+    monkeypatch.setattr(follow, "Effort", Counted)
+    skin = CondensedSkin(coarse, GeomSet(["box"], [(4e-3, 6e-3, 5e-3)], [0.8]))
+    start, direction = touch(coarse.geometry)
+    memory = skin.solve(Memory.rest(1), (start - 6e-3 * direction)[None], EYE).memory
+    turn = np.eye(3)
+    for k in range(5):
+        turn = np.array([[0.96, 0.28, 0], [-0.28, 0.96, 0], [0, 0, 1.0]]) @ turn
+        pos = start + (jump if k < 3 else -1e-3) * direction + [2e-4 * k, 0, 0]
+        out = skin.solve(memory, pos[None], turn[None])
+        squeezed(out)
+        memory = out.memory
+        assert left[-1].left > -0.25 * left[-1].most
+    assert 0 < max(counted.most - counted.left for counted in left)
+
+
+def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch):
+    monkeypatch.setattr("biotac_mj.skin.condensed.step.MAX_CONTACTS", 10)
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    out = skin.solve(Memory.rest(1), (start + 2e-3 * direction)[None], EYE)
+    assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
+
+
+def test_a_skin_between_two_geoms_reaches_one_share_of_their_motion(coarse):
+    """One goes deep into the core, the other away: both poses are those of the same share."""
+    start, direction = touch(coarse.geometry)
+    side, normal = surface_point(coarse.geometry, -8e-3, 1.2)
+    skin = CondensedSkin(coarse, GeomSet(["sphere", "sphere"], [(RADIUS,), (2e-3,)], [0.5, 0.5], [0, 1]))
+    mats = np.tile(np.eye(3), (2, 1, 1))
+    first = np.stack([start + 4e-4 * direction, side + 1.7e-3 * normal])
+    memory = skin.solve(Memory.rest(2), first, mats).memory
+    last = np.stack([start + 8e-3 * direction, side + 1.2e-3 * normal])
+    out = skin.solve(memory, last, mats)
+    assert squeezed(out) > 10 and 0 < out.reached < 1
+    assert np.allclose(out.memory.geom_pos, first + out.reached * (last - first), atol=1e-12)
+    assert (np.linalg.norm(out.wrench[:, :3], axis=1) > 0.05).all()
+
+
+def test_a_turn_is_followed_along_its_shortest_arc(coarse):
+    """A box that turns by 1 rad into the core stops where its pose is a share of that."""
+    start, direction = touch(coarse.geometry)
+    skin = CondensedSkin(coarse, GeomSet(["box"], [(12e-3, 1.5e-3, 3e-3)], [0.5]))
+    axis = np.cross(direction, [1.0, 0, 0]) / np.linalg.norm(np.cross(direction, [1.0, 0, 0]))
+    away = start - 4e-3 * direction
+    flat = np.stack([[1.0, 0, 0], -direction, np.cross([1.0, 0, 0], -direction)], 1)
+    flat, _ = np.linalg.qr(flat)
+    memory = skin.solve(Memory.rest(1), away[None], flat[None]).memory
+    asked = rotation(axis[None])[0] @ flat
+    out = skin.solve(memory, away[None], asked[None])
+    squeezed(out)
+    share = rotation(out.reached * axis[None])[0] @ flat
+    assert 0 < out.reached and np.allclose(out.memory.geom_mat[0], share, atol=1e-9)
+
+
+def test_the_coupling_says_how_far_a_step_got():
+    stepper = stepper_at()
+    start, direction = touch(load_skin("coarse"))
+    state = np.empty(stepper.nstate)
+    stepper.reset(state)
+    result = stepper.solve_skin(state, (start + 8e-3 * direction)[None], EYE, 2e-3)
+    assert 0 < result.reached < 1 and not result.converged and np.abs(result.wrench).max() > 20
+    result = stepper.solve_skin(result.state, (start + 5e-4 * direction)[None], EYE, 2e-3)
+    assert result.reached == 1 and result.converged

@@ -221,7 +221,9 @@ class CoreContact:
         self._look()
         return self._gap[face]
 
-    def meet(self, u: np.ndarray, share: float, last: Meeting | None) -> Meeting:
+    def meet(
+        self, u: np.ndarray, share: float, last: Meeting | None, loaded: np.ndarray | None = None
+    ) -> Meeting:
         """Faces with a sample nearer to the core than a share of their displacement, and those of the last
         meeting.
 
@@ -229,11 +231,14 @@ class CoreContact:
           u: (nvert, 3) displacements at the present positions, which the Warp array holds [m].
           share: how much of its displacement a face may make in this step.
           last: candidates so far; returned as they are where there are no more.
+          loaded: (m,) nodes, numbered as in `node`, whose faces are candidates in any case.
         """
         self._share[0], self._seen[:] = share, 0
         self._search()
         if last is not None:
             self._seen[last.face] = 2
+        if loaded is not None:
+            self._seen[np.isin(self._corner, loaded).any(1)] = 2
         face = np.flatnonzero(self._seen == 2)
         if last is not None and len(face) == len(last.face):
             return last

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
+from ..contact.shapes import distance
 from ..contact.touch import contact_kernels
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
@@ -22,6 +23,7 @@ __all__ = ["CandidateFaces"]
 wp.set_module_options({"enable_backward": False})
 
 touch_face = contact_kernels(False).touch_face
+_SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a sample counts as slipping
 
 
 @wp.kernel
@@ -86,6 +88,44 @@ def _touch(
                 force_out[i] += corner_out[3 * f + 2, 0]
                 lumped_out[i] += b02 + b12 + block_out[6 * f + 5, 0]
                 touched_out[i] = 1
+
+
+@wp.kernel
+def _couple(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+    # Out:
+    block_out: wp.array2d(dtype=mat33),
+):
+    """Adds to the stiffness of slipping samples how friction follows the normal force; it is not symmetric
+    then."""
+    for f in range(count[0]):
+        if touching[f, 0] == 1:
+            t = face[f]
+            for s in range(sample.shape[0]):
+                g = geom[f * sample.shape[0] + s, 0]
+                if g >= 0:
+                    b = sample[s]
+                    R = geoms.mat[g, 0]
+                    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0] - geoms.pos[g, 0]
+                    kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
+                    dn = distance(kind, size, rounding, geoms.grids, geoms.grid[g], wp.transpose(R) * p)
+                    n = R * vec3(dn[0], dn[1], dn[2])
+                    F = force[f * sample.shape[0] + s, 0]
+                    push = wp.dot(F, n)
+                    along = F - push * n
+                    if dn[3] < real(0.0) and wp.length(along) > real(_SLIPPING) * geoms.friction[g, 0] * push:
+                        K = wp.outer(along, n) / -dn[3]
+                        for c in range(3):
+                            for e in range(c, 3):
+                                block_out[6 * f + c * (5 - c) // 2 + e, 0] += b[c] * b[e] * K
 
 
 @wp.kernel
@@ -276,6 +316,11 @@ class CandidateFaces:
                 anchor,
             ],
             [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
+        )
+        self.couple = self._record(
+            _couple,
+            [count, face, m.sample, geoms.struct, self._x, touching, geom, sample_force],
+            [block],
         )
         self._multiply = self._record(_product, [*faces, *springs, p], [product])
         self._loads = self._record(

@@ -15,8 +15,8 @@ _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
 _FAR = 1.0  # geoms are moved out of the skin by no more [m]
-_EFFORT = 1.2e5  # of a step, for each outer node: a fifth of a second on the coarse skin
-_FIRST, _EACH = 0.4, 0.3  # shares of the effort left that the step at once and each part may take
+_EFFORT = 6e4  # of a step, for each outer node: about 0.1 s on the coarse skin
+_FIRST, _EACH = 0.4, 0.5  # shares of the effort left that the step at once and each part may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
 
@@ -31,7 +31,7 @@ def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple
         if found:
             return found
     deep = skin.search.deep(pos, mat)
-    if not deep and skin.untouched(pos, mat):  # the skin lets go
+    if skin.untouched(pos, mat):  # the skin lets go
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
     if memory.started:
         out, u, blocked = _go(skin, memory, pos, mat, effort)
@@ -47,7 +47,7 @@ def _go(skin, memory, pos, mat, effort):
     turn = Rotation.from_matrix(mat @ memory.geom_mat.transpose(0, 2, 1)).as_rotvec()
     move = pos - memory.geom_pos
     length = max(float((np.linalg.norm(move, axis=1) + _LEVER * np.linalg.norm(turn, axis=1)).max()), 1e-12)
-    at, part, found, blocked, iterations = 0.0, min(0.5, _PART / length), None, False, 0
+    at, part, found, blocked, iterations = 0.0, min(1.0, _PART / length), None, False, 0
     spent, from_pos, from_mat = _SPENT * effort.left, memory.geom_pos, memory.geom_mat
     u = None
     while at < 1:
@@ -56,9 +56,9 @@ def _go(skin, memory, pos, mat, effort):
         if to > 1 - 1e-9:
             to, pose = 1.0, (pos, mat)
         effort.allow(_EACH)
-        new = skin.attempt(memory, u, *pose, effort)
+        new = skin.attempt(memory, u, *pose, effort, (to - at) * length)
         if new:
-            found, at, part = new, to, min(2 * part, _PART / length)
+            found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]
             iterations += found[0].iterations
             continue
@@ -85,7 +85,7 @@ def _outside(skin, pos, mat):
 
         if not touches(0.0):
             continue
-        normal = skin.normal(skin.search.faces(0.0, 0.0, alone, mat))
+        normal = skin.outward(pos[g], skin.search.faces(0.0, 0.0, alone, mat))
         high = _LEAST
         while high < _FAR and touches(high, normal=normal):
             high *= 2

@@ -8,7 +8,7 @@ in single precision: three or four iterations do."""
 
 import numpy as np
 from scipy.linalg.blas import sgemv
-from scipy.linalg.lapack import dgesv, spotrf, spotrs
+from scipy.linalg.lapack import dgesv, sgesv, spotrf, spotrs
 
 from .faces import CandidateFaces
 
@@ -16,7 +16,7 @@ __all__ = ["Compliance", "Lumped", "Springs", "solve"]
 
 _ROUNDING = 3e-4  # of entries of W, which come in half precision
 _SLIP = 1e-6  # of a node's stiffness, along the direction in which it slips: Coulomb friction has none there
-_DIRECT = 120  # so many coordinates are solved directly
+_DIRECT, _COUPLED = 120, 400  # so many coordinates are solved directly; where D is not symmetric
 _MAX_CG, _CG_TOLERANCE = 40, 0.1
 # of the stiffest node, by which the lumped springs of an old factor may differ where a tangent is asked for
 _ALIKE = 0.02
@@ -161,35 +161,42 @@ class Lumped:
         return G.T @ self.solve(G)
 
 
+def cost(k: int, coupled: bool) -> float:
+    """What `solve` costs over k coordinates that touch, in products of a matrix with one row and column."""
+    return 0.05 * k**3 if k <= (_COUPLED if coupled else _DIRECT) else 10.0 * k**2
+
+
 def solve(
-    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None
+    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None, coupled: bool = False
 ) -> tuple[np.ndarray, np.ndarray, Lumped | None]:
     """Solves (1 + D W) df = r.
 
     Args:
       lumped: factor of springs like these, or None.
+      coupled: whether D is not symmetric, which conjugate gradients do not take.
 
     Returns:
       df (n,), W df (n,), and the factor to go on with.
     """
-    if len(springs.on) <= _DIRECT:
-        return *_solve_direct(W, springs, r), None
+    if len(springs.on) <= (_COUPLED if coupled else _DIRECT):
+        return *_solve_direct(W, springs, r, np.float32 if coupled else float), None
     lumped = lumped or Lumped(springs, W)
     df, du, iterations = _solve_iterative(W, springs, r, lumped)
     return df, du, lumped if iterations <= _STALE else None
 
 
-def _solve_direct(W, springs, r):
+def _solve_direct(W, springs, r, dtype):
     df, on = r.copy(), springs.on
     if len(on):  # only the rows of closed contacts are coupled
         D = springs.dense()
         df[on] = 0
-        matrix = D @ W.part(on)
+        matrix = D.astype(dtype, copy=False) @ W.part(on, dtype)
         matrix.ravel()[:: len(on) + 1] += 1
         right = r[on]
         if df.any():
             right = right - D @ (W @ df)[on]
-        df[on] = dgesv(matrix, right, overwrite_a=1)[2]
+        gesv = sgesv if dtype is np.float32 else dgesv
+        df[on] = gesv(matrix, right, overwrite_a=1)[2]
     return df, W @ df
 
 

@@ -80,11 +80,13 @@ def _near(
 def _core_clearance(
     # In:
     core_vert: wp.array(dtype=vec3),
+    core: Geoms,
     geoms: Geoms,
     # Out:
     clearance_out: wp.array(dtype=real),
 ):
-    """Distance of each geom to the nearest vertex of the core, negative where it is inside the geom."""
+    """Distance of each geom to the nearest vertex of the core, negative where it is inside the geom, or the
+    geom inside the core."""
     g = wp.tid()
     least = real(1.0)
     R = wp.transpose(geoms.mat[g, 0])
@@ -94,6 +96,14 @@ def _core_clearance(
             least,
             distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y),
         )
+    kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
+    if distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], vec3()) < real(
+        0.0
+    ):  # no ring around it
+        p = geoms.pos[g, 0]
+        inside = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p)
+        if inside < real(0.0):
+            least = wp.min(least, inside)
     clearance_out[g] = least
 
 
@@ -133,7 +143,10 @@ class NearSearch:
         )
         if model.has_core and geoms.count:
             self._clearances = self._record(
-                _core_clearance, geoms.count, [model.core_vert, geoms.struct], [clearance]
+                _core_clearance,
+                geoms.count,
+                [model.core_vert, model.core(1).struct, geoms.struct],
+                [clearance],
             )
         g = geoms.count
         self._regions, self._loaded, self._next = [], None, 0
@@ -167,10 +180,11 @@ class NearSearch:
             return True
         struct = self._geoms.struct
         struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
-        if not len(self._region(margin, pos, mat).faces):
-            return True
+        region = self._region(margin, pos, mat)
+        if not len(region.faces):
+            return region.clearance > 0 or not self.deep(pos, mat)
         self._x[:, 0] = self._rest
-        return not len(self.faces(margin, 0.0, pos, mat))
+        return not len(self.faces(margin, 0.0, pos, mat)) and not self.deep(pos, mat)
 
     def deep(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether a geom, posed so, is deeper inside the core than `max_core_depth`."""

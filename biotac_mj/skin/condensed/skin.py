@@ -254,13 +254,20 @@ class CondensedSkin:
         return out
 
     def attempt(
-        self, memory: Memory, u: np.ndarray | None, pos: np.ndarray, mat: np.ndarray, effort: Effort
+        self,
+        memory: Memory,
+        u: np.ndarray | None,
+        pos: np.ndarray,
+        mat: np.ndarray,
+        effort: Effort,
+        moved: float | None = None,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
         Args:
           memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
           effort: what it may cost.
+          moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -270,7 +277,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort)
+        step = self._step(memory, u, pos, mat, motion, effort, moved)
         try:
             for _ in range(4):
                 step.run()
@@ -292,12 +299,16 @@ class CondensedSkin:
         return dataclasses.replace(step.outcome(), memory=memory), step.u
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
-        """Whether no sample of the resting skin touches the geoms, posed so."""
+        """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
         self._x[:, 0] = self.rest
-        return not len(self.search.faces(0.0, 0.0, pos, mat))
+        return not len(self.search.faces(0.0, 0.0, pos, mat)) and not self.search.deep(pos, mat)
 
-    def normal(self, faces: np.ndarray) -> np.ndarray:
-        """Mean outward normal (3,) of outer faces (n,) at rest."""
+    def outward(self, point: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Mean outward normal (3,) of outer faces (n,) at rest; without any, of the one next to
+        a point (3,)."""
+        if not len(faces):
+            away = self.rest[self._face].mean(1) - point
+            faces = np.array([np.einsum("ij,ij->i", away, away).argmin()])
         a, b, c = (self.rest[self._face[faces, i]] for i in range(3))
         total = np.cross(b - a, c - a).sum(0)
         return total / max(np.linalg.norm(total), 1e-30)
@@ -311,10 +322,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort)
+        return Step(self, memory, u, pos, mat, motion, effort, moved)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..rigid import rigid_motions
-from .linear import Compliance, Lumped, Springs, solve
+from .linear import Compliance, Lumped, Springs, cost, solve
 
 __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 
@@ -16,7 +16,7 @@ _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, a
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 30, 4
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
-_PREPARE = 5  # iterations that candidates cost before the first one
+_PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
 
@@ -104,7 +104,8 @@ class Effort:
     """What a step may cost, counted so that it is the same on every machine.
 
     Args:
-      most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2.
+      most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2 and
+        the linear solve.
     """
 
     def __init__(self, most: float):
@@ -114,9 +115,10 @@ class Effort:
         """Lets what comes next take a share of what is left."""
         self._until = (1 - share) * self.left
 
-    def spend(self, n: int, times: float = 1.0) -> bool:
-        """Counts iterations over n coordinates; whether there is something left."""
-        self.left -= times * (_ITERATION + n * n)
+    def spend(self, n: int, linear: float = 0.0, times: int = 1) -> bool:
+        """Counts iterations over n coordinates with what their linear solves cost; whether there is something
+        left."""
+        self.left -= times * (_ITERATION + n * n + linear)
         return self.left > self._until
 
 
@@ -132,12 +134,14 @@ class Step:
         geom_mat: np.ndarray,
         motion: np.ndarray,
         effort: Effort,
+        moved: float | None = None,
     ):
         self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
-        moved = np.abs(motion).max(initial=0.0)
-        self.reach = _REACH + 2 * moved
-        self.share = min(1.0, 3 * moved / max(u.max(), -u.min(), 1e-9))
+        self.coupled = moved is not None
+        moved = moved if self.coupled else 2 * np.abs(motion).max(initial=0.0)
+        self.reach = _REACH + moved
+        self.share = min(1.0, 1.5 * moved / max(u.max(), -u.min(), 1e-9))
         self.faces = np.zeros(0, int)
         self.inner = np.zeros(0, int)
         self.meeting = None
@@ -211,6 +215,8 @@ class Step:
         if m:
             s._x[self.outer, 0] = s.rest[self.outer] + u[:m].reshape(-1, 3)
             s.faces.evaluate()
+            if self.coupled:
+                s.faces.couple()
             f[:m] = s.faces.force.ravel()
         if len(self.inner):
             f[m:], self.closed = self.meeting.force(u[m:])
@@ -238,17 +244,15 @@ class Step:
             s._measure_volume()
             return
         self.converged = False
-        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), _PREPARE):
+        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), times=_PREPARE):
             return
         self._set()
         f = self._at_candidates(self.force)
         if self.force is self.memory.force:
             f += self.repeat * self._at_candidates(self.memory.change)
-        failed = 0
         for number in range(_PASSES):
             f = self.last = self._newton(f)
-            failed += not self.converged
-            if failed > 1:
+            if not self.converged:
                 break
             if not f.any():  # nothing touches any more
                 self.bulge = 0.0
@@ -270,11 +274,22 @@ class Step:
             self.softening, self.swelling = self.after.tolist()
 
     def hold(self) -> None:
-        """Instead of `run`: takes the forces that the memory has for those of this step."""
+        """Instead of `run`: the balance that the memory holds, to the last digits, which contact's stiffness
+        needs."""
+        memory = self.memory
+        self.softening, self.swelling = memory.softening, memory.swelling
+        if self.skin._core:
+            first = 3 * len(self.skin._outer)
+            loaded = memory.coordinate[memory.coordinate >= first] - first
+            self.meeting = self.skin._core.meet(self.u, 0.0, None, loaded)
+            self.inner = self.meeting.node
         self._set()
-        self.last = self._at_candidates(self.force)
+        f = self.last = self._at_candidates(self.force)
+        self._scaled()
+        if self.a is not None:  # what it was when the pressure was found
+            self.bulge = -memory.pressure / self.share - float(self.along @ f)
         self.W, shift = self._scaled()
-        self._evaluate(self.W @ self.last + shift)
+        self._evaluate(self.W @ f + shift)
         self.lumped, self.converged = None, False
         self._place(self.u)
         self.skin._measure_volume()
@@ -301,12 +316,14 @@ class Step:
         g = self._evaluate(u)
         self.converged, self.lumped = False, None
         for _ in range(_MAX_NEWTON):
-            if not self.effort.spend(len(f)):
+            springs = self._springs()
+            if not self.effort.spend(len(f), cost(len(springs.on), self.coupled)):
                 break
             r = g - f
-            df, du, self.lumped = solve(self.W, self._springs(), r, self.lumped)
+            df, du, self.lumped = solve(self.W, springs, r, self.lumped, self.coupled)
             slope = float(r @ du)
-            self.error = math.sqrt(max(slope, 0.0) / (abs(float((f + df) @ (u + du))) + 1e-14))
+            left = max(abs(slope), float(df @ du)) if self.coupled else max(slope, 0.0)
+            self.error = math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
             if self.error < _TOLERANCE:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
@@ -318,12 +335,13 @@ class Step:
     def _search(self, f, u, df, du, slope):
         """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi
         where the step overshoots)."""
-        low, high, at_low, at_high = 0.0, None, slope, None
+        along = -du if self.coupled and slope < 0 else du
+        low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
         for _ in range(10):
             new_f, new_u = f + alpha * df, u + alpha * du
             g = self._evaluate(new_u)
-            now = float((g - new_f) @ du)
+            now = float((g - new_f) @ along)
             if abs(now) <= 0.5 * abs(slope):
                 break
             if now > 0:
