@@ -21,7 +21,7 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry files view.offscreen",
     "calibration": "geometry skin files press.indenter press.path",
     "data": "geometry skin sensor files press.approach press.indenter press.path",
-    "tasks": "coupling sensor geometry data.objects",
+    "tasks": "coupling sensor geometry data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files tasks press.approach press.scene",
     "learning": "data sensor geometry files",
     "discrepancy": "effects data skin sensor geometry files",
