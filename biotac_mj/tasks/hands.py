@@ -2,6 +2,7 @@
 2F-85, any other by body name."""
 
 import dataclasses
+import itertools
 import typing
 from collections.abc import Iterable
 
@@ -152,8 +153,10 @@ def attach_to_hand(
             raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
     links = {finger: _find(spec, mounts[finger].body) for finger in fingers}
     own = _subtree(_root(next(iter(links.values()))))
-    for i, body in enumerate(own):  # exclusions need names
-        body.name = body.name or f"{prefix}link{i}"
+    taken = {body.name for body in spec.bodies}
+    free = (name for i in itertools.count() if (name := f"{prefix}link{i}") not in taken)
+    for body in own:  # exclusions need names
+        body.name = body.name or next(free)
     names = {body.name for body in own}
     if slots is None:
         outside = {
