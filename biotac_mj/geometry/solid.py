@@ -16,8 +16,8 @@ def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     edges = edges[edges[:, 0] != edges[:, 1]]
     there, back = (np.sort(edges @ [len(vert), 1][::way]) for way in (1, -1))
     corner = vert[face] - vert.mean(axis=0)
-    volume = np.linalg.det(corner).sum() if len(face) else 0.0
-    return bool(volume > 0 and np.array_equal(there, back))
+    volume = np.linalg.det(corner)
+    return bool(volume.sum() > 1e-6 * np.abs(volume).sum() and np.array_equal(there, back))
 
 
 def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
