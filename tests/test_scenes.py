@@ -308,6 +308,14 @@ def test_what_refers_to_a_replaced_tip_goes_on():
     assert data.sensor("alength").data == pytest.approx(other.sensor("alength").data)
 
 
+def test_there_is_room_for_all_that_collided_in_pairs():
+    spec = hand("abcdef")
+    attach_to_hand(spec, tips("abcdef"), **FINGER)
+    model = spec.compile()
+    assert sum(model.equality(i).name.startswith("biotac_a_couple") for i in range(model.neq)) == 7
+    assert all(model.geom(f"{n}ball").conaffinity[0] for n in "abcdef")
+
+
 def test_what_is_not_drawn_is_not_in_the_scene():
     spec = hand("a")
     attach_to_hand(spec, tips("a"), **FINGER)

@@ -158,6 +158,12 @@ def attach_to_hand(
     for body in own:  # exclusions need names
         body.name = body.name or next(free)
     names = {body.name for body in own}
+    for finger, link in links.items():
+        if variant == "authentic":
+            _freeze(spec, link)
+        _replace(spec, link, mounts[finger], set() if self_touch else names)
+        if link.explicitinertial and link.mass > 2 * _CORE_MASS:
+            link.mass -= _CORE_MASS
     if slots is None:
         outside = {
             g.parent.name or id(g.parent)
@@ -167,17 +173,11 @@ def attach_to_hand(
         slots = max(4, len(outside) + 1, len(names) if self_touch else 0)
     handles, seed = {}, int(settings.pop("seed", 0))
     for i, (finger, link) in enumerate(links.items()):
-        mount = mounts[finger]
-        if variant == "authentic":
-            _freeze(spec, link)
-        _replace(spec, link, mount, set() if self_touch else names)
-        if link.explicitinertial and link.mass > 2 * _CORE_MASS:
-            link.mass -= _CORE_MASS
         handles[finger] = attach(
             spec,
             body=link.name,
-            pos=mount.pos,
-            quat=mount.quat,
+            pos=mounts[finger].pos,
+            quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
             seed=seed + i,
             slots=slots,
