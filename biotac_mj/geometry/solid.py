@@ -10,6 +10,8 @@ __all__ = ["bounds_solid", "convex_hull", "ground"]
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     """Whether a mesh (n, 3) [m], (m, 3) has an inside: every edge is passed as often one way as the other,
     and faces look outwards. Vertices within 1 nm are one."""
+    if not len(face):
+        return False
     _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
     welded = merged.reshape(-1)[face]
     edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
