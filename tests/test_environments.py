@@ -1,6 +1,7 @@
 """The tasks in Gymnasium: its own checker is content, episodes repeat with their seed, several run side by
 side."""
 
+import pickle
 import warnings
 
 import numpy as np
@@ -106,3 +107,31 @@ def test_training_example_learns_from_touch_interface(repo, tmp_path):
         env.close()
     rows = example.train(True, steps=16, seed=0, rollout=16)
     assert rows and {"steps", "reward"} <= set(rows[0])
+
+
+def test_pictures_need_no_setting(monkeypatch):
+    """Without a window and with MUJOCO_GL unset the library that works is found; where there is none, one
+    error before anything is drawn."""
+    from biotac_mj.view.offscreen import find_gl
+
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    with pytest.raises(ValueError, match="no GL library to render with: install libosmesa6 or libegl1"):
+        BioTacEnv("finger", "press", render_mode="rgb_array")
+    monkeypatch.delenv("MUJOCO_GL")
+    if find_gl() is None:
+        pytest.skip("no GL library to render with: install libosmesa6 or EGL")
+    env = BioTacEnv("finger", "press", render_mode="rgb_array", width=64, height=48)
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (48, 64, 3) and picture.std() > 5
+    env.close()
+    env.close()
+
+
+def test_a_pickle_makes_it_anew():
+    env = gymnasium.make("BioTac/Press-v0")
+    first, second = (x.reset(seed=3)[0] for x in (env, pickle.loads(pickle.dumps(env))))
+    assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)
+    loaded = biotac_mj.tasks.load("finger", "press", task_kwargs={"random": 4})
+    first, second = (x.reset().observation for x in (loaded, pickle.loads(pickle.dumps(loaded))))
+    assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)

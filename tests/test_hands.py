@@ -92,7 +92,9 @@ def test_a_hand_by_body_names():
         )
         np.testing.assert_allclose(mat, [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-12)
         assert_pad_leads(model, data, handle, f"{name}J1")
-    assert not any(model.geom(i).name.endswith("tip") for i in range(model.ngeom))
+    for name in "ab":  # what is replaced stays, for what refers to it, but touches nothing and is not drawn
+        tip = model.geom(f"{name}tip")
+        assert not tip.contype[0] and not tip.conaffinity[0] and tip.rgba[3] == 0
     # the skin touches the ball and the floor, and none of the hand's own links
     from test_attach import touching
 

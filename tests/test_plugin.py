@@ -331,20 +331,6 @@ def test_nan_pose_names_the_geom():
     biotac_mj.plugin.clear_errors()
 
 
-def test_a_model_that_cannot_work_fails_when_its_data_is_made():
-    with (
-        pytest.warns(RuntimeWarning, match="cannot touch: it knows plane, sphere"),
-        pytest.raises((mujoco.FatalError, ValueError)),
-    ):
-        two_biotacs(
-            1,
-            extra='<body mocap="true"><geom name="field" type="hfield" hfield="f" pos="0 0 '
-            '-1"/></body></worldbody>'
-            '<asset><hfield name="f" nrow="2" ncol="2" size="1 1 .1 .1"/></asset><worldbody>',
-        )
-    biotac_mj.plugin.clear_errors()
-
-
 def test_discrete_integrator_is_refused_two_way(model):
     other = copy.copy(model)
     other.opt.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE

@@ -25,7 +25,7 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "data": "geometry skin sensor fields files reading versions press.approach press.indenter press.path",
-    "tasks": "coupling sensor geometry files reading data.objects",
+    "tasks": "coupling sensor geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments data sensor geometry fields files reading",
     "discrepancy": "effects data skin sensor geometry fields files reading",

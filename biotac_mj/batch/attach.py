@@ -12,6 +12,7 @@ import warp as wp
 from ..coupling.attachment import _add_slots, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
+from ..coupling.instance import NO_PASSIVE
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
@@ -29,7 +30,6 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["add", "attach", "make"]
 
-_SPRINGLESS = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 _DAMPED = 0.3  # time step x damping / inertia
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
@@ -245,7 +245,9 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
             f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
             f"the model's bodies are {names}"
         )
-    touching = Touching(ModelView(mjm._address), core, config)
+    view = ModelView(mjm._address)
+    touching = Touching(view, core, config)
+    touching.warn(view)
     rubber, skin_options, modulus = skin_settings(config)
     differ = settings["worlds"]
     room = make_room(skin_options, modulus, differ, len(geometry.elem))
@@ -306,7 +308,7 @@ def _check_model(mjm, coupling):
         raise ValueError(
             "a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler"
         )
-    if mjm.opt.disableflags & _SPRINGLESS == _SPRINGLESS:
+    if mjm.opt.disableflags & NO_PASSIVE == NO_PASSIVE:
         raise ValueError(
             "mujoco_warp asks for no passive forces where springs and dampers are both disabled: "
             "enable one of the flags"

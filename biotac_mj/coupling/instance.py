@@ -19,9 +19,12 @@ from .config import TIERS, Config
 from .metric import Metric
 from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
-from .touching import Touching
+from .touching import Touching, forget_notes
 
-__all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
+__all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "state_size"]
+
+# flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
+NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 
 # head of the plugin state: steps that did not converge, whether the last committed step did, whether a step
 # was made since the reset, and the energy that is in the skin at most [J]
@@ -157,6 +160,7 @@ class Setup:
 def state_size(model: ModelView, index: int) -> int:
     """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
     model."""
+    forget_notes(model)
     return Setup(model, index, compiling=True).nstate
 
 
@@ -173,6 +177,7 @@ class Instance:
     def __init__(self, model: ModelView, data: DataView, index: int):
         self.setup = setup = Setup(model, index)
         self.model, self.data, self.index, self.touching = model, data, index, setup.touching
+        self.touching.warn(model)
         sensors = setup.named("sensor")
         self.sensor = {
             name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
@@ -371,7 +376,16 @@ class Instance:
         return self._reading
 
     def sense(self) -> None:
-        """Writes the readings into sensordata."""
+        """Writes the readings into sensordata.
+
+        Raises:
+          ValueError: MuJoCo has not asked for the skin.
+        """
+        if self.model.opt.disableflags & NO_PASSIVE == NO_PASSIVE:
+            raise ValueError(
+                "the skin is a passive force, and the flags spring and damper are both disabled: "
+                "enable one of them"
+            )
         out, result = self.data.sensordata, self._result
         if self._error or result is None:
             self._flag()

@@ -21,6 +21,10 @@ __all__ = ["Metric"]
 
 _MINVAL = 1e-15  # mjMINVAL
 _EQUALITY = int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+_NEVER = int(mujoco.mjtSleepPolicy.mjSLEEP_NEVER)
+_NEEDED = {
+    name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}")) for name in ("constraint", "equality")
+}
 _PLAIN = 1.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its derivative
 
 
@@ -50,6 +54,10 @@ class Metric:
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
             model.eq_active0[slot] = 1
+        self._slots = np.array(list(self.slot.values()), dtype=np.int64)
+        # MuJoCo does not see what the skin carries: a body asleep has no rows and would not be woken
+        for t in {int(tree[b]) for b in (self.core, *self.slot)} - {-1}:
+            model.tree_sleep_policy[t] = _NEVER
 
     def jacobians(self, data: DataView) -> np.ndarray:
         """(ngroup, 6, nv) of the touching bodies relative to the BioTac, about the origin of its frame and in
@@ -66,11 +74,24 @@ class Metric:
         )
 
     def find_rows(self, data: DataView) -> None:
-        """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them."""
+        """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them.
+
+        Raises:
+          ValueError: the model's flags leave no room for them.
+        """
         model = self.model
         self._rows = {}
         if not self.slot:
             return
+        off = [name for name, flag in _NEEDED.items() if model.opt.disableflags & flag]
+        if off:
+            raise ValueError(
+                f"two-way coupling needs MuJoCo's equality constraints and the flag {' and '.join(off)} is "
+                "disabled: enable it, or use coupling='one-way'"
+            )
+        if not data.eq_active[self._slots].all():  # switched off with all others, or new to this mjData
+            data.eq_active[self._slots] = 1
+            data.make_constraints()
         ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
         layout = ids.tobytes(), kinds.tobytes()
         if layout != self._layout:  # it rarely changes
@@ -97,9 +118,9 @@ class Metric:
             index = np.flatnonzero((ids == slot) & (kinds == _EQUALITY))
             if len(index) != 6:
                 raise ValueError(
-                    "two-way coupling needs MuJoCo's equality constraints: enable the flags constraint and "
-                    "equality, "
-                    "or use coupling='one-way'"
+                    f"MuJoCo made {len(index)} of the 6 constraint rows between the BioTac and body "
+                    f"{self.model.name('body', root)!r}: does that body sleep, or was the BioTac's equality "
+                    "constraint changed?"
                 )
             places[root] = slice(int(index[0]), int(index[0]) + 6)
         rows = np.concatenate([np.arange(here.start, here.stop) for here in places.values()])

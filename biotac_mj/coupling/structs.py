@@ -21,7 +21,14 @@ LIBRARY.mj_getPluginConfig.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_c
 LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
 LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
-for _stage in ("mj_referenceConstraint", "mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint"):
+for _stage in (
+    "mj_makeConstraint",
+    "mj_island",
+    "mj_referenceConstraint",
+    "mj_fwdActuation",
+    "mj_fwdAcceleration",
+    "mj_fwdConstraint",
+):
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 
@@ -207,6 +214,11 @@ class DataView(_View):
             self.model.address, self.address, address, address + 24 * self.model.nv, point.ctypes.data, body
         )
         return out
+
+    def make_constraints(self) -> None:
+        """Makes all constraint rows again, as mj_fwdPosition does: equalities were switched since."""
+        for stage in (LIBRARY.mj_makeConstraint, LIBRARY.mj_island, LIBRARY.mj_projectConstraint):
+            stage(self.model.address, self.address)
 
     def project_constraints(self) -> None:
         """Rebuilds what the dual solvers (PGS, noslip) derive from the constraints' Jacobian and

@@ -1,16 +1,19 @@
 """Which geoms of a model can touch a BioTac, and where they will be at the end of the step."""
 
+import functools
 import math
+import warnings
 
 import mujoco
 import numpy as np
 
 from ..geometry.rigid import cross, matrix, rotation
+from ..geometry.solid import bounds_solid, convex_hull, ground
 from .config import Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching"]
+__all__ = ["Touching", "forget_notes"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -20,7 +23,11 @@ _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
     int(mujoco.mjtGeom.mjGEOM_BOX): "box",
     int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+    int(mujoco.mjtGeom.mjGEOM_HFIELD): "mesh",  # the ground under it
+    int(mujoco.mjtGeom.mjGEOM_SDF): "mesh",  # that MuJoCo has made of it
 }
+_HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+_noted = {}  # address of a model -> what was said of it
 
 
 class Touching:
@@ -30,10 +37,10 @@ class Touching:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
       body: (ngroup,) ids of the touching bodies.
+      notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
 
     Raises:
-      ValueError: a named geom is missing or ambiguous, lies on the BioTac's own link, or has a type that the
-        skin cannot touch.
+      ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link.
     """
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
@@ -43,12 +50,17 @@ class Touching:
             config.geoms is None and not compiling
         ):  # contact exclusions are not yet in the model while it is compiled
             ids = _not_excluded(model, core, ids)
+        meshes, self.notes = {}, []
+        if not compiling:  # nor are meshes
+            meshes, self.notes = _meshes(model, ids)
+            ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
         self.geoms = [
-            _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config) for g, k in zip(ids, group)
+            _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config, meshes.get(int(g)))
+            for g, k in zip(ids, group)
         ]
         self.group = group
         # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
@@ -56,6 +68,13 @@ class Touching:
         self._body = np.concatenate([[core], self.body]).astype(np.int64)
         self._root = model.body_rootid[self._body]
         self._geom_pos, self._geom_mat = model.geom_pos[ids], matrix(model.geom_quat[ids])
+
+    def warn(self, model: ModelView) -> None:
+        """Warns of the notes, each once a model."""
+        for note in self.notes:
+            if note not in (said := _noted.setdefault(model.address, set())):
+                said.add(note)
+                warnings.warn(note, stacklevel=2)
 
     def key(self) -> bytes:
         """Bytes that differ whenever the skin would see other geoms."""
@@ -180,26 +199,76 @@ def _resolve(model, name):
     return matches[0]
 
 
-def _describe(model, index, group, rounding, config):
-    name, kind = model.name("geom", index), int(model.geom_type[index])
-    if kind not in _TYPES:
-        label = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-        raise ValueError(
-            f"geom {name or index!r} is of type {label}, which a BioTac cannot touch: it knows "
-            f"{', '.join(_TYPES.values())}; "
-            "name the geoms that may touch with attach(geoms=[...]) or clear its contype and conaffinity"
+def forget_notes(model: ModelView) -> None:
+    """Of a model that is being made, where another one may have been."""
+    _noted.pop(model.address, None)
+
+
+def _meshes(model, ids):
+    """{geom: (vert, face), or None where it is no solid} of the meshes among the geoms, and notes."""
+    out, hulls, left = {}, {}, []
+    for g in ids.tolist():
+        if _TYPES[int(model.geom_type[g])] != "mesh":
+            continue
+        data, name = int(model.geom_dataid[g]), model.name("geom", g)
+        if model.geom_type[g] == _HFIELD:
+            start, shape = model.hfield_adr[data], (model.hfield_nrow[data], model.hfield_ncol[data])
+            height = model.hfield_data[start : start + shape[0] * shape[1]].reshape(shape)
+            out[g] = ground(height.astype(float), model.hfield_size[data])
+            continue
+        mesh = model.name("mesh", data) if data >= 0 else ""
+        vert, face = _part(model, data, "vert"), _part(model, data, "face")
+        out[g], as_it_is = _solid(vert.tobytes(), face.tobytes(), _hull_points(model, data))
+        if out[g] is None:
+            left.append(f"geom {name or g!r} (mesh {mesh!r})")
+        elif not as_it_is:
+            hulls[mesh] = None
+    notes = []
+    if hulls:
+        names = ", ".join(map(repr, hulls))
+        notes.append(
+            f"collision mesh {names} is open or does not bound a solid: the BioTac's skin meets the convex "
+            "hull, as MuJoCo's own contacts do; close the mesh if its hollows matter"
         )
+    if left:
+        notes.append(f"{', '.join(left)} is flat or has no mesh and cannot touch the BioTac's skin: left out")
+    return out, notes
+
+
+def _part(model, mesh, part):
+    if mesh < 0:  # an SDF without a mesh
+        return np.zeros((0, 3))
+    start, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
+    return getattr(model, f"mesh_{part}")[start : start + count]
+
+
+def _hull_points(model, mesh):
+    """Bytes of the numbers (int32) of the vertices on the hull that MuJoCo collides; maybe none."""
+    start = model.mesh_graphadr[mesh] if mesh >= 0 else -1
+    if start < 0:
+        return b""
+    count = model.mesh_graph[start]
+    return model.mesh_graph[start + 2 + count : start + 2 + 2 * count].tobytes()
+
+
+@functools.lru_cache(maxsize=256)
+def _solid(vert, face, hull):
+    """Mesh ((n, 3), (m, 3)) that stands for one given as bytes, or None, and whether it is that one."""
+    vert = np.frombuffer(vert, np.float32).reshape(-1, 3).astype(np.float64)
+    face = np.frombuffer(face, np.int32).reshape(-1, 3)
+    if bounds_solid(vert, face):
+        return (vert, face), True
+    number = np.frombuffer(hull, np.int32)
+    return convex_hull(vert[number] if len(number) else vert), False
+
+
+def _describe(model, index, group, rounding, config, mesh):
+    name, kind = model.name("geom", index), int(model.geom_type[index])
     other, priority = float(model.geom_friction[index, 0]), int(model.geom_priority[index])
     friction = (
         max(other, config.friction)
         if priority == config.priority
         else (other if priority > config.priority else config.friction)
     )
-    vert = face = None
-    if _TYPES[kind] == "mesh":
-        mesh = model.geom_dataid[index]
-        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        vert = np.array(model.mesh_vert[start : start + count], dtype=np.float64)
-        start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        face = np.array(model.mesh_face[start : start + count], dtype=np.int32)
+    vert, face = mesh or (None, None)
     return Geom(name, _TYPES[kind], np.array(model.geom_size[index]), friction, group, rounding, vert, face)

@@ -7,8 +7,11 @@
 """
 
 import gymnasium
+import mujoco
 import numpy as np
+from gymnasium.utils import EzPickle
 
+from ..view.offscreen import Offscreen, find_gl
 from . import suite
 
 __all__ = ["BioTacEnv", "IDS", "register"]
@@ -19,19 +22,19 @@ IDS = {
 }
 
 
-class BioTacEnv(gymnasium.Env):
+class BioTacEnv(gymnasium.Env, EzPickle):
     """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0,
-    1].
+    1]. A pickle holds the arguments, as those of Gymnasium's own environments do: it begins with a reset.
 
     Args:
       domain, task: see `suite.tasks`.
       observe: "tactile", "privileged" or "none".
-      render_mode: None or "rgb_array", the camera `side`.
+      render_mode: None or "rgb_array", the camera `side`, with the GL library that works here.
       width, height: of a picture [pixel].
       settings: further arguments of the task (time_limit, physics_timestep, biotac ...).
 
     Raises:
-      ValueError: no such task or preset.
+      ValueError: no such task or preset; render_mode without a GL library.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
@@ -48,8 +51,11 @@ class BioTacEnv(gymnasium.Env):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
-        self.render_mode, self._size = render_mode, (height, width)
+        EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
+        self.render_mode, self._screen = render_mode, None
         self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
+        if render_mode is not None:
+            self._screen = Offscreen(self.suite.physics.model.ptr, width, height, find_gl())
         action = self.suite.action_spec()  # all of them in [-1, 1]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
         counts = ("electrodes", "pac", "pdc", "tac", "tdc")
@@ -76,11 +82,16 @@ class BioTacEnv(gymnasium.Env):
         return self._observation(step), float(step.reward), bool(ended), bool(step.last() and not ended), {}
 
     def render(self) -> np.ndarray | None:
-        if self.render_mode is None:
+        if self._screen is None:
             return None
-        return self.suite.physics.render(*self._size, camera_id="side")
+        physics, camera = self.suite.physics, mujoco.MjvCamera()
+        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, physics.model.camera("side").id
+        return self._screen.render(physics.data.ptr, camera)
 
     def close(self) -> None:
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
         if self.suite is not None:
             self.suite.close()
             self.suite = None

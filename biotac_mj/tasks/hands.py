@@ -1,7 +1,8 @@
-"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, any other by body
-name."""
+"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, the gripper
+2F-85, any other by body name."""
 
 import dataclasses
+import itertools
 import typing
 from collections.abc import Iterable
 
@@ -27,7 +28,9 @@ class Mount:
       body: name of the link; a hand that was attached with a prefix is found by the end of the name.
       pos: of the BioTac frame's origin in the link's frame [m].
       tip, pad: directions in that frame in which the fingertip points and in which the pad looks.
-      replaces: names of the geoms that the BioTac stands for; None is all of the link.
+      replaces: names of the geoms that the BioTac stands for; None is all of the link and of what is fixed to
+        it.
+      shown: names of hidden geoms that stay and are drawn, where what was drawn of the link is replaced.
     """
 
     body: str
@@ -35,6 +38,7 @@ class Mount:
     tip: tuple = (0.0, 0.0, 1.0)
     pad: tuple = (0.0, -1.0, 0.0)
     replaces: tuple | None = None
+    shown: tuple = ()
 
     @property
     def quat(self) -> np.ndarray:
@@ -80,7 +84,8 @@ _LEAP = {
         (8.2e-3 - 11.2e-3, _TIP - length, z),
         tip=(0.0, -1.0, 0.0),
         pad=(-1.0, 0.0, 0.0),
-        replaces=(f"{finger}_tip",),
+        replaces=(f"{finger}_tip", f"{finger}_ds_visual"),  # the latter draws the tip too, and the link
+        shown=tuple(f"{finger}_ds_collision_{i}" for i in (1, 2, 3)),
     )
     for finger, length, z in (
         ("if", 50e-3, 14.5e-3),
@@ -89,11 +94,15 @@ _LEAP = {
         ("th", 62e-3, -14.5e-3),
     )
 }
+# Menagerie's 2F-85: the pads end at z = 37.5 mm; the plate behind them, which stays, begins at y = 0, and a
+# BioTac reaches 5.3 mm behind its axis.
+_GRIPPER = {f: Mount(f"{f}_pad", (0, -5.3e-3, 37.5e-3 - _TIP)) for f in ("left", "right")}
 HANDS = {
     "shadow_hand": _SHADOW,
     "shadow_hand_authentic": _SHADOW_AUTHENTIC,
     "allegro_hand": _ALLEGRO,
     "leap_hand": _LEAP,
+    "robotiq_2f85": _GRIPPER,
 }
 
 
@@ -109,14 +118,18 @@ def attach_to_hand(
 ) -> dict[str, "Handle"]:
     """Puts BioTacs onto the fingertips of a hand.
 
+    What a BioTac stands for stays in the model, for tendons, sensors and whatever else refers to it, but
+    touches nothing, weighs nothing and is not drawn. Contact pairs that name it are taken out: the skin
+    touches their other geom instead.
+
     Args:
       spec: the MjSpec that holds the hand. Add the objects first, as for `attach`.
-      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand: Menagerie's models, left or right), or
-        {finger: Mount} of any other.
+      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, robotiq_2f85: Menagerie's models, left or
+        right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with that variant.
       fingers: which of them, e.g. ("ff", "th"); None takes all.
       variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
-        BioTac fingers, whose last joint does not move: the joint, and what drove it, are taken out of the
-        model.
+        BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
+        keyframes are taken out of the model.
       prefix: each finger's names begin with prefix + finger + "_".
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
@@ -126,10 +139,13 @@ def attach_to_hand(
       {finger: Handle}, in the order of `fingers`.
 
     Raises:
-      ValueError: unknown hand, variant or finger; a link that the model does not have.
+      ValueError: unknown hand, variant or finger; a link, or a geom of it to replace, that the model does not
+        have.
     """
     from ..coupling import attach
 
+    if hand == "shadow_hand_authentic":
+        hand, variant = "shadow_hand", "authentic"
     mounts = _mounts(hand, variant)
     fingers = tuple(mounts) if fingers is None else tuple(fingers)
     for finger in fingers:
@@ -137,7 +153,17 @@ def attach_to_hand(
             raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
     links = {finger: _find(spec, mounts[finger].body) for finger in fingers}
     own = _subtree(_root(next(iter(links.values()))))
+    taken = {body.name for body in spec.bodies}
+    free = (name for i in itertools.count() if (name := f"{prefix}link{i}") not in taken)
+    for body in own:  # exclusions need names
+        body.name = body.name or next(free)
     names = {body.name for body in own}
+    for finger, link in links.items():
+        if variant == "authentic":
+            _freeze(spec, link)
+        _replace(spec, link, mounts[finger], set() if self_touch else names)
+        if link.explicitinertial and link.mass > 2 * _CORE_MASS:
+            link.mass -= _CORE_MASS
     if slots is None:
         outside = {
             g.parent.name or id(g.parent)
@@ -147,19 +173,11 @@ def attach_to_hand(
         slots = max(4, len(outside) + 1, len(names) if self_touch else 0)
     handles, seed = {}, int(settings.pop("seed", 0))
     for i, (finger, link) in enumerate(links.items()):
-        mount = mounts[finger]
-        if variant == "authentic":
-            _freeze(spec, link)
-        for geom in list(link.geoms):
-            if mount.replaces is None or any(geom.name.endswith(name) for name in mount.replaces):
-                spec.delete(geom)
-        if link.explicitinertial and link.mass > 2 * _CORE_MASS:
-            link.mass -= _CORE_MASS
         handles[finger] = attach(
             spec,
             body=link.name,
-            pos=mount.pos,
-            quat=mount.quat,
+            pos=mounts[finger].pos,
+            quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
             seed=seed + i,
             slots=slots,
@@ -212,30 +230,102 @@ def _subtree(body):
     return [body, *(b for child in body.bodies for b in _subtree(child))]
 
 
+def _replace(spec, link, mount, own):
+    """Puts what the BioTac stands for out of the way; the skin touches nothing of the bodies named `own`."""
+    geoms = _fixed_geoms(link)
+    shown = [g for name in mount.shown for g in _named(geoms, name, link)]
+    if mount.replaces is not None:
+        geoms = [g for name in mount.replaces for g in _named(geoms, name, link)]
+    for geom in geoms:
+        geom.contype = geom.conaffinity = 0
+        geom.mass, geom.material, geom.rgba[3] = 0.0, "", 0.0
+        for pair in [p for p in spec.pairs if geom.name and geom.name in (p.geomname1, p.geomname2)]:
+            _let_touch(spec, pair.geomname2 if pair.geomname1 == geom.name else pair.geomname1, own)
+            spec.delete(pair)
+    for geom in shown:
+        geom.group = 0
+
+
+def _named(geoms, name, link):
+    found = [g for g in geoms if g.name and g.name.endswith(name)]
+    if not found:
+        there = ", ".join(g.name for g in geoms if g.name) or "no named geom"
+        raise ValueError(
+            f"link {link.name!r} has no geom {name!r}: its geoms are {there}; give Mount(replaces=...) those "
+            "that the BioTac stands for, () for none"
+        )
+    return found
+
+
+def _fixed_geoms(link):
+    """Geoms of a link and of the bodies that do not move against it."""
+    fixed = (body for body in link.bodies if not body.joints and not body.mocap)
+    return [*link.geoms, *(g for body in fixed for g in _fixed_geoms(body))]
+
+
+def _let_touch(spec, name, own):
+    """Lets skins touch a geom that only collided in pairs, and nothing else: by a bit that no geom has."""
+    geom = spec.geom(name)
+    if geom is None or geom.contype or geom.conaffinity or geom.parent.name in own:
+        return
+    used = np.bitwise_or.reduce([bits for g in spec.geoms for bits in (g.contype, g.conaffinity)])
+    free = [1 << i for i in range(31) if not used >> i & 1]
+    if not free:
+        raise ValueError(
+            f"geom {name!r} collides by contact pairs alone, and all bits of contype are taken: give it a "
+            "contype that lets the BioTac touch it"
+        )
+    geom.conaffinity = free[-1]
+
+
 def _freeze(spec, link):
-    """Takes out a link's joint: tendons and actuators on it act on the joint before it, or go too."""
+    """Takes out a link's joint: tendons on it become the joint before it, what else is about it goes."""
     before = link.parent.joints[-1].name
     for joint in list(link.joints):
         for tendon in list(spec.tendons):
-            over = [w.target.name for w in tendon.path]
-            if joint.name not in over:
+            if joint.name not in [
+                w.target.name for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT
+            ]:
                 continue
             for actuator in spec.actuators:
-                if actuator.target == tendon.name:
+                if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON and actuator.target == tendon.name:
                     actuator.trntype, actuator.target = mujoco.mjtTrn.mjTRN_JOINT, before
                     actuator.ctrlrange = spec.joint(before).range
-            spec.delete(tendon)
-        for actuator in list(spec.actuators):
-            if actuator.target == joint.name:
-                spec.delete(actuator)
-        spec.delete(joint)
+            for sensor in spec.sensors:
+                of_joint = getattr(mujoco.mjtSensor, sensor.type.name.replace("TENDON", "JOINT"), None)
+                if (
+                    sensor.objtype == mujoco.mjtObj.mjOBJ_TENDON
+                    and sensor.objname == tendon.name
+                    and of_joint
+                ):
+                    sensor.type, sensor.objtype, sensor.objname = of_joint, mujoco.mjtObj.mjOBJ_JOINT, before
+            _take_out(spec, tendon, "TENDON")
+        _take_out(spec, joint, "JOINT")
     link.pos = [0.0, 0.0, 0.0]
     for key in list(spec.keys):  # their lengths no longer fit
         spec.delete(key)
 
 
+def _take_out(spec, element, kind):
+    """Deletes a joint, tendon or actuator (`kind`, as in mjtObj) and what refers to it."""
+    name, of_kind = element.name, getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
+    transmission = {"JOINT": ("mjTRN_JOINT", "mjTRN_JOINTINPARENT"), "TENDON": ("mjTRN_TENDON",)}.get(
+        kind, ()
+    )
+    for sensor in list(spec.sensors):
+        if (of_kind, name) in ((sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname)):
+            spec.delete(sensor)
+    for equality in list(spec.equalities):
+        if equality.type.name == f"mjEQ_{kind}" and name in (equality.name1, equality.name2):
+            spec.delete(equality)
+    for actuator in list(spec.actuators):
+        if actuator.trntype.name in transmission and actuator.target == name:
+            _take_out(spec, actuator, "ACTUATOR")
+    spec.delete(element)
+
+
 def _exclude(spec, handles, own):
-    colliding = [b for b in own if b.name and any(g.contype or g.conaffinity for g in b.geoms)]
+    colliding = [b for b in own if any(g.contype or g.conaffinity for g in b.geoms)]
     for handle in handles.values():
         for body in colliding:
             spec.add_exclude(bodyname1=handle.body, bodyname2=body.name)

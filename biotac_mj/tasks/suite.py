@@ -1,5 +1,6 @@
 """`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
 
+import functools
 import importlib
 import typing
 
@@ -15,6 +16,21 @@ __all__ = ["DOMAINS", "environment", "load", "tasks"]
 DOMAINS = ("finger", "gripper")
 
 
+@functools.cache
+def _environment_class():
+    from dm_control import composer
+
+    class Environment(composer.Environment):
+        """One whose pickle holds what it was made with: it begins with a reset."""
+
+        arguments: dict
+
+        def __reduce__(self):
+            return functools.partial(environment, **self.arguments), ()
+
+    return Environment
+
+
 def environment(
     task: "type[TouchTask]",
     environment_kwargs: dict | None = None,
@@ -22,7 +38,7 @@ def environment(
     time_limit: float | None = None,
     **settings: object,
 ) -> "composer.Environment":
-    """A composer.Environment of a TouchTask class.
+    """A composer.Environment of a TouchTask class. Pickled, it is made anew of the same arguments.
 
     Args:
       task: the class; settings: its arguments.
@@ -31,7 +47,6 @@ def environment(
       environment_kwargs: further arguments of `composer.Environment`.
     """
     import warp
-    from dm_control import composer
 
     warp.config.log_level = warp.LOG_WARNING
     made = task(**settings)
@@ -40,8 +55,11 @@ def environment(
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
     # sums of time steps may fall short of it by rounding
     limit = (made.seconds if time_limit is None else time_limit) - 1e-6
-    env = composer.Environment(
+    env = _environment_class()(
         made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
+    )
+    env.arguments = dict(
+        task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
     )
     state = env.random_state.get_state()
     # the first one compiles and draws noise that later ones do not: done here, so that a seed means one

@@ -91,6 +91,10 @@ class Offscreen:
         return self
 
     def __exit__(self, *exc_info):
+        self.close()
+
+    def close(self) -> None:
+        """Frees the context; once is enough."""
         self._stack.close()
 
     def render(

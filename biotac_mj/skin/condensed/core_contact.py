@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..contact.faces import Geoms, face_samples
-from ..contact.shapes import distance_bound
+from ..contact.shapes import grid_value
 from ..types import real, vec3
 
 if typing.TYPE_CHECKING:
@@ -38,12 +38,11 @@ def _measure_face(
     distance_out: wp.array2d(dtype=real),
 ):
     t = face[f]
-    half = real(0.5) * core.grids.spacing[core.grid[0]]
     least = real(1.0)
     for s in range(sample.shape[0]):
         w = sample[s]
         p = w[0] * x[t[0], 0] + w[1] * x[t[1], 0] + w[2] * x[t[2], 0]
-        d = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p) + half
+        d = grid_value(core.grids, core.grid[0], p)
         distance_out[f, s] = d
         least = wp.min(least, d)
     return least
@@ -58,7 +57,8 @@ def _may_be_near(t: wp.vec3i, core: Geoms, x: wp.array2d(dtype=vec3), reach: rea
         wp.length_sq(x[t[0], 0] - center),
         wp.max(wp.length_sq(x[t[1], 0] - center), wp.length_sq(x[t[2], 0] - center)),
     )
-    far = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], center)
+    k = core.grid[0]
+    far = grid_value(core.grids, k, center) - core.grids.spacing[k]
     return far < reach + real(1.2) * wp.sqrt(radius)
 
 

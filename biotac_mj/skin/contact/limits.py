@@ -52,7 +52,7 @@ def crushed_on_core(
     for c in range(3):
         y = R * (x[face[f][c], w] - core.pos[0, w])
         bound = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
-        if bound < -limit:  # half a cell too deep, perhaps
+        if bound < -limit:  # too deep, perhaps
             dn = distance(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
             if dn[3] < -limit:
                 failed_out[w] = 1

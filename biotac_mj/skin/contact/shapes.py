@@ -10,9 +10,19 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from ...geometry.solid import bounds_solid
 from ..types import real, vec3
 
-__all__ = ["GEOM_TYPES", "DistanceGrid", "Grids", "bake_distance_grid", "distance", "pack_grids"]
+__all__ = [
+    "GEOM_TYPES",
+    "DistanceGrid",
+    "Grids",
+    "bake_distance_grid",
+    "distance",
+    "distance_bound",
+    "grid_value",
+    "pack_grids",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -81,16 +91,12 @@ def bake_distance_grid(
       spacing: of the grid [m], instead of `cells`.
 
     Raises:
-      ValueError: the mesh is open (its inside is not defined) or empty.
+      ValueError: the mesh bounds no solid (it is open, say) or is empty.
     """
     vert, face = np.asarray(vert, float), np.asarray(face, np.int32)
     if not len(vert) or not len(face):
         raise ValueError("a mesh geom without faces has no distance field: give it a triangle mesh")
-    _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
-    welded = merged.reshape(-1)[face]
-    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    if not np.array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0)):
+    if not bounds_solid(vert, face):
         raise ValueError("the mesh is open: its inside is not defined; close its holes")
     low, high = vert.min(0), vert.max(0)
     if spacing is None:
@@ -136,7 +142,7 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
 
 
 @wp.func
-def _grid_value(grids: Grids, k: int, p: vec3):
+def grid_value(grids: Grids, k: int, p: vec3):
     """Trilinear; outside the grid, whose box holds the mesh, a lower bound of the distance (by the box's
     nearest point)."""
     n = grids.shape[k]
@@ -164,25 +170,38 @@ def _grid_value(grids: Grids, k: int, p: vec3):
     return value
 
 
+# [m] cells that a bound may err by; distances that matter to who asks for one
+_COARSE, _NEAR = (wp.constant(real(2.5e-4)), wp.constant(real(5e-3)))
+# of what is linear between the corners of a cell, of a function of slope 1, in cells
+_TRILINEAR = wp.constant(real(0.5 * 3.0**0.5))
+
+
 @wp.func
 def _mesh_distance(grids: Grids, k: int, p: vec3):
     """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay
     sharp."""
-    d = _grid_value(grids, k, p)
+    d = grid_value(grids, k, p)
     h = grids.spacing[k]
-    if d > real(0.5) * h:  # more than the trilinear error at a sharp edge: no contact here
+    if d > _TRILINEAR * h:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     if d < -h:
         n = vec3(
-            _grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
-            - _grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
-            _grid_value(grids, k, p + vec3(real(0.0), h, real(0.0)))
-            - _grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
-            _grid_value(grids, k, p + vec3(real(0.0), real(0.0), h))
-            - _grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
+            grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
+            - grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
+            grid_value(grids, k, p + vec3(real(0.0), h, real(0.0)))
+            - grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
+            grid_value(grids, k, p + vec3(real(0.0), real(0.0), h))
+            - grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
         )
         n = wp.normalize(n)
         return wp.vec4d(n[0], n[1], n[2], d)
+    return _to_triangles(grids, k, p)
+
+
+@wp.func
+def _to_triangles(grids: Grids, k: int, p: vec3):
+    """From the nearest triangle, within four cells."""
+    h = grids.spacing[k]
     mesh = grids.mesh[k]
     q = wp.vec3(
         wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3))
@@ -319,7 +338,14 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
 
 @wp.func
 def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Cheap lower bound of the distance [m]: what is surely not nearer needs no exact distance."""
+    """Lower bound of the distance [m], cheap where that is far: what is surely not nearer needs no exact
+    distance."""
     if kind == 7:
-        return _grid_value(grids, grid, p) - real(0.5) * grids.spacing[grid]
+        h = grids.spacing[grid]
+        d = grid_value(grids, grid, p)
+        bound = d - _TRILINEAR * h
+        # a large mesh has large cells, and what is centimetres away is not near
+        if h > _COARSE and bound < _NEAR and d > -h:
+            bound = _to_triangles(grids, grid, p)[3]
+        return bound
     return distance(kind, size, rounding, grids, grid, p)[3]

@@ -1,0 +1,61 @@
+"""Triangle meshes as solids: whether a mesh bounds one, the convex hull of one that does not, the ground
+under a height field."""
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+__all__ = ["bounds_solid", "convex_hull", "ground"]
+
+
+def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
+    """Whether a mesh (n, 3) [m], (m, 3) has an inside: every edge is passed as often one way as the other,
+    and faces look outwards. Vertices within 1 nm are one."""
+    if not len(face):
+        return False
+    _, merged = np.unique(vert.round(9) + 0.0, axis=0, return_inverse=True)
+    welded = merged.reshape(-1)[face]
+    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    there, back = (np.sort(edges @ [len(vert), 1][::way]) for way in (1, -1))
+    corner = vert[face] - vert.mean(axis=0)
+    volume = np.linalg.det(corner)
+    return bool(volume.sum() > 1e-6 * np.abs(volume).sum() and np.array_equal(there, back))
+
+
+def convex_hull(vert: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mesh (k, 3) [m], (m, 3) of the convex hull of points (n, 3), faces outwards; None where they span no
+    volume."""
+    try:
+        hull = ConvexHull(vert)
+    except (QhullError, ValueError):  # flat, or fewer than four points
+        return None
+    inward = np.einsum("ij,ij->i", hull.equations[:, :3], np.cross(*_sides(vert, hull.simplices))) < 0
+    face = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+    used, face = np.unique(face, return_inverse=True)
+    vert, face = vert[used], face.reshape(-1, 3).astype(np.int32)
+    return (vert, face) if bounds_solid(vert, face) else None
+
+
+def _sides(vert, face):
+    corner = vert[face]
+    return corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+
+
+def ground(height: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Closed mesh (n, 3) [m], (m, 3) of MuJoCo's height field: height (nrow, ncol) in [0, 1], size (4,) [m]:
+    half lengths in x and y, largest elevation, thickness of the base."""
+    nrow, ncol = height.shape
+    y, x = np.meshgrid(*(np.linspace(-s, s, n) for s, n in ((size[1], nrow), (size[0], ncol))), indexing="ij")
+    top = np.stack([x, y, size[2] * height], axis=-1).reshape(-1, 3)
+    number = np.arange(nrow * ncol).reshape(nrow, ncol)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    # each cell is cut from its lowest row and column to its highest, as MuJoCo does
+    upper = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in ((a, b, c), (a, c, d))])
+    rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
+    lower, next_rim = len(top) + np.arange(len(rim)), np.roll(rim, -1)
+    next_lower = np.roll(lower, -1)
+    wall = np.concatenate([np.stack([rim, lower, next_lower], 1), np.stack([rim, next_lower, next_rim], 1)])
+    floor = np.stack([np.full(len(rim), len(top) + len(rim)), next_lower, lower], 1)
+    base = np.append(top[rim], [[0.0, 0.0, 0.0]], axis=0)
+    base[:, 2] = -size[3]
+    return np.concatenate([top, base]), np.concatenate([upper, wall, floor]).astype(np.int32)
