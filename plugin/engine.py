@@ -156,8 +156,7 @@ def _init(model, data, index):
 
 @_guarded(None)
 def _destroy(data, index):
-    with _lock:
-        _worlds.pop(data, None)
+    _worlds.pop(data, None)  # without the lock: a garbage collection calls this on any thread at any time
 
 
 @_guarded(None)
