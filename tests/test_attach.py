@@ -27,9 +27,9 @@ def spec_of(text=WORLD):
 
 
 def springs(spec, **settings):
-    return attach(
-        spec, **({"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings)
-    )
+    place = {} if {"site", "body"} & settings.keys() else {"body": "world"}
+    spring = {"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"}
+    return attach(spec, **(spring | place | settings))
 
 
 def touching(model, index=0):
@@ -198,7 +198,7 @@ def test_room_for_more_bodies_must_be_there():
         (dict(coupling="both"), r"unknown coupling 'both': choose one of two-way, one-way"),
         (dict(geoms=["cups"]), r"no geom 'cups' to touch: the model has arm, hand, cup"),
         (dict(rounding={"edge": 1e-3}), r"no geom 'edge' to touch"),
-        (dict(friction=-1.0), r"the skin's friction is -1.0: give a number >= 0"),
+        (dict(friction=-1.0), r"the skin's friction is -1.0: give a finite number >= 0"),
         (dict(friction=float("nan")), r"the skin's friction is nan"),
         (dict(stepper="femm"), r"unknown stepper 'femm': choose one of .*springs"),
         (dict(readings="volts"), r"unknown readings 'volts': choose one of biotac, "),
@@ -350,8 +350,8 @@ def test_dm_control_loads_and_steps_it(tmp_path):
 def test_nodes_of_the_skin_from_the_handle():
     """`Handle.vert_xpos` gives the skin at rest, and of the right BioTac where there are two."""
     spec = mujoco.MjSpec()
-    a = biotac_mj.attach(spec, prefix="a_", skin="coarse")
-    b = biotac_mj.attach(spec, prefix="b_", skin="default", pos=(0, 0, 1))
+    a = biotac_mj.attach(spec, body="world", prefix="a_", skin="coarse")
+    b = biotac_mj.attach(spec, body="world", prefix="b_", skin="default", pos=(0, 0, 1))
     model = spec.compile()
     data = mujoco.MjData(model)
     for handle, skin in ((a, "coarse"), (b, "default")):

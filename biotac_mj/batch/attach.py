@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import _add_slots, _check_place, _model
+from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
@@ -50,7 +50,7 @@ def add(
     Args:
       spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can
         touch and move against the BioTac now, and names those that have no name.
-      site, body: name of the site or the body it is fixed to; neither is the world.
+      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds.
       skin: as for `biotac_mj.attach`; give `attach` the same.
@@ -61,10 +61,12 @@ def add(
       prefix.
 
     Raises:
-      ValueError: unknown site or body; the prefix is taken. FileNotFoundError: no such skin.
+      ValueError: unknown site or body, or none given; the prefix is taken. FileNotFoundError: no such skin.
     """
-    _check_place(spec, site, body, prefix)
-    own = spec.site(site).parent if site is not None else spec.worldbody if body is None else spec.body(body)
+    _check_place(spec, site, body, prefix, pos, quat)
+    config = Config(coupling=coupling, geoms=geoms)
+    _check_geoms(spec, config.geoms or ())
+    own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
     child = _model(skin_reference(skin)[1])
     child.body("core").pos, child.body("core").quat = pos, quat
@@ -370,8 +372,9 @@ def _readings(choice, geometry, nworld, seed, device):
         return None, None
     from ..sensor.acquisition import BatchAcquisition
     from ..sensor.film import BatchFilm, FilmConduction
+    from ..sensor.readings import check_settings
 
-    settings = {} if choice is True else dict(choice)
+    settings = {} if choice is True else {**check_settings(choice, more=("signal", "weights"))}
     if settings.pop("signal", "physics") != "physics":
         from ..learning.serve import LearnedBatchFilm
 

@@ -2,13 +2,35 @@
 
 import dataclasses
 import json
+import math
+import numbers
 from collections.abc import Callable
 
-__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
+__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "Config", "integer", "real"]
 
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
+ON_ERROR = ("warn", "raise")
+
+
+_OPTIONS = ("skin", "modulus", "readings")  # of the FEM skin; other steppers have their own
+
+
+def real(what: str, value: object, least: float = -math.inf) -> float:
+    """A finite number; raises ValueError for anything else, or where it is below `least`."""
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not good or value < least:
+        more = "" if least == -math.inf else f" >= {least:g}"
+        raise ValueError(f"{what} is {value!r}: give a finite number{more}")
+    return float(value)
+
+
+def integer(what: str, value: object, least: float = -math.inf) -> int:
+    """A whole number; raises ValueError for anything else, or where it is below `least`."""
+    if real(what, value, least) % 1:
+        raise ValueError(f"{what} is {value!r}: give a whole number")
+    return int(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +57,8 @@ class Config:
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
         and "readings".
+      on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
+        on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
 
     skin: str = "default"
@@ -51,21 +75,41 @@ class Config:
     seed: int = 0
     device: str = "cpu"
     options: dict = dataclasses.field(default_factory=dict)
+    on_error: str = "warn"
 
     def __post_init__(self):
-        if self.coupling not in COUPLINGS:
-            raise ValueError(f"unknown coupling {self.coupling!r}: choose one of {', '.join(COUPLINGS)}")
-        if self.tier not in TIERS:
-            raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
+        for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
+            if (value := getattr(self, name)) not in choices:
+                raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(choices)}")
+        for name in ("skin", "stepper", "readings", "device"):
+            if not isinstance(value := getattr(self, name), str):
+                raise ValueError(f"{name} is {value!r}: give its name")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
-        if not self.friction >= 0:
-            raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
+        if self.liquid not in (True, False):
+            raise ValueError(f"liquid is {self.liquid!r}: give True or False")
         if self.geoms is not None:
-            object.__setattr__(self, "geoms", tuple(self.geoms))
+            if isinstance(self.geoms, str) or not all(isinstance(name, str) for name in self.geoms):
+                raise ValueError(f"geoms is {self.geoms!r}: give a list of names")
+            self._set("geoms", tuple(self.geoms))
+        for name in ("rounding", "options"):
+            if not isinstance(getattr(self, name), dict):
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
+        self._set("friction", real("the skin's friction", self.friction, 0.0))
+        self._set("priority", integer("priority", self.priority))
+        self._set("seed", integer("seed", self.seed, 0))
+        self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
+        unknown = sorted(set(self.options) - set(_OPTIONS), key=str)
+        if unknown and self.stepper == "fem":
+            raise ValueError(
+                f"options has {', '.join(map(repr, unknown))}: choose from {', '.join(_OPTIONS)}"
+            )
+
+    def _set(self, name, value):
+        object.__setattr__(self, name, value)
 
     def strings(self) -> dict:
         """Attribute name -> JSON text; `parse` reads it back."""

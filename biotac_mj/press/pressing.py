@@ -71,7 +71,6 @@ def press(
         else:
             data.mocap_pos[0] = path.position(*travel)
             mujoco.mj_step(model, data)
-        plugin.check()
         rows.append(
             (
                 data.time,

@@ -26,7 +26,7 @@ from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
 from .types import real, vec3
 
-__all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
+__all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "solved_geometry"]
 
 # (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
 solve_rest = None
@@ -280,15 +280,7 @@ class SkinModel:
         else:
             factor, n = np.asarray(modulus, float), len(given.elem)
             what = f"{n} elements of {given.name!r}"
-        if factor.shape != (n,):
-            raise ValueError(
-                f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
-            )
-        if not (np.isfinite(factor) & (factor > 0)).all():
-            raise ValueError(
-                f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
-                "positive finite numbers"
-            )
+        check_modulus(factor, n, what)
         # the eight linear parts of a ten-node tetrahedron follow each other
         return np.repeat(factor, self.nelem // n)
 
@@ -399,6 +391,19 @@ class SkinModel:
     def _of_free(self, stiffness):
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
         return stiffness[dof][:, dof]
+
+
+def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
+    """Raises ValueError where factors on Young's modulus are not n positive numbers, one for each of `what`."""
+    if factor.shape != (n,):
+        raise ValueError(
+            f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
+        )
+    if not (np.isfinite(factor) & (factor > 0)).all():
+        raise ValueError(
+            f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
+            "positive finite numbers"
+        )
 
 
 @functools.lru_cache(maxsize=8)

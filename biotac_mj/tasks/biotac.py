@@ -69,6 +69,7 @@ class BioTac(composer.Entity):
         geoms=None,
         rounding=None,
         options=None,
+        on_error="raise",
         **settings,
     ):
         """
@@ -78,6 +79,7 @@ class BioTac(composer.Entity):
           slots: how many bodies of the whole model may touch it two-way.
           noise: whether the observables have the real sensor's noise.
           geoms, rounding: see `biotac_mj.coupling.Config`; names are those of the whole model.
+          on_error: "raise" ends the episode with what went wrong inside a step, "warn" goes on without touch.
           options, settings: further ones of `biotac_mj.attach`.
 
         Raises:
@@ -96,7 +98,8 @@ class BioTac(composer.Entity):
         options["readings"] = {**options.get("readings", {}), "noise": False}
         spec = mujoco.MjSpec()
         self.handle = attach(
-            spec, prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options, **settings
+            spec, body="world", prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options,
+            on_error=on_error, **settings,
         )
         spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())
