@@ -10,7 +10,6 @@ every tier has been at work, are not counted."""
 import argparse
 import ctypes
 import gc
-import json
 import os
 import pathlib
 import sys

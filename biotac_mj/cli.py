@@ -192,7 +192,6 @@ def _press(args):
         device=args.device,
         options=args.options,
     )
-    _calm_warp()
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -241,7 +240,6 @@ def _add_view(verbs):
 def _view(args):
     from .view import view
 
-    _calm_warp()
     view(
         skin=args.skin,
         tier=args.tier,
@@ -386,7 +384,6 @@ def _add_calibrate(verbs):
 def _calibrate(args):
     from .calibration import verbs
 
-    _calm_warp()
     verbs.calibrate_verb(args)
 
 
@@ -445,7 +442,6 @@ def _add_compare(verbs):
 def _compare(args):
     from .calibration import verbs
 
-    _calm_warp()
     verbs.compare_verb(args)
 
 
@@ -523,7 +519,6 @@ def _add_generate(verbs):
 def _generate(args):
     from .data import verbs
 
-    _calm_warp()
     verbs.generate_verb(args)
 
 
@@ -583,7 +578,6 @@ def _add_diagnose(verbs):
 def _diagnose(args):
     from .discrepancy import verbs
 
-    _calm_warp()
     verbs.diagnose_verb(args)
 
 
@@ -634,13 +628,6 @@ def _export_data(args):
     from .data import verbs
 
     verbs.export_verb(args)
-
-
-def _calm_warp():
-    """Hides the list of devices and compiled modules; warnings stay."""
-    import warp
-
-    warp.config.log_level = warp.LOG_WARNING
 
 
 def main(argv=None) -> int:

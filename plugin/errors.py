@@ -5,6 +5,7 @@ A callback cannot raise: C lies between it and whoever called mj_step. Its error
 always if it is a KeyboardInterrupt or the like: in the thread that stepped, or in the main one where that is
 no thread of Python's (`mujoco.rollout`)."""
 
+import contextlib
 import ctypes
 import functools
 import signal
@@ -12,9 +13,11 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-__all__ = ["check", "clear_errors", "guarded", "watch_interrupts"]
+import mujoco
+
+__all__ = ["check", "clear_errors", "explained", "guarded", "watch_interrupts"]
 
 _lock = threading.Lock()
 _first = None  # the first error since the last `check`
@@ -98,6 +101,18 @@ def check() -> None:
         raise error
 
 
+@contextlib.contextmanager
+def explained() -> Iterator[None]:
+    """Where MuJoCo can only say that a BioTac cannot be made, raises what the BioTac says of it instead."""
+    before = _first
+    try:
+        yield
+    except (ValueError, mujoco.FatalError):
+        if _first is not before:
+            check()
+        raise
+
+
 def clear_errors() -> None:
     """Forgets the kept error."""
     global _first
@@ -163,8 +178,8 @@ def _in_callback(frame):
 
 
 def _interrupt(number, frame):
-    """Python's own handler of Ctrl-C, but that a callback is not left half done: there, or in a destructor that
-    it runs, the KeyboardInterrupt could be lost. A second one does not wait."""
+    """Python's own handler of Ctrl-C, but that a callback is not left half done, where the KeyboardInterrupt
+    could also be lost, in a destructor for example. A second one does not wait."""
     if _in_callback(frame) and not _late.waits_for(KeyboardInterrupt):
         _late.throw(KeyboardInterrupt())
     else:

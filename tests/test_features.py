@@ -153,8 +153,8 @@ def pin():
 def by_attach(material, options, file, worlds=None, tier="full", device="cpu"):
     spec = pin()
     handle = biotac_mj.attach(
-        spec, body="world", skin=file, material=material, liquid=None, options=options, tier=tier, readings="none",
-        coupling="one-way", device=device,
+        spec, body="world", skin=file, material=material, liquid=None, options=options, tier=tier,
+        readings="none", coupling="one-way", device=device,
     )  # fmt: skip
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -10,10 +10,11 @@ from imports import circles, imports, modules
 LAYERS = {
     "files": "biotac_mj",  # the version
     "threads": "",
+    "calm": "",
     "geometry": "",
-    "skin": "geometry threads",
+    "skin": "geometry threads calm",
     "features": "",
-    "sensor": "geometry threads",
+    "sensor": "geometry threads calm",
     "effects": "skin sensor geometry",
     "coupling": "skin sensor geometry learning.serve",
     "plugin": "coupling",
@@ -21,7 +22,7 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry files view.offscreen",
     "calibration": "geometry skin files press.indenter press.path",
     "data": "geometry skin sensor files press.approach press.indenter press.path",
-    "tasks": "coupling sensor geometry data.objects",
+    "tasks": "coupling plugin sensor geometry data.objects",
     "view": "coupling plugin skin sensor geometry files tasks press.approach press.scene",
     "learning": "data sensor geometry files",
     "discrepancy": "effects data skin sensor geometry files",

@@ -12,6 +12,7 @@ import warp as wp
 from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
+from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
@@ -149,6 +150,8 @@ def attach(
         (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
         frictions that is not nworld.
     """
+    if not isinstance(mjm, mujoco.MjModel) or not hasattr(d, "qpos"):
+        raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
     settings = dict(
@@ -224,7 +227,7 @@ def make(
 def _skins(mjm, prefix, skin, nworld, device, settings):
     """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one
     BioTac."""
-    material, friction, priority = settings["material"], settings["friction"], int(settings["priority"])
+    material, friction, priority = settings["material"], settings["friction"], settings["priority"]
     materials = _materials(material, nworld)
     chosen = materials[0] if materials else read_material(material)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
@@ -232,7 +235,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     config = Config(
         skin=skin_reference(skin)[0],
         material=plain(chosen),
-        liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
+        liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
         geoms=settings["geoms"],
         rounding=dict(settings["rounding"] or {}),
         friction=float(mu[0]),
@@ -240,12 +243,19 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         device=device,
         options=dict(settings["options"] or {}),
     )
-    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
+    if "readings" in config.options:
+        raise ValueError("options has 'readings': pass a batch its readings=")
+    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
             f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
             f"the model's bodies are {names}"
+        )
+    shown = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
+    if shown >= 0 and mjm.skin_vertnum[shown] != len(np.unique(geometry.outer_face)):
+        raise ValueError(
+            f"the BioTac {prefix!r} has another skin than {geometry.name!r}: give add and attach one"
         )
     touching = Touching(ModelView(mjm._address), core, config)
     rubber, skin_options, modulus = skin_settings(config)
@@ -283,9 +293,14 @@ def _materials(material, nworld):
 
 
 def _per_world(value, nworld, default):
-    out = np.asarray(default if value is None else value, float)
+    try:
+        out = np.asarray(default if value is None else value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"friction is {value!r}: pass finite numbers >= 0, one or ({nworld},)") from None
     if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
-        raise ValueError(f"friction has shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)")
+        raise ValueError(
+            f"friction is {value!r} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
+        )
     return np.broadcast_to(out, nworld)
 
 
@@ -304,6 +319,7 @@ def _sensor(mjm, name):
 
 
 def _check_model(mjm, coupling):
+    Config(coupling=coupling)
     if mjm.opt.integrator in (int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_DISCRETE)):
         raise ValueError(
             "a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler"
@@ -368,6 +384,9 @@ def _slots(mjm, m, d, touching, prefix):
 
 
 def _readings(choice, geometry, nworld, seed, device):
+    seeds = np.atleast_1d(seed)
+    if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
+        raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
     if choice is False:
         return None, None
     from ..sensor.acquisition import BatchAcquisition
@@ -375,7 +394,10 @@ def _readings(choice, geometry, nworld, seed, device):
     from ..sensor.readings import check_settings
 
     settings = {} if choice is True else {**check_settings(choice, more=("signal", "weights"))}
-    if settings.pop("signal", "physics") != "physics":
+    signal = settings.pop("signal", "physics")
+    if signal not in SIGNALS:
+        raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
+    if signal != "physics":
         from ..learning.serve import LearnedBatchFilm
 
         film = LearnedBatchFilm(

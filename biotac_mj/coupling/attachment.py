@@ -120,8 +120,8 @@ def attach(
       coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
 
     Raises:
-      ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that this machine
-        does not have; the prefix is taken. The spec is as it was then.
+      ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that is not
+        there; the prefix is taken. The spec is as it was then.
       TypeError: spec is no MjSpec. FileNotFoundError: no such file.
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """

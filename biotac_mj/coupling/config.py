@@ -6,6 +6,8 @@ import math
 import numbers
 from collections.abc import Callable
 
+import numpy as np
+
 __all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "Config", "integer", "real"]
 
 PLUGIN_NAME = "biotac_mj.skin"
@@ -26,10 +28,11 @@ def real(what: str, value: object, least: float = -math.inf) -> float:
     return float(value)
 
 
-def integer(what: str, value: object, least: float = -math.inf) -> int:
-    """A whole number; raises ValueError for anything else, or where it is below `least`."""
-    if real(what, value, least) % 1:
-        raise ValueError(f"{what} is {value!r}: give a whole number")
+def integer(what: str, value: object, least: int = -(2**31), most: int = 2**31 - 1) -> int:
+    """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
+    if not good or not least <= value <= most:
+        raise ValueError(f"{what} is {value!r}: give a whole number from {least} to {most}")
     return int(value)
 
 
@@ -92,7 +95,8 @@ class Config:
         if self.liquid not in (True, False):
             raise ValueError(f"liquid is {self.liquid!r}: give True or False")
         if self.geoms is not None:
-            if isinstance(self.geoms, str) or not all(isinstance(name, str) for name in self.geoms):
+            listed = isinstance(self.geoms, (list, tuple, set, np.ndarray))
+            if not listed or not all(isinstance(name, str) for name in self.geoms):
                 raise ValueError(f"geoms is {self.geoms!r}: give a list of names")
             self._set("geoms", tuple(self.geoms))
         for name in ("rounding", "options"):
@@ -100,7 +104,7 @@ class Config:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
         self._set("friction", real("the skin's friction", self.friction, 0.0))
         self._set("priority", integer("priority", self.priority))
-        self._set("seed", integer("seed", self.seed, 0))
+        self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
         self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         unknown = sorted(set(self.options) - set(_OPTIONS), key=str)
         if unknown and self.stepper == "fem":

@@ -53,12 +53,9 @@ def press(
     indenter = make_indenter(options.indenter)
     path = plan_path(_at_rest(geometry, options), indenter, options)
     spec, handle = build_scene(indenter, path, options)
-    try:
+    with plugin.explained():
         model = spec.compile()
         data = mujoco.MjData(model)
-    except (ValueError, mujoco.FatalError):
-        plugin.check()  # says why, where MuJoCo only says that
-        raise
     rows, picture = [], None
     last = len(path.depth) - 1
     begin = time.perf_counter()

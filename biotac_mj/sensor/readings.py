@@ -102,7 +102,7 @@ def check_settings(given: dict, more: tuple[str, ...] = ()) -> dict:
             raise ValueError(f"readings has {name!r}: choose from {', '.join(_SETTINGS + more)}")
         if name in ("noise", "film_every_step") and value not in (True, False):
             raise ValueError(f"{name} of the readings is {value!r}: give True or False")
-        if name == "sensor" and value not in REST_COUNTS:
+        if name == "sensor" and value not in list(REST_COUNTS):
             raise ValueError(f"sensor is {value!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
         if name == "temperature" and not (isinstance(value, numbers.Real) and math.isfinite(value)):
             raise ValueError(f"temperature of the readings is {value!r}: give a finite number of degrees C")

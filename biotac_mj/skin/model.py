@@ -394,7 +394,7 @@ class SkinModel:
 
 
 def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
-    """Raises ValueError where factors on Young's modulus are not n positive numbers, one for each of `what`."""
+    """Raises ValueError where factors on Young's modulus are not n positive numbers, one for each `what`."""
     if factor.shape != (n,):
         raise ValueError(
             f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"

@@ -9,6 +9,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
+from .. import plugin
 from ..sensor.channels import FULL_SCALE, OTHER_NOISE, electrode_noise
 
 __all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
@@ -94,14 +95,26 @@ class BioTac(composer.Entity):
                     f"BioTac got {key}={settings[key]!r}: "
                     "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
-        options = {**(options or {})}
-        options["readings"] = {**options.get("readings", {}), "noise": False}
+        if isinstance(options or {}, dict):  # else `attach` says what is wrong
+            own = (options or {}).get("readings", {})
+            options = {
+                **(options or {}),
+                "readings": {**own, "noise": False} if isinstance(own, dict) else own,
+            }
         spec = mujoco.MjSpec()
         self.handle = attach(
-            spec, body="world", prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options,
-            on_error=on_error, **settings,
+            spec,
+            body="world",
+            prefix=_PREFIX,
+            skin=skin,
+            tier=tier,
+            slots=slots,
+            options=options,
+            on_error=on_error,
+            **settings,
         )
-        spec.compile()
+        with plugin.explained():
+            spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())
         root.model = name
         for namespace in ("body", "geom", "mesh", "site", "sensor", "equality", "plugin", "deformable"):

@@ -9,6 +9,7 @@
 import gymnasium
 import numpy as np
 
+from ..coupling.config import integer
 from . import suite
 
 __all__ = ["BioTacEnv", "IDS", "register"]
@@ -48,7 +49,8 @@ class BioTacEnv(gymnasium.Env):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
-        self.render_mode, self._size = render_mode, (height, width)
+        self.render_mode = render_mode
+        self._size = integer("height", height, 1), integer("width", width, 1)
         self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
         action = self.suite.action_spec()  # all of them in [-1, 1]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
