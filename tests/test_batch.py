@@ -110,7 +110,7 @@ def impact_spec():
 def make(spec, nworld, body=None, skin=None, **settings):
     """mjm, m, d and the Batch of a spec."""
     skin = skin or shell()
-    batches.add(spec, body=body, skin=skin)
+    batches.add(spec, body=body or "world", skin=skin)
     if body is not None:  # all mass where the joint is: MuJoCo's own integration of a free body errs without
         spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
     mjm = spec.compile()

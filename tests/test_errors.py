@@ -182,6 +182,21 @@ def test_ctrl_c_ends_a_program_that_steps():
     assert program.returncode == -signal.SIGINT and errors.rstrip().endswith("KeyboardInterrupt")
 
 
+def test_compiling_is_announced(monkeypatch, tmp_path, capsys):
+    import warp as wp
+
+    from biotac_mj.calm import announce_compilation
+
+    wp.init()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    announce_compilation("cpu")
+    assert "compiling kernels for the CPU, once" in capsys.readouterr().err
+    (tmp_path / "wp_biotac_mj.skin.liquid_0").mkdir()
+    (tmp_path / "wp_biotac_mj.skin.liquid_0" / "liquid.cpp").touch()
+    announce_compilation("cpu")
+    assert capsys.readouterr().err == ""
+
+
 def test_a_handler_of_the_users_stays():
     seen = []
     before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..calm import announce_compilation
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import liquid
@@ -211,6 +212,7 @@ class SkinModel:
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
         self.device = wp.get_device(device)
+        announce_compilation(self.device)
         self._cores, self._rest = {}, None
         self._elimination = None
         self.law = LAWS[self.material.law]
