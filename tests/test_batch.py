@@ -584,7 +584,7 @@ def test_errors_say_what_to_do():
     mjm = spec.compile()
     with pytest.raises(ValueError, match="2 materials for 3 worlds: pass one for each"):
         attach(mjm, 3, material=["default"] * 2)
-    with pytest.raises(ValueError, match=r"friction has shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"friction is \[0.1, 0.2\] of shape \(2,\)"):
         attach(mjm, 3, friction=[0.1, 0.2])
     with pytest.raises(ValueError, match="worlds cannot differ in 'adhesive': choose from"):
         attach(mjm, 3, worlds={"adhesive": 0.1})
