@@ -51,7 +51,7 @@ def time_batch(skin: str, worlds: int, increments: int, element=None) -> dict:
     spec.option.timestep = 2e-3
     sphere = spec.worldbody.add_body(name="sphere", mocap=True, pos=path[0])
     sphere.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0])
-    batch.add(spec, skin=skin)
+    batch.add(spec, body="world", skin=skin)
     mjm = spec.compile()
     mjd = mujoco.MjData(mjm)
     mujoco.mj_forward(mjm, mjd)

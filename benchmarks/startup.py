@@ -46,7 +46,7 @@ def start(tier: str, skin: str, fill: float) -> dict[str, tuple[float, float]]:
     ball.add_freejoint()
     ball.add_geom(size=[RADIUS, 0, 0], mass=0.01)
     options = {"skin": {"fill_volume": fill}} if fill else {}
-    handle = biotac_mj.attach(spec, tier=tier, skin=skin, options=options)
+    handle = biotac_mj.attach(spec, body="world", tier=tier, skin=skin, options=options)
     lap()
     model = spec.compile()
     data = mujoco.MjData(model)

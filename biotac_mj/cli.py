@@ -206,7 +206,7 @@ def _press(args):
         device=args.device,
         options=args.options,
     )
-    _start_warp(args)
+    _check_device(args)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -256,7 +256,7 @@ def _add_view(verbs):
 def _view(args):
     from .view import view
 
-    _start_warp(args)
+    _check_device(args)
     view(
         skin=args.skin,
         tier=args.tier,
@@ -409,7 +409,7 @@ def _add_calibrate(verbs):
 def _calibrate(args):
     from .calibration import verbs
 
-    _start_warp(args)
+    _check_device(args)
     verbs.calibrate_verb(args)
 
 
@@ -475,7 +475,7 @@ def _add_compare(verbs):
 def _compare(args):
     from .calibration import verbs
 
-    _start_warp(args)
+    _check_device(args)
     verbs.compare_verb(args)
 
 
@@ -561,7 +561,7 @@ def _add_generate(verbs):
 def _generate(args):
     from .data import verbs
 
-    _start_warp(args)
+    _check_device(args)
     verbs.generate_verb(args)
 
 
@@ -622,7 +622,7 @@ def _add_diagnose(verbs):
 def _diagnose(args):
     from .discrepancy import verbs
 
-    _start_warp(args)
+    _check_device(args)
     verbs.diagnose_verb(args)
 
 
@@ -680,11 +680,10 @@ def _export_data(args):
     verbs.export_verb(args)
 
 
-def _start_warp(args):
-    """Hides the list of devices and compiled modules, warnings stay; refuses devices that are not here."""
+def _check_device(args):
+    """Refuses devices that are not here."""
     import warp
 
-    warp.config.log_level = warp.LOG_WARNING
     there = [one.alias for one in warp.get_devices()]
     for name in args.device.split(","):
         if name not in (*there, *("cuda" for one in there if one != "cpu")):

@@ -34,7 +34,7 @@ def scene(skin):
     spec.option.timestep = DT
     sphere = spec.worldbody.add_body(name="sphere", mocap=True)
     sphere.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0])
-    batch.add(spec, skin=skin)
+    batch.add(spec, body="world", skin=skin)
     return spec.compile()
 
 

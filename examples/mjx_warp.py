@@ -26,7 +26,7 @@ def scene(skin, mass):
     ball = spec.worldbody.add_body(name="ball", pos=[-9e-3, -RADIUS - 7.1e-3, 0])
     ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], damping=[4.0, 0, 0])
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=mass)
-    batch.add(spec, skin=skin, coupling="one-way")
+    batch.add(spec, body="world", skin=skin, coupling="one-way")
     return spec.compile()
 
 

@@ -1,22 +1,19 @@
 """The engine plugin "biotac_mj.skin": MuJoCo's plugin interface, served from Python through ctypes.
 
 MuJoCo calls the functions below from inside `mj_step`, on whatever thread steps; ctypes takes the interpreter
-lock for each call. Nothing may be raised into C, so an exception is kept, reported as a RuntimeWarning, shown
-as -1 in the status sensor and raised again by `check`."""
+lock for each call. What they raise comes back by way of `errors`, and the status sensor shows -1."""
 
 import atexit
 import ctypes
-import functools
-import sys
 import threading
-import warnings
 
 import mujoco
 
 from ..coupling import structs
 from ..coupling.config import PLUGIN_NAME
+from .errors import guarded, watch_interrupts
 
-__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "check", "clear_errors", "register"]
+__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "register"]
 
 # Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
 # `biotac_mj.coupling.config`.
@@ -35,6 +32,7 @@ ATTRIBUTES = (
     "seed",
     "device",
     "options",
+    "on_error",
 )
 
 _INT, _PTR = ctypes.c_int, ctypes.c_void_p
@@ -79,43 +77,16 @@ class _Plugin(ctypes.Structure):
 
 _lock = threading.RLock()
 _worlds = {}  # mjData address -> World, all BioTacs in it; holds only what the state and the model determine
-_errors = []
-_MAX_ERRORS = 100
 _alive = []  # what C points to
 
 
-def _keep(error):
-    with _lock:
-        if len(_errors) < _MAX_ERRORS:
-            _errors.append(error)
-    try:
-        warnings.warn(
-            f"BioTac: {str(error) or type(error).__name__} (biotac_mj.plugin.check() raises it)",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-    except RuntimeWarning:  # the user turned warnings into errors: it is kept above
-        pass
+def _raises(model, index):
+    return structs.ModelView(model).config(index, "on_error") == '"raise"'
 
 
-def _guarded(on_error):
-    def decorate(function):
-        # what is left when MuJoCo frees the last mjData: this module's names are gone by then
-        finalizing = sys.is_finalizing
-
-        @functools.wraps(function)
-        def call(*args):
-            if finalizing():
-                return on_error
-            try:
-                return function(*args)
-            except BaseException as error:  # noqa: BLE001 - C cannot take it
-                _keep(error)
-                return on_error
-
-        return call
-
-    return decorate
+def _abandon(model, data, index, capability):
+    if data in _worlds:
+        _worlds[data].failed(index)
 
 
 def _world(model, data, index):
@@ -132,19 +103,19 @@ def _world(model, data, index):
     return world
 
 
-@_guarded(-1)
+@guarded(failed=-1)
 def _nstate(model, index):
     from ..coupling.instance import state_size  # late: `import biotac_mj` loads neither Warp nor the geometry
 
     return state_size(structs.ModelView(model), index)
 
 
-@_guarded(0)
+@guarded(failed=0)
 def _nsensordata(model, index, sensor):
     return 0
 
 
-@_guarded(-1)
+@guarded(failed=-1)
 def _init(model, data, index):
     with _lock:
         world = _worlds.get(data)
@@ -154,44 +125,40 @@ def _init(model, data, index):
     return 0
 
 
-@_guarded(None)
+@guarded()
 def _destroy(data, index):
-    with _lock:
-        _worlds.pop(data, None)
+    _worlds.pop(data, None)  # without the lock: a garbage collection calls this on any thread at any time
 
 
-@_guarded(None)
+@guarded()
 def _copy(destination, model, source, index):
     with _lock:
         _worlds.pop(destination, None)
 
 
-@_guarded(None)
+@guarded()
 def _reset(model, state, plugin_data, index):
     from ..coupling.instance import reset_state
 
     reset_state(structs.ModelView(model), state, index)
 
 
+@guarded(raises=lambda model, data, index, capability: _raises(model, index), abandon=_abandon)
 def _compute(model, data, index, capability):
-    try:
-        world = _world(model, data, index)
-        if capability == _PASSIVE:
-            world.passive(index)
-        elif capability == _SENSOR:
-            world.instances[index].sense()
-    except BaseException as error:  # noqa: BLE001
-        _keep(error)
-        if data in _worlds:
-            _worlds[data].failed(index)
+    watch_interrupts()
+    world = _world(model, data, index)
+    if capability == _PASSIVE:
+        world.passive(index)
+    elif capability == _SENSOR:
+        world.instances[index].sense()
 
 
-@_guarded(None)
+@guarded(raises=lambda model, data, index: _raises(model, index))
 def _advance(model, data, index):
     _world(model, data, index).instances[index].commit_step()
 
 
-@_guarded(None)
+@guarded(raises=lambda model, data, option, scene, index: _raises(model, index))
 def _visualize(model, data, option, scene, index):
     _world(model, data, index).instances[index].visualize()
 
@@ -242,23 +209,3 @@ def _fall_silent(slot):
     get = structs.LIBRARY.mjp_getPluginAtSlot
     get.restype, get.argtypes = ctypes.POINTER(_Plugin), (_INT,)
     get(slot).contents.destroy = _CALLBACKS["destroy"]()  # none
-
-
-def check():
-    """Raises the first error that a BioTac met inside MuJoCo since the last call; returns None if there was
-    none.
-
-    Call it in long loops: a KeyboardInterrupt that came while a skin was solved is among the errors, for it
-    cannot pass through C either.
-    """
-    with _lock:
-        errors = list(_errors)
-        _errors.clear()
-    if errors:
-        raise errors[0]
-
-
-def clear_errors():
-    """Forgets the kept errors."""
-    with _lock:
-        _errors.clear()

@@ -22,14 +22,17 @@ WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
     <geom type="sphere" size=".01" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
 
 
+FEM = {"stepper": "fem", "skin": "coarse", "readings": "biotac"}
+
+
 def spec_of(text=WORLD):
     return mujoco.MjSpec.from_string(text)
 
 
 def springs(spec, **settings):
-    return attach(
-        spec, **({"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"} | settings)
-    )
+    place = {} if {"site", "body"} & settings.keys() else {"body": "world"}
+    spring = {"skin": spring_skin.pad_geometry(), "stepper": "springs", "readings": "sum"}
+    return attach(spec, **(spring | place | settings))
 
 
 def touching(model, index=0):
@@ -198,16 +201,64 @@ def test_room_for_more_bodies_must_be_there():
         (dict(coupling="both"), r"unknown coupling 'both': choose one of two-way, one-way"),
         (dict(geoms=["cups"]), r"no geom 'cups' to touch: the model has arm, hand, cup"),
         (dict(rounding={"edge": 1e-3}), r"no geom 'edge' to touch"),
-        (dict(friction=-1.0), r"the skin's friction is -1.0: give a number >= 0"),
-        (dict(friction=float("nan")), r"friction is nan"),
+        (dict(friction=-1.0), r"the skin's friction is -1.0: give a finite number >= 0"),
+        (dict(friction=float("nan")), r"the skin's friction is nan"),
         (dict(stepper="femm"), r"unknown stepper 'femm': choose one of .*springs"),
         (dict(readings="volts"), r"unknown readings 'volts': choose one of biotac, "),
         (dict(skin="/no/such/skin.npz"), r"no skin at .*skin.npz"),
+        (dict(skin=3), r"skin is 3: pass one of coarse"),
+        (dict(body=None), r"no place is given: pass site= or body=; body='world'"),
+        (dict(pos=(0, 0)), r"pos is \(0, 0\): give 3 numbers"),
+        (dict(pos=(0, 0, np.nan)), r"pos .* has an element that is nan: give a finite number"),
+        (dict(quat=(0, 0, 0, 0)), r"quat is zero: give a rotation"),
+        (dict(quat=(1, 0, np.inf, 0)), r"quat .* has an element that is inf"),
+        (dict(prefix=None), r"prefix is None: give a text"),
+        (dict(liquid="no"), r"liquid is 'no': give True or False"),
+        (dict(geoms="cup"), r"geoms is 'cup': give a list of names"),
+        (dict(rounding={"cup": -1e-3}), r"rounding of 'cup' is -0.001: give a finite number >= 0"),
+        (dict(rounding=1e-3), r"rounding is 0.001: give a dict"),
+        (dict(friction="high"), r"the skin's friction is 'high': give a finite number >= 0"),
+        (dict(priority=0.5), r"priority is 0.5: give a whole number"),
+        (dict(seed=-1), r"seed is -1: give a whole number from 0"),
+        (dict(slots=-1), r"slots is -1: give a whole number from 0"),
+        (dict(on_error="ignore"), r"unknown on_error 'ignore': choose one of warn, raise"),
+        (dict(device="cuda:99"), r"no device 'cuda:99' on this machine: it has .*cpu"),
+        (dict(stepper=None), r"stepper is None: give its name"),
+        (dict(options=[]), r"options is \[\]: give a dict"),
+        (FEM | dict(options={"effects": 1}), r"options has 'effects': choose from skin, modulus, readings"),
+        (FEM | dict(options={"skin": {"tol": 1}}), r"options\['skin'\] has 'tol'"),
+        (
+            FEM | dict(options={"modulus": [1.0]}),
+            r"modulus has shape \(1,\): give one factor for each of the",
+        ),
+        (FEM | dict(options={"modulus": "/no/such.npy"}), r"no modulus at /no/such.npy"),
+        (FEM | dict(options={"readings": {"nois": 1}}), r"readings has 'nois': choose from noise, sensor"),
+        (FEM | dict(options={"readings": {"noise": "a"}}), r"noise of the readings is 'a'"),
+        (FEM | dict(options={"readings": {"sensor": "9"}}), r"sensor is '9': pass one of '1', '2', '3'"),
+        (FEM | dict(options={"readings": {"temperature": np.nan}}), r"temperature of the readings is nan"),
+        (FEM | dict(material={"youngs_modulus": np.nan}), r"youngs_modulus is nan"),
+        (FEM | dict(tier="condensed", options={"skin": {"dynamics": "implicit"}}), r"has no inertia"),
     ],
 )
-def test_bad_settings(settings, text):
+def test_bad_settings_are_refused_at_once(settings, text):
+    """... and leave the spec as it was."""
+    spec = spec_of()
+    before = spec.to_xml()
     with pytest.raises((ValueError, FileNotFoundError), match=text):
-        springs(spec_of(), **settings)
+        springs(spec, **settings)
+    assert spec.to_xml() == before
+
+
+def test_what_is_no_spec_is_refused():
+    with pytest.raises(TypeError, match="spec is MjModel: pass a mujoco.MjSpec"):
+        springs(spec_of().compile(), body="hand")
+
+
+def test_packages_that_are_missing_are_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "biotac_mj.learning.serve", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"needs torch: pip install 'biotac-mj\[learning\]'"):
+        springs(spec_of(), **FEM | {"readings": "latent_projection"})
 
 
 def test_a_prefix_serves_one_biotac():
@@ -350,8 +401,8 @@ def test_dm_control_loads_and_steps_it(tmp_path):
 def test_nodes_of_the_skin_from_the_handle():
     """`Handle.vert_xpos` gives the skin at rest, and of the right BioTac where there are two."""
     spec = mujoco.MjSpec()
-    a = biotac_mj.attach(spec, prefix="a_", skin="coarse")
-    b = biotac_mj.attach(spec, prefix="b_", skin="default", pos=(0, 0, 1))
+    a = biotac_mj.attach(spec, body="world", prefix="a_", skin="coarse")
+    b = biotac_mj.attach(spec, body="world", prefix="b_", skin="default", pos=(0, 0, 1))
     model = spec.compile()
     data = mujoco.MjData(model)
     for handle, skin in ((a, "coarse"), (b, "default")):

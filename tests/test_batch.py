@@ -110,7 +110,7 @@ def impact_spec():
 def make(spec, nworld, body=None, skin=None, **settings):
     """mjm, m, d and the Batch of a spec."""
     skin = skin or shell()
-    batches.add(spec, body=body, skin=skin)
+    batches.add(spec, body=body or "world", skin=skin)
     if body is not None:  # all mass where the joint is: MuJoCo's own integration of a free body errs without
         spec.body("biotac_core").mass, spec.body("biotac_core").fullinertia = 1e-7, [1e-13] * 3 + [0.0] * 3
     mjm = spec.compile()
@@ -167,7 +167,7 @@ def single(pos, skin, settings):
     """Force (nstep, 6), electrodes, pdc and status of one world by the engine plugin over the poses pos
     (nstep, 3)."""
     spec = press_spec()
-    handle = biotac_mj.attach(spec, skin=skin, **settings)
+    handle = biotac_mj.attach(spec, body="world", skin=skin, **settings)
     model = spec.compile()
     data = mujoco.MjData(model)
     rows = []
@@ -314,7 +314,7 @@ def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
     np.testing.assert_allclose(read(mjm, d, "contact_force")[:, 1], weight, rtol=5e-3)
     assert np.abs(d.qvel.numpy()).max() < 2e-4 and np.abs(d.qfrc_constraint.numpy()).max() < 0.01 * weight
     spec = ball_spec()
-    handle = biotac_mj.attach(spec, skin=shell(), readings="none")
+    handle = biotac_mj.attach(spec, body="world", skin=shell(), readings="none")
     model = spec.compile()
     data = mujoco.MjData(model)
     for _ in range(150):
@@ -483,7 +483,7 @@ def test_a_ball_between_two_biotacs_feels_both():
     spec.body("ball").first_joint().damping = [0.3, 0, 0]
     across = {"pos": [0, -2 * (7e-3 + RADIUS) + 6e-4, 0], "quat": [0, 1, 0, 0]}  # its pad looks along +y
     for prefix, pose in (("biotac_", {}), ("other_", across)):
-        batches.add(spec, skin=shell(), prefix=prefix, **pose)
+        batches.add(spec, body="world", skin=shell(), prefix=prefix, **pose)
     mjm = spec.compile()
     data = mujoco.MjData(mjm)
     mujoco.mj_forward(mjm, data)
@@ -551,7 +551,7 @@ def test_an_inactive_batch_changes_nothing():
 
 def test_a_callback_that_was_there_is_kept():
     spec = ball_spec()
-    batches.add(spec, skin=shell())
+    batches.add(spec, body="world", skin=shell())
     mjm = spec.compile()
     m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1)
     seen = []
@@ -578,13 +578,13 @@ def test_errors_say_what_to_do():
         "the model's bodies are world, ball",
     ):
         attach(spec.compile())
-    batches.add(spec, skin=shell())
+    batches.add(spec, body="world", skin=shell())
     with pytest.raises(ValueError, match="prefix 'biotac_' is taken"):
-        batches.add(spec, skin=shell())
+        batches.add(spec, body="world", skin=shell())
     mjm = spec.compile()
     with pytest.raises(ValueError, match="2 materials for 3 worlds: pass one for each"):
         attach(mjm, 3, material=["default"] * 2)
-    with pytest.raises(ValueError, match=r"friction has shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"friction is \[0.1, 0.2\] of shape \(2,\)"):
         attach(mjm, 3, friction=[0.1, 0.2])
     with pytest.raises(ValueError, match="worlds cannot differ in 'adhesive': choose from"):
         attach(mjm, 3, worlds={"adhesive": 0.1})
@@ -606,11 +606,11 @@ def test_errors_say_what_to_do():
             )
         else:
             other.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
-        batches.add(other, skin=shell())
+        batches.add(other, body="world", skin=shell())
         with pytest.raises(ValueError, match=text):
             attach(other.compile())
     crowded = ball_spec()
-    batches.add(crowded, skin=shell(), coupling="one-way")
+    batches.add(crowded, body="world", skin=shell(), coupling="one-way")
     with pytest.raises(
         ValueError,
         match="no room for two-way coupling of the BioTac 'biotac_' with ball: add it after the objects",
@@ -621,7 +621,7 @@ def test_errors_say_what_to_do():
 def test_strong_damping_is_warned_of():
     spec = ball_spec(mass=0.001)
     spec.body("ball").first_joint().damping, spec.body("ball").first_joint().name = [1.0, 0, 0], "slide"
-    batches.add(spec, skin=shell())
+    batches.add(spec, body="world", skin=shell())
     with pytest.warns(
         UserWarning,
         match=r"joint 'slide' is damped strongly \(time step x damping / inertia = 2\): .* smaller steps",

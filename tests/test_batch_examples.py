@@ -56,6 +56,7 @@ def test_poses_between_the_steps_of_another_simulator():
     exact = {"skin": {"tolerance": 1e-5}}
     handle = biotac_mj.attach(
         spec,
+        body="world",
         skin=shell(),
         readings="none",
         coupling="one-way",
@@ -66,7 +67,9 @@ def test_poses_between_the_steps_of_another_simulator():
     model = spec.compile()
     data = mujoco.MjData(model)
     plain = press_spec()
-    batch.add(plain, skin=shell(), coupling="one-way", pos=[0.01, 0.02, 0.03], quat=[0.8, 0.6, 0, 0])
+    batch.add(
+        plain, body="world", skin=shell(), coupling="one-way", pos=[0.01, 0.02, 0.03], quat=[0.8, 0.6, 0, 0]
+    )
     mjm = plain.compile()
     skins = batch.make(mjm, 2, device="cpu", skin=shell(), readings=False, options=exact)
     frame = np.array([[1, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]])
@@ -95,7 +98,7 @@ def test_poses_between_the_steps_of_another_simulator():
 
 def test_wp_arrays_are_taken_as_they_are():
     spec = ball_spec()
-    batch.add(spec, skin=shell(), coupling="one-way")
+    batch.add(spec, body="world", skin=shell(), coupling="one-way")
     mjm = spec.compile()
     skins = batch.make(mjm, 1, device="cpu", skin=shell(), readings=False)
     data = mujoco.MjData(mjm)

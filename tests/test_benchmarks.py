@@ -31,6 +31,15 @@ def accuracy(repo):
     sys.path.remove(str(repo / "benchmarks"))
 
 
+@pytest.mark.slow
+def test_models_are_freed(repo, tmp_path):
+    """Each cycle's model is of 20 MB and more."""
+    done = _run(repo, "lives.py", "--cycles", 20, "--json", tmp_path / "out.json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert len(found["memory_mb"]) == 21 and found["growth_mb"] < 50
+
+
 def test_accuracy_of_stored_cases(repo, shared, tmp_path):
     cases = tmp_path / "cases"
     cases.mkdir()

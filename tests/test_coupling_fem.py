@@ -282,7 +282,9 @@ def two_biotacs(**settings):
     )
     for i in range(2):
         settings = dict(skin="coarse", friction=0.3, seed=i) | settings
-        biotac_mj.attach(spec, pos=[APEX[0] + 0.04 * i, 0, 0], quat=PAD_UP, prefix=f"b{i}_", **settings)
+        biotac_mj.attach(
+            spec, body="world", pos=[APEX[0] + 0.04 * i, 0, 0], quat=PAD_UP, prefix=f"b{i}_", **settings
+        )
     return spec.compile()
 
 
@@ -427,7 +429,9 @@ def test_a_mesh_with_a_hole_presses_around_the_hole():
     body = spec.worldbody.add_body(name="ring", pos=[0, 0, TOP], quat=PAD_UP)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -1, 0], damping=[damping, 0, 0])
     body.add_geom(name="ring", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ring", mass=mass)
-    handle = biotac_mj.attach(spec, quat=PAD_UP, pos=APEX, skin="coarse", readings="none", friction=0.3)
+    handle = biotac_mj.attach(
+        spec, body="world", quat=PAD_UP, pos=APEX, skin="coarse", readings="none", friction=0.3
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 50)

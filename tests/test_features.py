@@ -153,8 +153,8 @@ def pin():
 def by_attach(material, options, file, worlds=None, tier="full", device="cpu"):
     spec = pin()
     handle = biotac_mj.attach(
-        spec, skin=file, material=material, liquid=None, options=options, tier=tier, readings="none",
-        coupling="one-way", device=device,
+        spec, body="world", skin=file, material=material, liquid=None, options=options, tier=tier,
+        readings="none", coupling="one-way", device=device,
     )  # fmt: skip
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -174,7 +174,7 @@ def by_batch(material, options, file, worlds=None):
 
     materials, values, _ = differing(material, worlds)
     spec = pin()
-    batches.add(spec, skin=shell(), coupling="one-way")
+    batches.add(spec, body="world", skin=shell(), coupling="one-way")
     mjm = spec.compile()
     with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
         m, d = mjw.put_model(mjm), mjw.put_data(mjm, mujoco.MjData(mjm), nworld=2)

@@ -575,7 +575,7 @@ def test_a_ball_rests_with_its_weight():
     ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0])
     quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
     handle = biotac_mj.attach(
-        spec, quat=quat, skin="coarse", geoms=["ball"], tier="condensed", readings="none"
+        spec, body="world", quat=quat, skin="coarse", geoms=["ball"], tier="condensed", readings="none"
     )
     model = spec.compile()
     data = mujoco.MjData(model)

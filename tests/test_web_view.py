@@ -157,7 +157,9 @@ def test_a_model_is_shown_while_it_steps():
         '<mujoco><option timestep="0.01"/><worldbody><body mocap="true" pos="-.01 -.0175 0"><geom '
         'size=".01"/></body></worldbody></mujoco>'
     )
-    handle = biotac_mj.attach(spec, skin=spring_skin.pad_geometry(), stepper="springs", readings="sum")
+    handle = biotac_mj.attach(
+        spec, body="world", skin=spring_skin.pad_geometry(), stepper="springs", readings="sum"
+    )
     model = spec.compile()
     page = web_view.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
     try:

@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import _add_slots, _check_place, _model
+from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _model
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE
+from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
@@ -50,7 +51,7 @@ def add(
     Args:
       spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can
         touch and move against the BioTac now, and names those that have no name.
-      site, body: name of the site or the body it is fixed to; neither is the world.
+      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds.
       skin: as for `biotac_mj.attach`; give `attach` the same.
@@ -61,10 +62,12 @@ def add(
       prefix.
 
     Raises:
-      ValueError: unknown site or body; the prefix is taken. FileNotFoundError: no such skin.
+      ValueError: unknown site or body, or none given; the prefix is taken. FileNotFoundError: no such skin.
     """
-    _check_place(spec, site, body, prefix)
-    own = spec.site(site).parent if site is not None else spec.worldbody if body is None else spec.body(body)
+    _check_place(spec, site, body, prefix, pos, quat)
+    config = Config(coupling=coupling, geoms=geoms)
+    _check_geoms(spec, config.geoms or ())
+    own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
     child = _model(skin_reference(skin)[1])
     child.body("core").pos, child.body("core").quat = pos, quat
@@ -147,6 +150,8 @@ def attach(
         (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
         frictions that is not nworld.
     """
+    if not isinstance(mjm, mujoco.MjModel) or not hasattr(d, "qpos"):
+        raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
     settings = dict(
@@ -222,7 +227,7 @@ def make(
 def _skins(mjm, prefix, skin, nworld, device, settings):
     """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one
     BioTac."""
-    material, friction, priority = settings["material"], settings["friction"], int(settings["priority"])
+    material, friction, priority = settings["material"], settings["friction"], settings["priority"]
     materials = _materials(material, nworld)
     chosen = materials[0] if materials else read_material(material)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
@@ -230,7 +235,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     config = Config(
         skin=skin_reference(skin)[0],
         material=plain(chosen),
-        liquid=chosen.liquid if settings["liquid"] is None else bool(settings["liquid"]),
+        liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
         geoms=settings["geoms"],
         rounding=dict(settings["rounding"] or {}),
         friction=float(mu[0]),
@@ -238,12 +243,19 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         device=device,
         options=dict(settings["options"] or {}),
     )
-    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, prefix + "core")
+    if "readings" in config.options:
+        raise ValueError("options has 'readings': pass a batch its readings=")
+    core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
             f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
             f"the model's bodies are {names}"
+        )
+    shown = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
+    if shown >= 0 and mjm.skin_vertnum[shown] != len(np.unique(geometry.outer_face)):
+        raise ValueError(
+            f"the BioTac {prefix!r} has another skin than {geometry.name!r}: give add and attach one"
         )
     view = ModelView(mjm._address)
     touching = Touching(view, core, config)
@@ -283,9 +295,14 @@ def _materials(material, nworld):
 
 
 def _per_world(value, nworld, default):
-    out = np.asarray(default if value is None else value, float)
+    try:
+        out = np.asarray(default if value is None else value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"friction is {value!r}: pass finite numbers >= 0, one or ({nworld},)") from None
     if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
-        raise ValueError(f"friction has shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)")
+        raise ValueError(
+            f"friction is {value!r} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
+        )
     return np.broadcast_to(out, nworld)
 
 
@@ -304,6 +321,7 @@ def _sensor(mjm, name):
 
 
 def _check_model(mjm, coupling):
+    Config(coupling=coupling)
     if mjm.opt.integrator in (int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_DISCRETE)):
         raise ValueError(
             "a batch steps its skins once per step: choose the integrator implicitfast, implicit or Euler"
@@ -368,13 +386,20 @@ def _slots(mjm, m, d, touching, prefix):
 
 
 def _readings(choice, geometry, nworld, seed, device):
+    seeds = np.atleast_1d(seed)
+    if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
+        raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
     if choice is False:
         return None, None
     from ..sensor.acquisition import BatchAcquisition
     from ..sensor.film import BatchFilm, FilmConduction
+    from ..sensor.readings import check_settings
 
-    settings = {} if choice is True else dict(choice)
-    if settings.pop("signal", "physics") != "physics":
+    settings = {} if choice is True else {**check_settings(choice, more=("signal", "weights"))}
+    signal = settings.pop("signal", "physics")
+    if signal not in SIGNALS:
+        raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
+    if signal != "physics":
         from ..learning.serve import LearnedBatchFilm
 
         film = LearnedBatchFilm(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.resources
+import importlib.util
 import pathlib
 import typing
 import weakref
@@ -12,8 +13,8 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
-from .config import PLUGIN_NAME, Config
-from .stepper import check_names
+from .config import PLUGIN_NAME, Config, integer, real
+from .stepper import check_names, make_readings
 
 if typing.TYPE_CHECKING:
     from ..skin import Material
@@ -99,13 +100,14 @@ def attach(
     readings: str = "biotac",
     options: dict | None = None,
     slots: int | None = None,
+    on_error: str = "warn",
 ) -> Handle:
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
     Args:
       spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching
         bodies as there are now (see `slots`).
-      site, body: name of the site or the body it is fixed to; neither is the world.
+      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds, so that a model may hold several.
       skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
@@ -114,18 +116,20 @@ def attach(
       liquid, friction: None takes the material's choice.
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "readings": of the sensor.
-      coupling, geoms, rounding, priority, seed, device, stepper, tier, readings: see `Config`.
+        elements' centroids; "readings": of the sensor (noise, sensor, film_every_step, temperature; weights).
+      coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
 
     Raises:
-      ValueError: unknown site, body, coupling, geom or skin; the prefix is taken; site and body both given.
-      FileNotFoundError: no such file.
+      ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that is not
+        there; the prefix is taken. The spec is as it was then.
+      TypeError: spec is no MjSpec. FileNotFoundError: no such file.
+      ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
-    _check_place(spec, site, body, prefix)
+    _check_place(spec, site, body, prefix, pos, quat)
     text, geometry = skin_reference(skin)
     from ..skin.settings import plain
 
-    material, options = plain(material), plain(dict(options or {}), geometry)
+    material, options = plain(material), plain({} if options is None else options, geometry)
     if stepper == "fem":
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
@@ -134,31 +138,22 @@ def attach(
         tier=tier,
         readings=readings,
         material=material,
-        liquid=liquid is None or bool(liquid),
+        liquid=True if liquid is None else liquid,
         coupling=coupling,
         geoms=geoms,
-        rounding=dict(rounding or {}),
-        priority=int(priority),
-        seed=int(seed),
+        rounding={} if rounding is None else rounding,
+        priority=priority,
+        seed=seed,
         device=device,
         options=options,
-        **({} if friction is None else {"friction": float(friction)}),
+        on_error=on_error,
+        **({} if friction is None else {"friction": friction}),
     )
-    check_names(config)
-    if stepper == "fem":
-        from .fem import skin_settings
-
-        skin_settings(config)  # refuses unknown or wrong ones
-    if stepper == "fem" and tier == "condensed":
-        _refuse_condensed(config)
-    names = [g.name for g in spec.geoms]
-    for name in (*(config.geoms or ()), *config.rounding):
-        if name not in names:
-            raise ValueError(
-                f"no geom {name!r} to touch: the model has "
-                f"{', '.join(n for n in names if n) or 'no named geom'}"
-            )
-    if slots is None:
+    _check(config, geometry)
+    _check_geoms(spec, (*(config.geoms or ()), *config.rounding))
+    if slots is not None:
+        slots = integer("slots", slots, 0)
+    else:
         slots = max(
             4, len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
         )
@@ -167,8 +162,7 @@ def attach(
     if site is not None:
         spec.attach(child, site=spec.site(site), prefix=prefix)
     else:
-        parent = spec.worldbody if body is None else spec.body(body)
-        spec.attach(child, frame=parent.add_frame(), prefix=prefix)
+        spec.attach(child, frame=spec.body(body).add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
     _collide(spec, core, config)
     _activate(spec, core, prefix + "skin", config)
@@ -184,17 +178,43 @@ def _material_choices(material, liquid, friction):
     return chosen.liquid if liquid is None else liquid, chosen.friction if friction is None else friction
 
 
-def _refuse_condensed(config):
-    from ..skin.condensed.refusals import refuse
-    from .fem import skin_settings
+def _check(config, geometry):
+    """What would fail in the plugin's first call, or on the way of the readings."""
+    check_names(config)
+    make_readings(config, geometry)
+    if config.stepper == "fem":
+        from ..skin.condensed.refusals import refuse
+        from ..skin.model import check_modulus
+        from .fem import skin_settings
 
-    material, options, modulus = skin_settings(config)
-    rubber = (*([] if modulus is None else ["modulus"]), *material.extensions)
-    liquid = config.liquid if options.liquid is None else options.liquid
-    refuse(rubber, options, liquid, config.device.startswith("cuda"))
+        material, options, modulus = skin_settings(config)
+        liquid = config.liquid if options.liquid is None else options.liquid
+        if config.tier == "condensed":
+            rubber = (*([] if modulus is None else ["modulus"]), *material.extensions)
+            refuse(rubber, options, liquid, config.device.startswith("cuda"))
+        if modulus is not None:
+            check_modulus(modulus, len(geometry.elem), f"{len(geometry.elem)} elements of {geometry.name!r}")
+    if config.device != "cpu":
+        _check_device(config.device)
 
 
-def _check_place(spec, site, body, prefix):
+def _check_device(name):
+    import warp
+
+    try:
+        found = warp.get_device(name)
+    except (ValueError, RuntimeError):
+        there = ", ".join(device.alias for device in warp.get_devices())
+        raise ValueError(f"no device {name!r} on this machine: it has {there}") from None
+    if found.is_cuda and importlib.util.find_spec("torch") is None:
+        raise ModuleNotFoundError(f"device {name!r} needs torch: pip install 'biotac-mj[cuda]'")
+
+
+def _check_place(spec, site, body, prefix, pos, quat):
+    if not isinstance(spec, mujoco.MjSpec):
+        raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
+    if site is None and body is None:
+        raise ValueError("no place is given: pass site= or body=; body='world' fixes the BioTac to the world")
     if site is not None and body is not None:
         raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
@@ -203,10 +223,29 @@ def _check_place(spec, site, body, prefix):
                 f"no {kind} {name!r} to attach to: the model has "
                 f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
             )
+    for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
+        if np.shape(value) != (size,):
+            raise ValueError(f"{what} is {value!r}: give {size} numbers")
+        for number in value:
+            real(f"{what} {value!r} has an element that", number)
+    if not np.any(quat):
+        raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
+    if not isinstance(prefix, str):
+        raise ValueError(f"prefix is {prefix!r}: give a text that the BioTac's names begin with")
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(
             f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
         )
+
+
+def _check_geoms(spec, wanted):
+    names = [g.name for g in spec.geoms]
+    for name in wanted:
+        if name not in names:
+            raise ValueError(
+                f"no geom {name!r} to touch: the model has "
+                f"{', '.join(n for n in names if n) or 'no named geom'}"
+            )
 
 
 def _model(geometry):

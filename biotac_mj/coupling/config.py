@@ -3,11 +3,14 @@
 import dataclasses
 import json
 import math
+import numbers
 from collections.abc import Callable
 
-from ..fields import check_entries, check_types, refuse_unknown
+import numpy as np
 
-__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "Config"]
+from ..fields import check_entries, refuse_unknown
+
+__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "Config", "integer", "real"]
 
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
@@ -15,6 +18,24 @@ TIERS = ("full", "condensed")
 # what options["readings"] may have
 _SENSOR = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float}
 READINGS = {"biotac": _SENSOR, "latent_projection": {"weights": str | None, **_SENSOR}}
+ON_ERROR = ("warn", "raise")
+
+
+def real(what: str, value: object, least: float = -math.inf) -> float:
+    """A finite number; raises ValueError for anything else, or where it is below `least`."""
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not good or value < least:
+        more = "" if least == -math.inf else f" >= {least:g}"
+        raise ValueError(f"{what} is {value!r}: give a finite number{more}")
+    return float(value)
+
+
+def integer(what: str, value: object, least: int = -(2**31), most: int = 2**31 - 1) -> int:
+    """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
+    if not good or not least <= value <= most:
+        raise ValueError(f"{what} is {value!r}: give a whole number from {least} to {most}")
+    return int(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +62,8 @@ class Config:
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
         and "readings".
+      on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
+        on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
 
     skin: str = "default"
@@ -57,27 +80,42 @@ class Config:
     seed: int = 0
     device: str = "cpu"
     options: dict = dataclasses.field(default_factory=dict)
+    on_error: str = "warn"
 
     def __post_init__(self):
-        if self.geoms is not None:
-            object.__setattr__(self, "geoms", tuple(self.geoms))
-        check_types(self)
-        if self.coupling not in COUPLINGS:
-            raise ValueError(f"unknown coupling {self.coupling!r}: choose one of {', '.join(COUPLINGS)}")
-        if self.tier not in TIERS:
-            raise ValueError(f"unknown tier {self.tier!r}: choose one of {', '.join(TIERS)}")
+        for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
+            if (value := getattr(self, name)) not in choices:
+                raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(choices)}")
+        for name in ("skin", "stepper", "readings", "device"):
+            if not isinstance(value := getattr(self, name), str):
+                raise ValueError(f"{name} is {value!r}: give its name")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
-        if not 0 <= self.friction < math.inf:
-            raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
+        if self.liquid not in (True, False):
+            raise ValueError(f"liquid is {self.liquid!r}: give True or False")
+        if self.geoms is not None:
+            listed = isinstance(self.geoms, (list, tuple, set, np.ndarray))
+            if not listed or not all(isinstance(name, str) for name in self.geoms):
+                raise ValueError(f"geoms is {self.geoms!r}: give a list of names")
+            self._set("geoms", tuple(self.geoms))
+        for name in ("rounding", "options"):
+            if not isinstance(getattr(self, name), dict):
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
+        self._set("friction", real("the skin's friction", self.friction, 0.0))
+        self._set("priority", integer("priority", self.priority))
+        self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
+        self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem" and self.readings in READINGS:  # others have options of their own
             refuse_unknown(self.options, ("skin", "modulus", "readings"), "options")
             wanted = READINGS[self.readings]
             given = check_entries("options['readings']", self.options.get("readings", {}), wanted, wanted)
             refuse_unknown(given, wanted, "options['readings']")
+
+    def _set(self, name, value):
+        object.__setattr__(self, name, value)
 
     def strings(self) -> dict:
         """Attribute name -> JSON text; `parse` reads it back."""

@@ -15,6 +15,7 @@ from ..skin.rubber.memory import RubberMemory
 from ..skin.settings import Settings, read_settings
 from ..skin.types import vec3
 from .config import Config
+from .shared import Shared
 from .stepper import Geom, SkinResult
 
 __all__ = ["FemStepper", "rest_geometry", "shared_model", "skin_settings"]
@@ -311,7 +312,7 @@ def _grid(vert, face):
     )
 
 
-_models = {}
+_models = Shared(keep=2)
 
 
 def shared_model(geometry: SkinGeometry, settings: Settings, device: str) -> SkinModel:
@@ -321,6 +322,4 @@ def shared_model(geometry: SkinGeometry, settings: Settings, device: str) -> Ski
     mesh = (array.tobytes() for array in (geometry.vert, geometry.elem, geometry.fixed))
     uneven = modulus if modulus is None or callable(modulus) else modulus.tobytes()
     key = (*mesh, rubber, options, uneven, device)
-    if key not in _models:
-        _models[key] = SkinModel(geometry, rubber, options, device, modulus=modulus)
-    return _models[key]
+    return _models.get(key, lambda: SkinModel(geometry, rubber, options, device, modulus=modulus))

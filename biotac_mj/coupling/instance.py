@@ -7,6 +7,7 @@ it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see not
 import ctypes
 import dataclasses
 import functools
+import gc
 import threading
 
 import mujoco
@@ -17,6 +18,7 @@ from ..geometry.rigid import displace, displacement
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
+from .shared import Shared
 from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
 from .touching import Touching, forget_notes
@@ -48,6 +50,12 @@ class _Skin:
         self.lock = threading.Lock()
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
 
+    def __del__(self, collect=gc.collect):
+        # recorded launches and what they work on refer to each other in circles: few objects, so that Python
+        # would look for them late, and much memory
+        self.__dict__.clear()
+        collect()
+
     @functools.cached_property
     def thickness(self):
         geometry = self.geometry
@@ -62,35 +70,19 @@ class _Skin:
         return SkinResult(None, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.stepper.vert_xpos(state).copy())
 
 
-class _SkinKey:
-    def __init__(self, config, touching):
-        self.config, self.geoms = config, touching.geoms
-        self.key = (tuple(config.strings().items()), touching.key())
-
-    def __hash__(self):
-        return hash(self.key)
-
-    def __eq__(self, other):
-        return self.key == other.key
-
-
-@functools.lru_cache(maxsize=8)
-def _cached_skin(key):
-    return _Skin(key.config, key.geoms)
-
-
-_cache_lock = threading.RLock()
+# MuJoCo asks a model that it compiles for the size of its states and lets go of it: the skins of a hand
+# should last until its mjData is made
+_skins = Shared(keep=8)
 
 
 def _skin(config, touching):
-    with _cache_lock:  # lru_cache alone would let two threads build the same skin
-        return _cached_skin(_SkinKey(config, touching))
+    key = (tuple(config.strings().items()), touching.key())
+    return _skins.get(key, lambda: _Skin(config, touching.geoms))
 
 
 def forget_skins() -> None:
     """Makes the next model build its skins anew; those of living models stay."""
-    with _cache_lock:
-        _cached_skin.cache_clear()
+    _skins.forget()
 
 
 class Setup:

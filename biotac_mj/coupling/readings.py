@@ -7,7 +7,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction
-from ..sensor.readings import PhysicsReadings
+from ..sensor.readings import PhysicsReadings, check_settings
 from .config import Config
 from .fem import rest_geometry
 
@@ -24,7 +24,7 @@ class SensorReadings:
 
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
-        self._options = dict(config.options.get("readings", {}))
+        self._options = check_settings(config.options.get("readings", {}))
         self.nstate = Acquisition.nstate
 
     @functools.cached_property

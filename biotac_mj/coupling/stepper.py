@@ -169,7 +169,14 @@ def register_readings(name: str, factory: Callable) -> None:
 def _factory(table, name):
     if isinstance(table[name], str):
         module, attribute = table[name].split(":")
-        return getattr(importlib.import_module(module), attribute)
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except ModuleNotFoundError as error:
+            if error.name not in ("torch", "safetensors"):
+                raise
+            raise ModuleNotFoundError(
+                f"{name!r} needs {error.name}: pip install 'biotac-mj[learning]'", name=error.name
+            ) from None
     return table[name]
 
 

@@ -32,6 +32,10 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
     Raises:
       FileNotFoundError, ValueError: no such skin.
     """
+    if not isinstance(skin, (SkinGeometry, str, os.PathLike)):
+        raise ValueError(
+            f"skin is {skin!r}: pass one of {', '.join(SKINS)}, a stored skin's file or a SkinGeometry"
+        )
     if not isinstance(skin, SkinGeometry):
         text = os.fspath(skin)
         if text.endswith(".npz"):

@@ -10,6 +10,7 @@ import torch
 
 from ..sensor.acquisition import Acquisition
 from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, impedance_from_counts
+from ..sensor.readings import check_settings
 from .weights import load_forward, shipped, window_of
 
 if typing.TYPE_CHECKING:
@@ -46,13 +47,12 @@ class NetworkReadings:
         film_every_step: bool = False,
         temperature: float = REST_TEMPERATURE,
     ):
-        if sensor not in REST_COUNTS:
-            raise ValueError(f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
+        check_settings({"sensor": sensor})
         self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
         self.temperature = temperature
         self._weights, self._geometry = weights or shipped("forward"), geometry
         self._rest = impedance_from_counts(REST_COUNTS[sensor])
-        self._memory = window_of(self._weights)
+        self._memory = window_of(self._weights, geometry)
         self.nstate = Acquisition.nstate + 1 + int(np.prod(self._memory))
 
     @functools.cached_property
@@ -105,9 +105,8 @@ class LearnedReadings:
     it."""
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
-        self._network = NetworkReadings(
-            geometry, seed=config.seed, **dict(config.options.get("readings", {}))
-        )
+        settings = check_settings(config.options.get("readings", {}), more=("weights",))
+        self._network = NetworkReadings(geometry, seed=config.seed, **settings)
         self.nstate = self._network.nstate
 
     @functools.cached_property

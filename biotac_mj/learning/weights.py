@@ -142,6 +142,11 @@ def _read(path, names=None):
 
 def _load(path, geometry, direction):
     meta, tensors = _read(path)
+    _refuse_other(meta, path, geometry, direction)
+    return meta, tensors
+
+
+def _refuse_other(meta, path, geometry, direction):
     if not isinstance(meta, dict) or meta.get("format") != _FORMAT or meta.get("direction") != direction:
         raise ValueError(
             f"{path} holds no {direction} model of {_FORMAT}: "
@@ -158,7 +163,6 @@ def _load(path, geometry, direction):
             f"{geometry.name!r} with "
             f"{geometry.nvert}: take that skin, or train on this one"
         )
-    return meta, tensors
 
 
 def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel":
@@ -181,12 +185,13 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
     return model.eval()
 
 
-def window_of(path: pathlib.Path | str) -> tuple:
+def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
     """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has
-    none."""
+    none; raises as `load_forward` where it is not for this skin."""
     from .features import FilmFeatures
 
     meta = describe(path)
+    _refuse_other(meta, path, geometry, "forward")
     return (len(meta["window"]), NELECTRODE, FilmFeatures.count) if meta.get("window") else (0,)
 
 

@@ -53,12 +53,9 @@ def press(
     indenter = make_indenter(options.indenter)
     path = plan_path(_at_rest(geometry, options), indenter, options)
     spec, handle = build_scene(indenter, path, options)
-    try:
+    with plugin.explained():
         model = spec.compile()
         data = mujoco.MjData(model)
-    except (ValueError, mujoco.FatalError):
-        plugin.check()  # says why, where MuJoCo only says that
-        raise
     rows, picture = [], None
     last = len(path.depth) - 1
     begin = time.perf_counter()
@@ -71,7 +68,6 @@ def press(
         else:
             data.mocap_pos[0] = path.position(*travel)
             mujoco.mj_step(model, data)
-        plugin.check()
         rows.append(
             (
                 data.time,

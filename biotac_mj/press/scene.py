@@ -73,6 +73,7 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
         seed=options.seed,
         device=options.device,
         options=read_dict(options.options, "options"),
+        on_error="raise",
     )
     see_through(spec, handle)
     return spec, handle

@@ -21,8 +21,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from biotac_mj.calm import calm_warp
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE, NPAC
+
+calm_warp()
 
 __all__ = [
     "Acquisition",

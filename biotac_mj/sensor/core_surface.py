@@ -4,6 +4,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from biotac_mj.calm import calm_warp
+
+calm_warp()
+
 __all__ = ["Core", "CoreSurface", "nearest_on_core"]
 
 wp.set_module_options({"enable_backward": False})

@@ -1,14 +1,19 @@
 """What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for
 stored motions."""
 
+import math
+import numbers
+
 import numpy as np
 
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
-from biotac_mj.sensor.channels import REST_TEMPERATURE
+from biotac_mj.sensor.channels import REST_COUNTS, REST_TEMPERATURE
 from biotac_mj.sensor.film import FilmConduction
 
-__all__ = ["PhysicsReadings", "record"]
+__all__ = ["PhysicsReadings", "check_settings", "record"]
+
+_SETTINGS = ("noise", "sensor", "film_every_step", "temperature")
 
 
 class PhysicsReadings:
@@ -79,6 +84,29 @@ class PhysicsReadings:
     def readings(self, state: np.ndarray) -> dict:
         """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""
         return self.acquisition.readings(state)
+
+
+def check_settings(given: dict, more: tuple[str, ...] = ()) -> dict:
+    """Settings of `PhysicsReadings`, given by name, as they are.
+
+    Args:
+      given: of noise, sensor, film_every_step, temperature. more: further names.
+
+    Raises:
+      ValueError: not a dict, another name, or a value that cannot be.
+    """
+    if not isinstance(given, dict):
+        raise ValueError(f"readings is {given!r}: give a dict of {', '.join(_SETTINGS + more)}")
+    for name, value in given.items():
+        if name not in _SETTINGS + more:
+            raise ValueError(f"readings has {name!r}: choose from {', '.join(_SETTINGS + more)}")
+        if name in ("noise", "film_every_step") and value not in (True, False):
+            raise ValueError(f"{name} of the readings is {value!r}: give True or False")
+        if name == "sensor" and value not in list(REST_COUNTS):
+            raise ValueError(f"sensor is {value!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
+        if name == "temperature" and not (isinstance(value, numbers.Real) and math.isfinite(value)):
+            raise ValueError(f"temperature of the readings is {value!r}: give a finite number of degrees C")
+    return given
 
 
 def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, pressure: np.ndarray) -> dict:

@@ -1,5 +1,6 @@
 """The skin: finite elements in Warp."""
 
+from ..calm import calm_warp
 from . import fill  # noqa: F401  tells SkinModel how its rest is solved
 from .contact.law import ContactLaw
 from .contact.shapes import bake_distance_grid
@@ -8,6 +9,8 @@ from .geoms import GeomSet
 from .model import SkinModel, SkinOptions
 from .rubber.material import PRESETS, Material, material
 from .step import launch_step, prepare_step, step
+
+calm_warp()
 
 __all__ = [
     "PRESETS",

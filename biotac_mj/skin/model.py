@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..calm import announce_compilation
 from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
@@ -27,7 +28,7 @@ from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
 from .types import real, vec3
 
-__all__ = ["SkinModel", "SkinOptions", "Surface", "solved_geometry"]
+__all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "solved_geometry"]
 
 # (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
 solve_rest = None
@@ -214,6 +215,7 @@ class SkinModel:
         self.material: Material = material(material_choice)
         self.options = options or SkinOptions()
         self.device = wp.get_device(device)
+        announce_compilation(self.device)
         self._cores, self._rest = {}, None
         self._elimination = None
         self.law = LAWS[self.material.law]
@@ -283,15 +285,7 @@ class SkinModel:
         else:
             factor, n = np.asarray(modulus, float), len(given.elem)
             what = f"{n} elements of {given.name!r}"
-        if factor.shape != (n,):
-            raise ValueError(
-                f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
-            )
-        if not (np.isfinite(factor) & (factor > 0)).all():
-            raise ValueError(
-                f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
-                "positive finite numbers"
-            )
+        check_modulus(factor, n, what)
         # the eight linear parts of a ten-node tetrahedron follow each other
         return np.repeat(factor, self.nelem // n)
 
@@ -402,6 +396,19 @@ class SkinModel:
     def _of_free(self, stiffness):
         dof = (3 * self.free[:, None] + np.arange(3)).ravel()
         return stiffness[dof][:, dof]
+
+
+def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
+    """Raises ValueError where factors on Young's modulus are not n positive numbers, one for each `what`."""
+    if factor.shape != (n,):
+        raise ValueError(
+            f"modulus has shape {factor.shape}: give one factor for each of the {what}, shape ({n},)"
+        )
+    if not (np.isfinite(factor) & (factor > 0)).all():
+        raise ValueError(
+            f"{(~(factor > 0) | ~np.isfinite(factor)).sum()} of the {n} factors of modulus are not "
+            "positive finite numbers"
+        )
 
 
 @functools.lru_cache(maxsize=8)

@@ -8,6 +8,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
+from ..coupling.config import real
 from .biotac import PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
@@ -79,6 +80,10 @@ class TouchTask(composer.Task, abc.ABC):
     ):
         if observe not in _OBSERVE:
             raise ValueError(f"unknown preset observe={observe!r}: choose one of {', '.join(_OBSERVE)}")
+        if not real("physics_timestep", physics_timestep) > 0:
+            raise ValueError(f"physics_timestep is {physics_timestep}: give positive seconds")
+        if not isinstance(biotac or {}, dict):
+            raise ValueError(f"biotac is {biotac!r}: give a dict of settings of a BioTac")
         self._arena, self.machine = arena(), machine
         self._arena.attach(machine)
         names = ["biotac"] if len(mounts) == 1 else [f"biotac_{i}" for i in range(len(mounts))]

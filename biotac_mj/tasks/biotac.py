@@ -9,6 +9,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
+from .. import plugin
 from ..sensor.channels import FULL_SCALE, OTHER_NOISE, electrode_noise
 
 __all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
@@ -69,6 +70,7 @@ class BioTac(composer.Entity):
         geoms=None,
         rounding=None,
         options=None,
+        on_error="raise",
         **settings,
     ):
         """
@@ -78,6 +80,7 @@ class BioTac(composer.Entity):
           slots: how many bodies of the whole model may touch it two-way.
           noise: whether the observables have the real sensor's noise.
           geoms, rounding: see `biotac_mj.coupling.Config`; names are those of the whole model.
+          on_error: "raise" ends the episode with what went wrong inside a step, "warn" goes on without touch.
           options, settings: further ones of `biotac_mj.attach`.
 
         Raises:
@@ -92,13 +95,26 @@ class BioTac(composer.Entity):
                     f"BioTac got {key}={settings[key]!r}: "
                     "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
-        options = {**(options or {})}
-        options["readings"] = {**options.get("readings", {}), "noise": False}
+        if isinstance(options or {}, dict):  # else `attach` says what is wrong
+            own = (options or {}).get("readings", {})
+            options = {
+                **(options or {}),
+                "readings": {**own, "noise": False} if isinstance(own, dict) else own,
+            }
         spec = mujoco.MjSpec()
         self.handle = attach(
-            spec, prefix=_PREFIX, skin=skin, tier=tier, slots=slots, options=options, **settings
+            spec,
+            body="world",
+            prefix=_PREFIX,
+            skin=skin,
+            tier=tier,
+            slots=slots,
+            options=options,
+            on_error=on_error,
+            **settings,
         )
-        spec.compile()
+        with plugin.explained():
+            spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())
         root.model = name
         for namespace in ("body", "geom", "mesh", "site", "sensor", "equality", "plugin", "deformable"):

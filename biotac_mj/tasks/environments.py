@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from gymnasium.utils import EzPickle
 
+from ..coupling.config import integer
 from ..view.offscreen import Offscreen, find_gl
 from . import suite
 
@@ -53,6 +54,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
+        width, height = integer("width", width, 1), integer("height", height, 1)
         self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
         if render_mode is not None:
             self._screen = Offscreen(self.suite.physics.model.ptr, width, height, find_gl())

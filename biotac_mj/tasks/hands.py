@@ -9,6 +9,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
+from ..coupling.config import integer
 from ..geometry.rigid import quaternion
 
 if typing.TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Mount:
           ValueError: tip and pad are not at right angles.
         """
         x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
-        if abs(x @ y) > 1e-6 or not x.any() or not y.any():
+        if not np.isfinite([*x, *y]).all() or abs(x @ y) > 1e-6 or not x.any() or not y.any():
             raise ValueError(
                 f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: "
                 "a BioTac's pad looks sideways"
@@ -146,8 +147,13 @@ def attach_to_hand(
 
     if hand == "shadow_hand_authentic":
         hand, variant = "shadow_hand", "authentic"
+    for name in ("site", "body", "pos", "quat"):
+        if name in settings:
+            raise ValueError(f"{name}={settings[name]!r} is given: a finger's place is its Mount's")
     mounts = _mounts(hand, variant)
-    fingers = tuple(mounts) if fingers is None else tuple(fingers)
+    fingers = tuple(mounts) if fingers is None else (fingers,) if isinstance(fingers, str) else tuple(fingers)
+    if not fingers:
+        raise ValueError(f"no finger is named: choose from {', '.join(mounts)}, or None for all")
     for finger in fingers:
         if finger not in mounts:
             raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
@@ -171,7 +177,7 @@ def attach_to_hand(
             if (g.contype or g.conaffinity) and g.parent.name not in names
         }
         slots = max(4, len(outside) + 1, len(names) if self_touch else 0)
-    handles, seed = {}, int(settings.pop("seed", 0))
+    handles, seed = {}, integer("seed", settings.pop("seed", 0), 0)
     for i, (finger, link) in enumerate(links.items()):
         handles[finger] = attach(
             spec,
@@ -190,6 +196,8 @@ def attach_to_hand(
 
 def _mounts(hand, variant):
     if not isinstance(hand, str):
+        if not isinstance(hand, dict) or not all(isinstance(mount, Mount) for mount in hand.values()):
+            raise ValueError(f"hand is {hand!r}: choose one of {', '.join(HANDS)}, or give {{finger: Mount}}")
         return dict(hand)
     if variant not in ("replace", "authentic"):
         raise ValueError(f"unknown variant {variant!r}: choose replace or authentic")

@@ -6,6 +6,9 @@ import typing
 
 import numpy as np
 
+from .. import plugin
+from ..coupling.config import real
+
 if typing.TYPE_CHECKING:
     from dm_control import composer
 
@@ -45,26 +48,31 @@ def environment(
       random: seed or RandomState of episodes and noise.
       time_limit: length of an episode [s]; None takes the task's.
       environment_kwargs: further arguments of `composer.Environment`.
-    """
-    import warp
 
-    warp.config.log_level = warp.LOG_WARNING
+    Raises:
+      ValueError: a setting that cannot be; TypeError: one that the task does not have.
+    """
+
+    if time_limit is not None:
+        real("time_limit", time_limit, 0.0)
     made = task(**settings)
     # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
     # forces that act in it
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
     # sums of time steps may fall short of it by rounding
     limit = (made.seconds if time_limit is None else time_limit) - 1e-6
-    env = _environment_class()(
-        made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
-    )
+    with plugin.explained():
+        env = _environment_class()(
+            made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
+        )
     env.arguments = dict(
         task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
     )
     state = env.random_state.get_state()
     # the first one compiles and draws noise that later ones do not: done here, so that a seed means one
     # episode
-    env.reset()
+    with plugin.explained():
+        env.reset()
     env.random_state.set_state(state)
     return env
 

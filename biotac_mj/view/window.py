@@ -59,7 +59,7 @@ def build_scene(
         conaffinity=0,
         rgba=[0.85, 0.45, 0.15, 0.6],
     )
-    handle = attach(spec, quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
+    handle = attach(spec, body="world", quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
     see_through(spec, handle)
     return spec, handle
 

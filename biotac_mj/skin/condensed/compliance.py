@@ -142,9 +142,9 @@ class SurfaceCompliance:
         """Whether rows (n,) are in the file; one that is damaged is written anew."""
         if self._file is not None and not self._file.check(coordinates):
             self._file = None
-            report_damage(self._path())
-            if self._write(self._path()):
-                self._file = self._read(self._path())
+            report_damage(self._path)
+            if self._write(self._path):
+                self._file = self._read(self._path)
         return self._file is not None
 
     def _block(self, c):
@@ -186,7 +186,7 @@ class SurfaceCompliance:
 
     def _open(self):
         """Rows mapped from the cache, written there first if need be; None where nothing can be written."""
-        path = self._path()
+        path = self._path
         return self._read(path) or (self._read(path) if self._write(path) else None)
 
     def _read(self, path):
@@ -212,7 +212,7 @@ class SurfaceCompliance:
         self._factor  # noqa: B018 - before there is a file
         return replace_file(path, write)
 
-    @functools.cache  # noqa: B019 - one for each model, which keeps it as long as it lives
+    @functools.cached_property
     def _path(self):
         def make():
             return {"stiffness": np.array(self._digest())}

@@ -86,11 +86,13 @@ _compliances = weakref.WeakKeyDictionary()
 
 
 def _compliance(model, outer, inner, direction, cache):
-    """The rows of a model, shared by all its skins."""
-    if cache not in _compliances.get(model, {}):
-        made = SurfaceCompliance(model, outer, inner, direction, cache)
-        _compliances.setdefault(model, {})[cache] = made
-    return _compliances[model][cache]
+    """The rows of a model, shared by all its skins and kept by them: they hold the model, so it must not hold
+    them."""
+    mine = _compliances.setdefault(model, weakref.WeakValueDictionary())
+    made = mine.get(cache)
+    if made is None:
+        made = mine[cache] = SurfaceCompliance(model, outer, inner, direction, cache)
+    return made
 
 
 def _key(memory):

@@ -1,0 +1,101 @@
+"""What a process keeps of models that are gone: its memory over cycles of attach, compile, step and delete.
+
+    python benchmarks/lives.py --cycles 1000 --json out/lives.json [--skin coarse] [--tiers full,condensed]
+
+Every cycle has a material of its own and the next of the tiers, and presses a ball into the skin for a few
+steps. Its caches on disk are a folder of its own. The memory is the resident one after a garbage collection,
+with what the allocator holds free given back; the first cycles, in which kernels are loaded and
+every tier has been at work, are not counted."""
+
+import argparse
+import ctypes
+import gc
+import os
+import pathlib
+import sys
+import tempfile
+import time
+
+__all__ = ["lives", "main", "resident"]
+
+WARM_UP, STEPS = 16, 3
+PLACE = (-12e-3, -11.5e-3, 0.0)  # of a ball of 3.5 mm, 0.2 mm in the pad [m]
+
+
+def resident() -> float:
+    """Megabytes of memory that this process holds, after a collection and without what is only kept free."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+    pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def live(number: int, tier: str, skin: str = "coarse") -> None:
+    """One model from attach to its end, with a material that no other has.
+
+    Raises:
+      RuntimeError: the ball did not touch.
+    """
+    import mujoco
+
+    import biotac_mj
+
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ball = spec.worldbody.add_body(name="ball", pos=PLACE)
+    ball.add_freejoint()
+    ball.add_geom(size=[3.5e-3, 0, 0], mass=0.01)
+    material = {"youngs_modulus": 5e5 * (1 + 1e-4 * number)}
+    handle = biotac_mj.attach(spec, body="world", skin=skin, tier=tier, material=material)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, STEPS)
+    if not abs(handle.read(data, "contact_force")[:3]).max() > 1e-3:
+        raise RuntimeError("the ball does not touch the skin")
+
+
+def lives(
+    cycles: int, tiers: tuple[str, ...] = ("full", "condensed"), skin: str = "coarse", every: int = 1
+) -> list[tuple[int, float]]:
+    """Cycle and memory [MB] then, of every `every`-th after the warm-up and of the last."""
+    out = []
+    for i in range(WARM_UP + cycles):
+        live(i, tiers[i % len(tiers)], skin)
+        done = i + 1 - WARM_UP
+        if done >= 0 and (done % every == 0 or done == cycles):
+            out.append((done, resident()))
+    return out
+
+
+def main(arguments=None) -> int:
+    """The command; writes the JSON and prints the growth."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cycles", type=int, default=1000)
+    parser.add_argument("--skin", default="coarse")
+    parser.add_argument("--tiers", default="full,condensed")
+    parser.add_argument("--json", type=pathlib.Path, required=True)
+    args = parser.parse_args(arguments)
+    from accuracy import write_json
+
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["BIOTAC_CACHE"] = folder
+        rows = lives(args.cycles, tuple(args.tiers.split(",")), args.skin, max(1, args.cycles // 50))
+    growth = rows[-1][1] - rows[0][1]
+    found = {
+        "cycles": args.cycles,
+        "growth_mb": growth,
+        "mb_per_cycle": growth / args.cycles,
+        "seconds": time.perf_counter() - begin,
+        "memory_mb": rows,
+    }
+    write_json(args.json, found)
+    print(f"{args.cycles} models: {rows[0][1]:.0f} MB after the first, {growth:+.1f} MB since", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(pathlib.Path(__file__).parent))
+    sys.exit(main())
