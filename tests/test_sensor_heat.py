@@ -18,6 +18,7 @@ from biotac_mj.sensor.heat import (
     THERMISTOR,
     Heat,
     HeatParameters,
+    electrode_factor,
     half_space,
 )
 from biotac_mj.sensor.materials import MATERIALS, ROOM, Material, material_of, read_thermal
@@ -46,7 +47,7 @@ def test_half_space_has_the_impedance_of_one_over_sqrt_s():
     """Over six decades of frequency, on the imaginary and the real axis."""
     rate, conductance, fast, slow = half_space()
     frequency = np.logspace(-4, 2, 60)
-    for s, bound in ((1j * frequency, 0.016), (frequency, 0.001)):
+    for s, bound in ((1j * frequency, 0.016), (frequency, 0.003)):
         admittance = (conductance * s[:, None] / (s[:, None] + rate)).sum(1) + s * fast + slow
         assert np.abs(admittance / np.sqrt(s) - 1).max() < bound
 
@@ -150,6 +151,22 @@ def test_rest_is_a_fixed_point_and_warm_up_leads_to_it():
     skin_at(heat, sensor.ambient)
     touch(heat, 0.0, 0.0, 1.0, 5000)
     np.testing.assert_allclose(heat.state.numpy()[:, :LOST], rest[:, :LOST], atol=1e-6)
+
+
+def test_warming_up_lowers_every_impedance():
+    """From a cold start the liquid's temperature alone takes ln Z down, as one exponential of minutes: real
+    sensors 0.23 in the first 190 s with 204 s."""
+    heat = Heat([])
+    skin_at(heat, HeatParameters().ambient)
+    rest = HeatParameters().rest()[LIQUID]
+    log_z = []
+    for _ in range(9):
+        touch(heat, 0.0, 0.0, 0.5, 120)
+        log_z.append(np.log(electrode_factor(heat.state.numpy()[0, LIQUID], rest)))
+    assert (np.diff(log_z) < 0).all() and log_z[-1] > 0
+    constant = 60 / np.log(np.diff(log_z)[:-1] / np.diff(log_z)[1:])
+    assert (constant > 100).all() and (constant < 300).all()
+    assert -0.078 < np.log(electrode_factor(31.0, 30.0)) < -0.064
 
 
 def test_a_step_of_any_length_stays_between_the_temperatures():

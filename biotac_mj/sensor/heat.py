@@ -22,10 +22,21 @@ import math
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.materials import Material
 
-__all__ = ["CORE", "GIVEN", "LIQUID", "LOST", "THERMISTOR", "Heat", "HeatParameters", "half_space"]
+__all__ = [
+    "CORE",
+    "GIVEN",
+    "LIQUID",
+    "LOST",
+    "THERMISTOR",
+    "Heat",
+    "HeatParameters",
+    "electrode_factor",
+    "half_space",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,6 +52,7 @@ BODY = _STORE + NBRANCH
 
 _LN_RATIO = 2.0  # of neighbouring rates: 1.4 % of the impedance at the worst frequency, see `half_space`
 _SLOWEST = 1e-5  # [1/s]
+_PER_DEGREE = 0.071  # [1/C], of ln Z
 
 real = wp.float64
 _CELL = 1.0 / NCELL
@@ -109,6 +121,12 @@ class HeatParameters:
         depth = layers * (np.arange(NCELL) + 0.5) / NCELL
         state[FREE:BODIES] = state[LIQUID] - flux * (1 / self.gap + depth)
         return state
+
+
+def electrode_factor(temperature: ArrayLike, reference: ArrayLike) -> np.ndarray:
+    """What the electrodes' impedances are multiplied by when the liquid is at a temperature and not at the
+    reference [C] at which they were taken: -6.4 to -7.8 % per degree in five sensors, here -7.1 %."""
+    return np.exp(-_PER_DEGREE * (np.asarray(temperature, float) - reference))
 
 
 _FIELDS = [field.name for field in dataclasses.fields(HeatParameters)]

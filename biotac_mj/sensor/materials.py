@@ -41,7 +41,8 @@ class Material:
 # Sources. INC: Incropera and others, Fundamentals of Heat and Mass Transfer, tables A.1 to A.5 (300 K).
 # ISO: EN ISO 10456, table 3. CRC: CRC Handbook of Chemistry and Physics. ASH: ASHRAE Handbook, Fundamentals.
 # MAK: makers' usual data for the grade. CHO: Choi and Okos' formulas for food. MOR: Morton and Hearle,
-# Physical Properties of Textile Fibres; fabrics are k of fibre and air at the named density. Densities of foams, fabrics and powders vary by a factor of two between goods, effusivities so by about 1.4.
+# Physical Properties of Textile Fibres; fabrics are k of fibre and air at the named density. Densities of
+# foams, fabrics and powders vary by a factor of two between goods, effusivities so by about 1.4.
 _TABLE = """
 steel             | 16.0   7900   490   INC | stainless, stainless steel
 carbon steel      | 52     7850   470   INC | mild steel, tool steel | screwdriver, wrench
