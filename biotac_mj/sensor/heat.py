@@ -36,6 +36,7 @@ __all__ = [
     "HeatParameters",
     "electrode_factor",
     "half_space",
+    "state_size",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -56,6 +57,11 @@ _PER_DEGREE = 0.071  # [1/C], of ln Z
 
 real = wp.float64
 _CELL = 1.0 / NCELL
+
+
+def state_size(ngroup: int) -> int:
+    """Numbers in the state of a sensor that up to `ngroup` bodies touch."""
+    return BODIES + BODY * ngroup
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +121,7 @@ class HeatParameters:
         skin = self.area / (1 / self.gap + layers + 1 / self.air)
         above = self.power / self.loss()
         flux = above / (1 / self.inside + 1 / skin) / self.area
-        state = np.zeros(BODIES + BODY * ngroup)
+        state = np.zeros(state_size(ngroup))
         state[[THERMISTOR, CORE]] = self.ambient + above
         state[LIQUID] = self.ambient + flux * (1 / self.gap + layers + 1 / self.air)
         depth = layers * (np.arange(NCELL) + 0.5) / NCELL
