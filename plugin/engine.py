@@ -29,6 +29,7 @@ ATTRIBUTES = (
     "coupling",
     "geoms",
     "rounding",
+    "thermal",
     "friction",
     "priority",
     "tier",

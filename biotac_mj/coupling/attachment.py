@@ -12,6 +12,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
+from ..sensor.materials import read_thermal
 from .config import PLUGIN_NAME, Config
 from .stepper import check_names
 
@@ -90,6 +91,7 @@ def attach(
     coupling: str = "two-way",
     geoms: list | None = None,
     rounding: dict | None = None,
+    thermal: dict | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -115,6 +117,9 @@ def attach(
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
         elements' centroids; "readings": of the sensor.
+      thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
+        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]. {} makes all of plastic at 23 C, None
+        leaves heat out.
       coupling, geoms, rounding, priority, seed, device, stepper, tier, readings: see `Config`.
 
     Raises:
@@ -138,6 +143,7 @@ def attach(
         coupling=coupling,
         geoms=geoms,
         rounding=dict(rounding or {}),
+        thermal=None if thermal is None else dict(thermal),
         priority=int(priority),
         seed=int(seed),
         device=device,
@@ -148,7 +154,9 @@ def attach(
     if stepper == "fem" and tier == "condensed":
         _refuse_condensed(config)
     names = [g.name for g in spec.geoms]
-    for name in (*(config.geoms or ()), *config.rounding):
+    for value in (config.thermal or {}).values():
+        read_thermal(value)
+    for name in (*(config.geoms or ()), *config.rounding, *(config.thermal or {})):
         if name not in names:
             raise ValueError(
                 f"no geom {name!r} to touch: the model has "

@@ -28,6 +28,9 @@ class Config:
       geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own
         links.
       rounding: geom name -> radius of its rounded edges [m].
+      thermal: geom name -> material, for heat between the sensor and what it touches
+        (`sensor.materials.read_thermal`); geoms that are not named are of plastic. None leaves heat out: TDC
+        is constant.
       friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
         the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
@@ -46,6 +49,7 @@ class Config:
     coupling: str = "two-way"
     geoms: tuple | None = None
     rounding: dict = dataclasses.field(default_factory=dict)
+    thermal: dict | None = None
     friction: float = 0.783414394
     priority: int = 0
     seed: int = 0
@@ -62,6 +66,8 @@ class Config:
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
+        if self.thermal is None and self.options.get("readings", {}).get("cold"):
+            raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
         if not self.friction >= 0:
             raise ValueError(f"the skin's friction is {self.friction}: give a number >= 0")
         if self.geoms is not None:
