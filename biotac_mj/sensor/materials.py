@@ -21,7 +21,7 @@ class Material:
     Attributes:
       name: of the material.
       conductivity: k [W/(m K)]; density: [kg/m^3]; heat: specific heat capacity [J/(kg K)].
-      source: where the three numbers are from.
+      source: the kind of handbook that has the three numbers (see the table's head).
       temperature: before it is touched [C].
     """
 
@@ -38,7 +38,8 @@ class Material:
         return math.sqrt(self.conductivity * self.density * self.heat)
 
 
-# Sources. INC: Incropera and others, Fundamentals of Heat and Mass Transfer, tables A.1 to A.5 (300 K).
+# Typical values. The last column names the handbook to check one in; they were not compared entry by entry.
+# INC: Incropera and others, Fundamentals of Heat and Mass Transfer, tables A.1 to A.5 (300 K).
 # ISO: EN ISO 10456, table 3. CRC: CRC Handbook of Chemistry and Physics. ASH: ASHRAE Handbook, Fundamentals.
 # MAK: makers' usual data for the grade. CHO: Choi and Okos' formulas for food. MOR: Morton and Hearle,
 # Physical Properties of Textile Fibres; fabrics are k of fibre and air at the named density. Densities of
