@@ -26,6 +26,7 @@ ATTRIBUTES = (
     "coupling",
     "geoms",
     "rounding",
+    "thermal",
     "friction",
     "priority",
     "tier",

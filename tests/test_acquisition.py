@@ -33,12 +33,14 @@ def flat(readings):
 
 def test_rest_counts():
     acquisition, state = started(noise=False)
-    run(acquisition, state, 1e-3, 0.05, lambda t: (REST, 0.0, 31.0))
+    run(acquisition, state, 1e-3, 0.05, lambda t: (REST, 0.0, channels.REST_TEMPERATURE))
     readings = acquisition.readings(state)
     assert np.array_equal(readings["electrodes"], channels.REST_COUNTS["1"])
     assert readings["pdc"] == 2000 and readings["tac"] in (2047, 2048)
     assert np.all((readings["pac"] >= 2047) & (readings["pac"] <= 2048))
-    assert channels.temperature_from_counts(readings["tdc"]) == pytest.approx(31.0, abs=0.05)
+    assert channels.temperature_from_counts(readings["tdc"]) == pytest.approx(
+        channels.REST_TEMPERATURE, abs=0.05
+    )
 
 
 @pytest.mark.parametrize("dt", [1e-4, 7e-4, 2e-3, 2e-2])
@@ -46,7 +48,7 @@ def test_every_electrode_is_sampled_at_its_slot(dt):
     """A ramp in Z: the held count is the ramp at the last slot of that electrode, whatever the step."""
     acquisition, state = started(noise=False)
     rate = np.linspace(1e4, 4e4, 19)
-    run(acquisition, state, dt, 0.14, lambda t: (REST + rate * t, 0.0, 31.0))
+    run(acquisition, state, dt, 0.14, lambda t: (REST + rate * t, 0.0, channels.REST_TEMPERATURE))
     slot = 2 * np.arange(19) + 1
     last = slot + SLOTS_PER_FRAME * np.floor(
         (round(0.14 / dt) * dt * SLOT_RATE + 1e-6 - slot) / SLOTS_PER_FRAME
@@ -88,11 +90,14 @@ def test_pac_gain(hertz):
 
 
 def test_tac_follows_heating():
+    """TDC at once, TAC behind 0.25 Hz."""
     acquisition, state = started(noise=False)
-    run(acquisition, state, 2e-3, 0.5, lambda t: (REST, 0.0, 31.0 + 0.4 * t))
+    run(acquisition, state, 2e-3, 0.5, lambda t: (REST, 0.0, channels.REST_TEMPERATURE + 0.4 * t))
     readings = acquisition.readings(state)
-    assert channels.heating_from_counts(readings["tac"]) == pytest.approx(0.4, abs=2e-3)
-    assert channels.temperature_from_counts(readings["tdc"]) == pytest.approx(31.2, abs=0.05)
+    followed = 0.4 * (1 - np.exp(-2 * np.pi * 0.25 * 0.5))
+    assert channels.heating_from_counts(readings["tac"]) == pytest.approx(followed, abs=2e-3)
+    warm = channels.REST_TEMPERATURE + 0.2
+    assert channels.temperature_from_counts(readings["tdc"]) == pytest.approx(warm, abs=0.05)
 
 
 def test_the_step_does_not_change_what_is_sampled():
@@ -100,14 +105,20 @@ def test_the_step_does_not_change_what_is_sampled():
     results = []
     for dt in (1e-4, 7e-4, 2e-3, 2e-2):
         acquisition, state = started(seed=5)
-        run(acquisition, state, dt, 0.14, lambda t: (REST + 2e3 * t, 5e3 * t, 31.0 + 0.1 * t))
+        run(
+            acquisition,
+            state,
+            dt,
+            0.14,
+            lambda t: (REST + 2e3 * t, 5e3 * t, channels.REST_TEMPERATURE + 0.1 * t),
+        )
         results.append(flat(acquisition.readings(state)))
     assert all(np.array_equal(results[0], other) for other in results[1:])
 
 
 def test_replay_from_a_saved_state_is_bit_equal():
     acquisition, state = started(seed=1)
-    run(acquisition, state, 2e-3, 0.1, lambda t: (REST * (1 + t), 1e3 * t, 31.0))
+    run(acquisition, state, 2e-3, 0.1, lambda t: (REST * (1 + t), 1e3 * t, channels.REST_TEMPERATURE))
     saved, copies = state.copy(), []
     for _ in range(2):
         state[:] = saved
@@ -154,7 +165,7 @@ def test_noise_is_that_of_numpys_philox(seed):
 
 def test_clipping_to_twelve_bits():
     acquisition, state = started()
-    run(acquisition, state, 5e-3, 0.03, lambda t: (np.full(19, 1e12), 1e9, 31.0))
+    run(acquisition, state, 5e-3, 0.03, lambda t: (np.full(19, 1e12), 1e9, channels.REST_TEMPERATURE))
     readings = acquisition.readings(state)
     assert (
         np.all(readings["electrodes"] <= 25)

@@ -13,6 +13,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
+from ..sensor.materials import read_thermal
 from .config import PLUGIN_NAME, Config, integer, real
 from .stepper import check_names, make_readings
 
@@ -91,6 +92,7 @@ def attach(
     coupling: str = "two-way",
     geoms: list | None = None,
     rounding: dict | None = None,
+    thermal: dict | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -117,6 +119,9 @@ def attach(
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
         elements' centroids; "readings": of the sensor (noise, sensor, film_every_step, temperature; weights).
+      thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
+        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]. {} makes all of plastic at 23 C, None
+        leaves heat out.
       coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
 
     Raises:
@@ -142,6 +147,7 @@ def attach(
         coupling=coupling,
         geoms=geoms,
         rounding={} if rounding is None else rounding,
+        thermal=thermal,
         priority=priority,
         seed=seed,
         device=device,
@@ -150,7 +156,9 @@ def attach(
         **({} if friction is None else {"friction": friction}),
     )
     _check(config, geometry)
-    _check_geoms(spec, (*(config.geoms or ()), *config.rounding))
+    for value in (config.thermal or {}).values():
+        read_thermal(value)
+    _check_geoms(spec, (*(config.geoms or ()), *config.rounding, *(config.thermal or {})))
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:

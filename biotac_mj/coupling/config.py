@@ -16,7 +16,7 @@ PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 # what options["readings"] may have
-_SENSOR = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float}
+_SENSOR = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float, "cold": bool}
 READINGS = {"biotac": _SENSOR, "latent_projection": {"weights": str | None, **_SENSOR}}
 ON_ERROR = ("warn", "raise")
 
@@ -55,6 +55,9 @@ class Config:
       geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own
         links.
       rounding: geom name -> radius of its rounded edges [m].
+      thermal: geom name -> material, for heat between the sensor and what it touches
+        (`sensor.materials.read_thermal`); geoms that are not named are of plastic. None leaves heat out: TDC
+        is constant.
       friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
         the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
@@ -75,6 +78,7 @@ class Config:
     coupling: str = "two-way"
     geoms: tuple | None = None
     rounding: dict = dataclasses.field(default_factory=dict)
+    thermal: dict | None = None
     friction: float = 0.783414394
     priority: int = 0
     seed: int = 0
@@ -104,6 +108,8 @@ class Config:
         for name in ("rounding", "options"):
             if not isinstance(getattr(self, name), dict):
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
+        if not (self.thermal is None or isinstance(self.thermal, dict)):
+            raise ValueError(f"thermal is {self.thermal!r}: give a dict of geoms and materials, or None")
         self._set("friction", real("the skin's friction", self.friction, 0.0))
         self._set("priority", integer("priority", self.priority))
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
@@ -113,6 +119,8 @@ class Config:
             wanted = READINGS[self.readings]
             given = check_entries("options['readings']", self.options.get("readings", {}), wanted, wanted)
             refuse_unknown(given, wanted, "options['readings']")
+            if self.thermal is None and given.get("cold"):
+                raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
 
     def _set(self, name, value):
         object.__setattr__(self, name, value)

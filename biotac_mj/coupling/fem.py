@@ -110,6 +110,22 @@ class FemStepper:
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
+    @functools.cached_property
+    def _sample_area(self):
+        """What a contact sample of each face stands for [m^2], and how many a face has."""
+        nsample = len(self._model.sample)
+        return self._model.outer.area.numpy() / nsample, nsample
+
+    def touched_area(self, state: np.ndarray) -> np.ndarray:
+        """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
+        contacts = _contacts(self._part(state, "contacts"))
+        share, nsample = self._sample_area
+        group = np.array([g.group for g in self._geoms], int)
+        face = contacts[:, 0].astype(int) // nsample
+        return np.bincount(
+            group[contacts[:, 1].astype(int)], share[face], minlength=1 + max(group, default=-1)
+        )
+
     def solve_skin(
         self,
         state: np.ndarray,

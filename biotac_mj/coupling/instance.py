@@ -46,7 +46,7 @@ class _Skin:
     def __init__(self, config, geoms):
         self.geometry = load_skin(config.skin)
         self.stepper = make_stepper(config, self.geometry, geoms)
-        self.readings = make_readings(config, self.geometry)
+        self.readings = make_readings(config, self.geometry, geoms)
         self.lock = threading.Lock()
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
 
@@ -361,8 +361,13 @@ class Instance:
             skin, result = self.setup.skin, self._result
             state = self.setup.parts(self.state)[3].copy()
             with skin.lock:
+                touch = {}
+                if self.setup.config.thermal is not None:
+                    after = result.state is not None
+                    area = skin.stepper.touched_area(result.state) if after else np.zeros(self.setup.ngroup)
+                    touch = {"area": area, "force": np.linalg.norm(result.wrench[:, :3], axis=1)}
                 counts = skin.readings.advance(
-                    state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure
+                    state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure, **touch
                 )
             self._reading = state, counts
         return self._reading

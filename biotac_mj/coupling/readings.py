@@ -7,9 +7,12 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction
+from ..sensor.heat import state_size
+from ..sensor.materials import Material, read_thermal
 from ..sensor.readings import PhysicsReadings, check_settings
 from .config import Config
 from .fem import rest_geometry
+from .stepper import Geom
 
 __all__ = ["SensorReadings"]
 
@@ -17,7 +20,7 @@ __all__ = ["SensorReadings"]
 class SensorReadings:
     """`PhysicsReadings` behind the `Readings` protocol.
 
-    `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature).
+    `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature, cold).
 
     The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """
@@ -25,7 +28,16 @@ class SensorReadings:
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
         self._options = check_settings(config.options.get("readings", {}))
+        self._bodies: list[Material] | None = None
         self.nstate = Acquisition.nstate
+
+    def feel_heat(self, geoms: list[Geom]) -> None:
+        """A body is made of what the first of its geoms that `config.thermal` names is made of."""
+        self._bodies = [read_thermal("plastic")] * (1 + max((g.group for g in geoms), default=-1))
+        named = [(g, value) for g in geoms for key, value in self._config.thermal.items() if _is(g.name, key)]
+        for geom, value in reversed(named):
+            self._bodies[geom.group] = read_thermal(value)
+        self.nstate = Acquisition.nstate + state_size(len(self._bodies))
 
     @functools.cached_property
     def _physics(self):
@@ -33,7 +45,7 @@ class SensorReadings:
             rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
         )
         film = _film(_Skin(geometry), self._options.get("sensor", "1"))
-        return PhysicsReadings(geometry, seed=self._seed, film=film, **self._options)
+        return PhysicsReadings(geometry, seed=self._seed, film=film, bodies=self._bodies, **self._options)
 
     @functools.cached_property
     def rest(self) -> dict:
@@ -45,10 +57,21 @@ class SensorReadings:
         self._physics.reset(state)
 
     def advance(
-        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+        self,
+        state: np.ndarray,
+        time: float,
+        dt: float,
+        vert_xpos: np.ndarray,
+        pressure: float,
+        area: np.ndarray | None = None,
+        force: np.ndarray | None = None,
     ) -> dict:
-        self._physics.advance(state, time, dt, vert_xpos, pressure)
+        self._physics.advance(state, time, dt, vert_xpos, pressure, area, force)
         return self._physics.readings(state)
+
+
+def _is(name, key):
+    return name == key or name.endswith(key)  # after a further attach
 
 
 class _Skin:

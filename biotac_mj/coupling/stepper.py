@@ -102,6 +102,9 @@ class SkinStepper(Protocol):
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
 
+    def touched_area(self, state: np.ndarray) -> np.ndarray:
+        """(ngroup,) area of the skin that each body touches in a state [m^2]; asked where heat counts."""
+
     # A stepper may have the three methods below; a skin that rests then costs next to nothing.
 
     def resting(self, state: np.ndarray) -> bool:
@@ -127,6 +130,12 @@ class Readings(Protocol):
         self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
     ) -> dict:
         """Advances state in place over [time, time + dt] and returns channel -> counts."""
+
+    # Readings may have the method below; `advance` then also gets area [m^2] and force [N], (ngroup,) each,
+    # of what touches at the end of the step.
+
+    def feel_heat(self, geoms: list[Geom]) -> None:
+        """Heat flows between the sensor and these geoms; called first, it may change nstate."""
 
 
 class _NoReadings:
@@ -205,11 +214,16 @@ def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> S
     return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 
-def make_readings(config: Config, geometry: SkinGeometry) -> Readings:
+def make_readings(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> Readings:
     """The readings that `config.readings` names.
 
     Raises:
-      ValueError: the name is unknown.
+      ValueError: the name is unknown, or `config.thermal` asks for heat that the readings do not know.
     """
     check_names(config)
-    return _factory(_readings, config.readings)(config, geometry)
+    readings = _factory(_readings, config.readings)(config, geometry)
+    if config.thermal is not None:
+        if not hasattr(readings, "feel_heat"):
+            raise ValueError(f"readings {config.readings!r} know no heat: leave thermal out")
+        readings.feel_heat(geoms)
+    return readings

@@ -10,6 +10,8 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import REST_COUNTS, REST_TEMPERATURE
 from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.sensor.heat import LIQUID, THERMISTOR, Heat, HeatParameters, electrode_factor
+from biotac_mj.sensor.materials import Material
 
 __all__ = ["PhysicsReadings", "check_settings", "record"]
 
@@ -27,7 +29,12 @@ class PhysicsReadings:
       sensor: "1" | "2" | "3", whose published rest counts the electrodes show at rest.
       film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
       `Acquisition.needs_impedance`).
-      temperature: of the core, steady [C]; TDC is constant and TAC at mid-scale but for noise.
+      temperature: of the core at rest [C]; without `bodies` it is steady, TDC constant and TAC at mid-scale
+        but for noise.
+      bodies: of what is made what may touch, one of each body; the sensor then has a heat of its own
+        (`sensor.heat`), which moves TDC, TAC and, with the liquid's temperature, all electrodes. None: it has
+        none.
+      cold: the sensor is switched on at the reset: it begins at the temperature around it and warms up.
       film: a FilmConduction to share between sensors of the same geometry; None builds one.
 
     Attributes:
@@ -43,11 +50,21 @@ class PhysicsReadings:
         film_every_step: bool = False,
         temperature: float = REST_TEMPERATURE,
         film: FilmConduction | None = None,
+        bodies: list[Material] | None = None,
+        cold: bool = False,
     ):
         self.film = FilmConduction(geometry, sensor=sensor) if film is None else film
         self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
         self.temperature = temperature
-        self.nstate = self.acquisition.nstate
+        self._heat = self._begin = None
+        if bodies is not None:
+            sensor = HeatParameters().at_rest(temperature)
+            self._heat = Heat(bodies, sensor)
+            begins = sensor if not cold else sensor.at_rest(sensor.ambient)
+            self._begin, self._liquid = begins.rest(len(bodies)), sensor.rest()[LIQUID]
+        elif cold:
+            raise ValueError("cold is of a sensor with heat: give bodies, in attach thermal")
+        self.nstate = self.acquisition.nstate + (0 if self._heat is None else self._heat.nstate)
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(
@@ -56,10 +73,25 @@ class PhysicsReadings:
         """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state
         (nstate,)."""
         impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
-        self.acquisition.reset(state, impedance, pressure, self.temperature, time)
+        temperature = self.temperature
+        if self._heat is not None:
+            state[self.acquisition.nstate :] = self._begin
+            temperature = self._begin[THERMISTOR]
+            impedance = impedance * electrode_factor(self._begin[LIQUID], self._liquid)
+        self.acquisition.reset(self._counts(state), impedance, pressure, temperature, time)
+
+    def _counts(self, state):
+        return state[: self.acquisition.nstate]
 
     def advance(
-        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+        self,
+        state: np.ndarray,
+        time: float,
+        dt: float,
+        vert_xpos: np.ndarray,
+        pressure: float,
+        area: np.ndarray | None = None,
+        force: np.ndarray | None = None,
     ) -> None:
         """Samples the step (time, time + dt].
 
@@ -68,22 +100,42 @@ class PhysicsReadings:
           time: at the start of the step [s]; dt: its length [s].
           vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m].
           pressure: of the liquid at the end of the step, above rest [Pa].
+          area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
+            touches.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
-        impedance = None
+        impedance, counts, temperature = None, self._counts(state), self.temperature
+        heat = self._advance_heat(state, dt, area, force)
+        if heat is not None:
+            temperature = heat[THERMISTOR]
         if self.acquisition.needs_impedance(
-            state, time, dt
+            counts, time, dt
         ):  # a skin that nothing touches need not be solved again
             impedance = (
                 self._rest if np.array_equal(vert_xpos, self._rest_vert) else self.film.impedance(vert_xpos)
             )
-        self.acquisition.advance(state, time, dt, impedance, pressure, self.temperature)
+            if heat is not None:
+                impedance = impedance * electrode_factor(heat[LIQUID], self._liquid)
+        self.acquisition.advance(counts, time, dt, impedance, pressure, temperature)
+        if heat is not None:
+            state[self.acquisition.nstate :] = heat
+
+    def _advance_heat(self, state, dt, area, force):
+        """The heat's state after the step, None without heat."""
+        if self._heat is None:
+            return None
+        heat, own = self._heat, self._heat.state.numpy()[0]
+        own[:] = state[self.acquisition.nstate :]
+        for array, given in ((heat.area, area), (heat.force, force)):
+            array.numpy()[:] = 0.0 if given is None else given
+        heat.advance(dt)
+        return own
 
     def readings(self, state: np.ndarray) -> dict:
         """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""
-        return self.acquisition.readings(state)
+        return self.acquisition.readings(self._counts(state))
 
 
 def check_settings(given: dict, more: tuple[str, ...] = ()) -> dict:

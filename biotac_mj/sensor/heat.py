@@ -1,0 +1,405 @@
+"""Heat of a BioTac: one temperature state a sensor, stepped implicitly with the skin, many sensors at once.
+
+    heater -> core -> liquid -> skin -> air              the skin that nothing touches
+               |
+           thermistor -> film -> skin -> contact -> body   one column of skin for each touching body
+
+What moves is heat through thin layers, so each path is one-dimensional: lumps for the core, the core's
+part under the contact with the thermistor, and the liquid; `NCELL` finite volumes through the skin; and the
+touched body as a half-space known by its effusivity e = sqrt(k rho c) and temperature. The heat that a
+half-space takes through its surface is e sqrt(s) times the surface's temperature, a memory of all the past;
+here it is a sum of `NBRANCH` relaxing stores (`half_space`), so the state is short and a step is implicit
+(backward Euler: stable for every time step, first order).
+
+When a contact grows, skin goes from the free column to the body's with the heat that is in it, and the body's
+new part is at the body's own temperature; when it shrinks the skin goes back and what the body had taken
+stays with the body. A body that is left altogether is forgotten: the finger comes back to a fresh place.
+
+`Heat` steps one sensor or the sensors of all worlds with the same kernel."""
+
+import dataclasses
+import math
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from biotac_mj.sensor.materials import Material
+
+__all__ = [
+    "CORE",
+    "GIVEN",
+    "LIQUID",
+    "LOST",
+    "THERMISTOR",
+    "Heat",
+    "HeatParameters",
+    "electrode_factor",
+    "half_space",
+    "state_size",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+NCELL = 8  # finite volumes through the skin
+NBRANCH = 10  # stores of a half-space
+# The state: temperatures [C] of the thermistor (and of the core about it), the core, the liquid; heat lost to
+# the air and the mount and heat given to bodies since the reset [J]; cells of the free skin, inside first;
+# then for each body the area [m^2], cells, its surface and its stores.
+THERMISTOR, CORE, LIQUID, LOST, GIVEN, FREE = range(6)
+BODIES = FREE + NCELL
+_SURFACE, _STORE = 1 + NCELL, 2 + NCELL
+BODY = _STORE + NBRANCH
+
+_LN_RATIO = 2.0  # of neighbouring rates: 1.4 % of the impedance at the worst frequency, see `half_space`
+_SLOWEST = 1e-5  # [1/s]
+_PER_DEGREE = 0.071  # [1/C], of ln Z
+
+real = wp.float64
+_CELL = 1.0 / NCELL
+
+
+def state_size(ngroup: int) -> int:
+    """Numbers in the state of a sensor that up to `ngroup` bodies touch."""
+    return BODIES + BODY * ngroup
+
+
+@dataclasses.dataclass(frozen=True)
+class HeatParameters:
+    """Constants of one sensor. Sources and intervals: docs/sensor.md.
+
+    Attributes:
+      power: of the heater, which is the sensor's own electronics [W].
+      ambient: temperature of the air and of what the sensor is mounted on [C].
+      core: heat capacity of the whole core [J/K]; near: of its part about the thermistor and under the
+        contact; liquid: of the liquid.
+      mount: core to mount [W/K]; inside: core to liquid [W/K]; spread: core to the part near the thermistor
+        [W/K].
+      area: of the skin [m^2]; thickness: of the skin [m].
+      conductivity: of the rubber [W/(m K)]; capacity: its density times specific heat [J/(m^3 K)].
+      gap: liquid to skin at rest [W/(m^2 K)]; film: core to skin where the skin is pressed on it.
+      air: skin to air [W/(m^2 K)].
+      contact: skin to body at 10 kPa, over the mean conductivity of the two [1/m] (`contact_conductance`).
+    """
+
+    power: float = 0.81
+    ambient: float = 23.0
+    core: float = 2.8
+    liquid: float = 1.5
+    near: float = 1.19
+    mount: float = 0.0186
+    inside: float = 0.0458
+    spread: float = 0.643
+    area: float = 1.24e-3
+    thickness: float = 4.0e-4
+    conductivity: float = 0.193
+    capacity: float = 1.6e6
+    gap: float = 600.0
+    film: float = 266.0
+    air: float = 16.0
+    contact: float = 1.17e4
+
+    def __post_init__(self):
+        bad = [f.name for f in dataclasses.fields(self) if not math.isfinite(getattr(self, f.name))]
+        small = [f.name for f in dataclasses.fields(self)[2:] if getattr(self, f.name) <= 0]
+        if bad or small or self.near >= self.core:
+            what = f"{', '.join(bad + small)} cannot be" if bad or small else "near is more than the core has"
+            raise ValueError(f"heat parameters: {what}; capacities, conductances and lengths are positive")
+
+    def loss(self) -> float:
+        """What the sensor loses per degree of its core above the ambient when nothing touches it [W/K]."""
+        skin = self.area / (1 / self.gap + self.thickness / self.conductivity + 1 / self.air)
+        return self.mount + 1 / (1 / self.inside + 1 / skin)
+
+    def at_rest(self, temperature: float) -> "HeatParameters":
+        """The same sensor with the power that keeps its core at a temperature [C]."""
+        return dataclasses.replace(self, power=self.loss() * (temperature - self.ambient))
+
+    def rest(self, ngroup: int = 0) -> np.ndarray:
+        """The steady state (nstate,) of a sensor that nothing touches."""
+        layers = self.thickness / self.conductivity
+        skin = self.area / (1 / self.gap + layers + 1 / self.air)
+        above = self.power / self.loss()
+        flux = above / (1 / self.inside + 1 / skin) / self.area
+        state = np.zeros(state_size(ngroup))
+        state[[THERMISTOR, CORE]] = self.ambient + above
+        state[LIQUID] = self.ambient + flux * (1 / self.gap + layers + 1 / self.air)
+        depth = layers * (np.arange(NCELL) + 0.5) / NCELL
+        state[FREE:BODIES] = state[LIQUID] - flux * (1 / self.gap + depth)
+        return state
+
+
+def electrode_factor(temperature: ArrayLike, reference: ArrayLike) -> np.ndarray:
+    """What the electrodes' impedances are multiplied by when the liquid is at a temperature and not at the
+    reference [C] at which they were taken: -6.4 to -7.8 % per degree in five sensors, here -7.1 %."""
+    return np.exp(-_PER_DEGREE * (np.asarray(temperature, float) - reference))
+
+
+_FIELDS = [field.name for field in dataclasses.fields(HeatParameters)]
+Parameters = wp.types.vector(len(_FIELDS), real)
+(
+    _POWER, _AMBIENT, _C_CORE, _C_LIQUID, _C_NEAR, _MOUNT, _INSIDE, _SPREAD, _AREA, _THICKNESS, _CONDUCTIVITY,
+    _CAPACITY, _GAP, _FILM, _AIR, _CONTACT,
+) = range(len(_FIELDS))  # fmt: skip
+
+
+def half_space() -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Stores that answer as a half-space of unit effusivity does.
+
+    1 / sqrt(s) = 1 / pi int dp / (sqrt(p) (s + p)), and the rule of trapezia in ln p with step h makes of
+    s / sqrt(s) = sqrt(s) the sum of c s / (s + p), c = h sqrt(p) / pi: stores of capacity c / p behind a
+    resistance 1 / c. The poles of the integrand bound the rule's error by 2 exp(-pi^2 / h) on the imaginary
+    axis. The terms that are left out are geometric series: those that are faster are a capacity at the
+    surface, those that are slower a conductance to the undisturbed body.
+
+    Returns:
+      rate p (NBRANCH,) [1/s]; conductance c (NBRANCH,) [s^-1/2]; surface's capacity [s^1/2]; conductance to
+      the undisturbed body [s^-1/2].
+    """
+    h = _LN_RATIO
+    rate = _SLOWEST * np.exp(h * np.arange(NBRANCH))
+    conductance = h / np.pi * np.sqrt(rate)
+    tail = 1 / np.expm1(h / 2)  # sum of exp(-h j / 2), j = 1, 2, ...
+    return rate, conductance, float(h / np.pi / np.sqrt(rate[-1]) * tail), float(conductance[0] * tail)
+
+
+_RATE, _BRANCH, _FAST, _SLOW = half_space()
+_rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row in (_RATE, _BRANCH))
+
+
+@wp.func
+def contact_conductance(coefficient: real, pressure: real, rubber: real, body: real):
+    """h = a k (p / 10 kPa)^0.95 with the harmonic mean k of both conductivities: conforming rough surfaces
+    (Yovanovich, 1981; Cooper, Mikic and Yovanovich, 1969, with the exponent 0.985). The slope of the
+    asperities over their height and the hardness are one fitted coefficient a [1/m]."""
+    mean = real(2.0) * rubber * body / (rubber + body)
+    return coefficient * mean * wp.pow(wp.max(pressure, real(1.0)) / real(1.0e4), real(0.95))
+
+
+@wp.func
+def _mix(old: real, area: real, new: real, added: real):
+    return (old * area + new * added) / (area + added)
+
+
+@wp.kernel
+def step_heat(
+    # In:
+    dt: real,
+    parameters: wp.array(dtype=Parameters),
+    bodies: wp.array2d(dtype=wp.vec3d),
+    area: wp.array2d(dtype=real),
+    force: wp.array2d(dtype=real),
+    # Out:
+    state: wp.array2d(dtype=real),
+    scratch: wp.array2d(dtype=real),
+):
+    """Every layer is eliminated into the one inside it, the core is solved for, and the layers follow from
+    it. `scratch` holds a layer's share of its inner neighbour, `state` meanwhile the rest."""
+    w = wp.tid()
+    q = parameters[w]
+    one, half = real(1.0), real(0.5)
+    ngroup = area.shape[1]
+    dx = q[_THICKNESS] * real(_CELL)
+    layer = q[_CONDUCTIVITY] / dx
+    store = q[_CAPACITY] * dx / dt
+
+    wanted = real(0.0)
+    for g in range(ngroup):
+        wanted += wp.max(area[w, g], real(0.0))
+    # nothing comes round to the nail's side
+    fit = wp.min(one, half * q[_AREA] / wp.max(wanted, real(1.0e-12)))
+
+    # skin changes hands: what bodies leave, then what they take
+    free = q[_AREA]
+    for g in range(ngroup):
+        free -= state[w, BODIES + BODY * g]
+    for g in range(ngroup):
+        b = BODIES + BODY * g
+        left = state[w, b] - fit * wp.max(area[w, g], real(0.0))
+        if left > real(0.0):
+            for i in range(NCELL):
+                state[w, FREE + i] = _mix(state[w, FREE + i], free, state[w, b + 1 + i], left)
+            free += left
+            state[w, b] -= left
+    for g in range(ngroup):
+        b = BODIES + BODY * g
+        had = state[w, b]
+        added = fit * wp.max(area[w, g], real(0.0)) - had
+        if added > real(0.0):
+            for i in range(NCELL):
+                state[w, b + 1 + i] = _mix(state[w, b + 1 + i], had, state[w, FREE + i], added)
+            for i in range(_SURFACE, BODY):
+                state[w, b + i] = _mix(state[w, b + i], had, bodies[w, g][1], added)
+            free -= added
+            state[w, b] += added
+
+    # free skin, from the air inwards
+    outside = one / (half / layer + one / q[_AIR])
+    inlet = one / (half / layer + one / q[_GAP])
+    known = outside * q[_AMBIENT]
+    pull = outside
+    for k in range(NCELL):
+        i = FREE + NCELL - 1 - k
+        inner = wp.where(k == NCELL - 1, inlet, layer)
+        total = store + pull + inner
+        state[w, i] = (store * state[w, i] + known) / total
+        scratch[w, i] = inner / total
+        known = inner * state[w, i]
+        pull = inner - inner * scratch[w, i]
+    liquid_known = free * known
+    liquid_pull = free * pull
+
+    # skin on bodies
+    near_known = real(0.0)
+    near_pull = real(0.0)
+    press = one / (half / layer + one / q[_FILM])
+    for g in range(ngroup):
+        b = BODIES + BODY * g
+        patch = state[w, b]
+        if patch > real(0.0):
+            body = bodies[w, g]
+            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], body[2])
+            touch = one / (half / layer + one / h)
+            known = body[0] * real(_SLOW) * body[1]
+            pull = body[0] * real(_SLOW)
+            for i in range(NBRANCH):
+                c = body[0] * _branches[i] / (one + dt * _rates[i])
+                known += c * state[w, b + _STORE + i]
+                pull += c
+            at = b + _SURFACE
+            hold = body[0] * real(_FAST) / dt
+            total = hold + pull + touch
+            state[w, at] = (hold * state[w, at] + known) / total
+            scratch[w, at] = touch / total
+            known = touch * state[w, at]
+            pull = touch - touch * scratch[w, at]
+            for k in range(NCELL):
+                i = b + NCELL - k
+                inner = wp.where(k == NCELL - 1, press, layer)
+                total = store + pull + inner
+                state[w, i] = (store * state[w, i] + known) / total
+                scratch[w, i] = inner / total
+                known = inner * state[w, i]
+                pull = inner - inner * scratch[w, i]
+            near_known += patch * known
+            near_pull += patch * pull
+
+    # the core, its two neighbours eliminated
+    near_total = q[_C_NEAR] / dt + q[_SPREAD] + near_pull
+    near = (q[_C_NEAR] / dt * state[w, THERMISTOR] + near_known) / near_total
+    near_share = q[_SPREAD] / near_total
+    liquid_total = q[_C_LIQUID] / dt + q[_INSIDE] + liquid_pull
+    liquid = (q[_C_LIQUID] / dt * state[w, LIQUID] + liquid_known) / liquid_total
+    liquid_share = q[_INSIDE] / liquid_total
+    rest = (q[_C_CORE] - q[_C_NEAR]) / dt
+    core = (
+        rest * state[w, CORE] + q[_POWER] + q[_MOUNT] * q[_AMBIENT] + q[_SPREAD] * near + q[_INSIDE] * liquid
+    ) / (rest + q[_MOUNT] + q[_SPREAD] * (one - near_share) + q[_INSIDE] * (one - liquid_share))
+    near += near_share * core
+    liquid += liquid_share * core
+    state[w, CORE] = core
+    state[w, THERMISTOR] = near
+    state[w, LIQUID] = liquid
+
+    # and outwards again
+    t = liquid
+    for k in range(NCELL):
+        state[w, FREE + k] += scratch[w, FREE + k] * t
+        t = state[w, FREE + k]
+    lost = q[_MOUNT] * (core - q[_AMBIENT]) + free * outside * (t - q[_AMBIENT])
+    given = real(0.0)
+    for g in range(ngroup):
+        b = BODIES + BODY * g
+        patch = state[w, b]
+        if patch > real(0.0):
+            body = bodies[w, g]
+            t = near
+            for i in range(1, _SURFACE + 1):
+                inside = t
+                state[w, b + i] += scratch[w, b + i] * t
+                t = state[w, b + i]
+            for i in range(NBRANCH):
+                a = dt * _rates[i]
+                at = b + _STORE + i
+                state[w, at] = (state[w, at] + a * t) / (one + a)
+            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], body[2])
+            given += patch * (inside - t) / (half / layer + one / h)
+    state[w, LOST] += dt * lost
+    state[w, GIVEN] += dt * given
+
+
+class Heat:
+    """Temperatures of `nworld` sensors on one device, each touched by up to `ngroup` bodies.
+
+    Args:
+      bodies: materials of the touching bodies, the same in every world.
+      parameters: of all sensors, or (nworld,) of them.
+      nworld: number of sensors.
+      device: Warp device.
+
+    Attributes:
+      state: (nworld, nstate) wp.array float64, laid out as this module's constants say; temperatures in [C].
+      area: (nworld, ngroup) wp.array float64, what each body touches [m^2]; write it before `advance`.
+      force: (nworld, ngroup) wp.array float64, the normal force of each [N]; likewise.
+      nstate: length of a sensor's state.
+
+    Raises:
+      ValueError: another number of parameters than of sensors.
+    """
+
+    def __init__(
+        self,
+        bodies: list[Material],
+        parameters: HeatParameters | list[HeatParameters] = HeatParameters(),
+        nworld: int = 1,
+        device: str = "cpu",
+    ):
+        parameters = [parameters] * nworld if isinstance(parameters, HeatParameters) else list(parameters)
+        if len(parameters) != nworld:
+            raise ValueError(
+                f"{len(parameters)} sets of heat parameters for {nworld} sensors: pass one, or one for each"
+            )
+        self.ngroup, self.nworld, self.device = len(bodies), nworld, wp.get_device(device)
+        self._parameters = parameters
+        rest = np.array([p.rest(self.ngroup) for p in parameters])
+        self.nstate = rest.shape[1]
+        numbers = np.array([dataclasses.astuple(p) for p in parameters], float)
+        with wp.ScopedDevice(self.device):
+            self.state = wp.array(rest, dtype=real)
+            self._scratch = wp.zeros_like(self.state)
+            self._constants = wp.array(numbers, dtype=Parameters)
+            self._bodies = wp.array(_numbers([bodies] * nworld), dtype=wp.vec3d, ndim=2)
+            self.area = wp.zeros((nworld, self.ngroup), dtype=real)
+            self.force = wp.zeros((nworld, self.ngroup), dtype=real)
+        inputs = [1.0, self._constants, self._bodies, self.area, self.force]
+        # packing the arguments takes longer than the step of one sensor
+        self._step = wp.launch(
+            step_heat, nworld, inputs, [self.state, self._scratch], device=self.device, record_cmd=True
+        )
+
+    def set_bodies(self, bodies: list[list[Material]]) -> None:
+        """Gives every world bodies of its own: (nworld, ngroup) materials."""
+        self._bodies.assign(_numbers(bodies))
+
+    def advance(self, dt: float) -> None:
+        """One step of dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
+        self._step.set_param_at_index_from_ctype(0, dt)
+        self._step.launch()
+
+    def energy(self) -> np.ndarray:
+        """(nworld,) heat in the sensors above 0 C [J]. With `LOST` and `GIVEN` it grows by the heater's."""
+        out = []
+        for p, s in zip(self._parameters, self.state.numpy(), strict=True):
+            patches = s[BODIES:].reshape(self.ngroup, BODY)
+            cells = p.capacity * p.thickness / NCELL
+            skin = (p.area - patches[:, 0].sum()) * s[FREE:BODIES].sum()
+            skin += (patches[:, 0] * patches[:, 1 : 1 + NCELL].sum(1)).sum()
+            out.append(
+                p.near * s[THERMISTOR] + (p.core - p.near) * s[CORE] + p.liquid * s[LIQUID] + cells * skin
+            )
+        return np.array(out)
+
+
+def _numbers(bodies):
+    rows = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
+    return np.array(rows, float).reshape(len(bodies), -1, 3)
