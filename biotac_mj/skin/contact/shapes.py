@@ -16,6 +16,10 @@ __all__ = ["GEOM_TYPES", "DistanceGrid", "Grids", "bake_distance_grid", "distanc
 
 wp.set_module_options({"enable_backward": False})
 
+# by how many cells a trilinear value may be off: distances change no faster than places, and the corners of a
+# cell are half of its diagonal from its middle. A thin edge between them comes near that
+_TRILINEAR = 0.8661
+
 # MuJoCo's mjtGeom
 GEOM_TYPES = {"plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
 
@@ -170,7 +174,7 @@ def _mesh_distance(grids: Grids, k: int, p: vec3):
     sharp."""
     d = _grid_value(grids, k, p)
     h = grids.spacing[k]
-    if d > real(0.5) * h:  # more than the trilinear error at a sharp edge: no contact here
+    if d > real(_TRILINEAR) * h:  # no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     if d < -h:
         n = vec3(
@@ -321,5 +325,5 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
 def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
     """Cheap lower bound of the distance [m]: what is surely not nearer needs no exact distance."""
     if kind == 7:
-        return _grid_value(grids, grid, p) - real(0.5) * grids.spacing[grid]
+        return _grid_value(grids, grid, p) - real(_TRILINEAR) * grids.spacing[grid]
     return distance(kind, size, rounding, grids, grid, p)[3]
