@@ -108,7 +108,7 @@ def rubber(rng: np.random.Generator, tier: str) -> tuple[Material, SkinOptions]:
 
 @functools.lru_cache(maxsize=1)
 def skin_model(skin: str, seed: int, tier: str, device: str, number: int) -> SkinModel:
-    """The model of so many batches; with a surface to press on and the thickness of the skin under it."""
+    """The model of so many batches, with the nodes of its outer surface."""
     rng = np.random.default_rng([seed, number, 1])
     model = SkinModel(load_skin(skin), *rubber(rng, tier), device=device)
     g = model.geometry
@@ -255,7 +255,7 @@ class Condensed:
         """See `Full.press`."""
         out = self.skin.solve(self.memory, pos, mat)
         self.memory = out.memory
-        numbers = [out.vert_xpos, out.wrench, out.tangent, out.pressure]
+        numbers = [out.vert_xpos, out.wrench, out.tangent, out.volume]
         finite = all(np.isfinite(a).all() for a in numbers)
         force = np.linalg.norm(out.wrench[:, :3].sum(0))
         return (*(np.array([x]) for x in (out.converged, out.reached, finite, force)),)
