@@ -33,7 +33,7 @@ wp.set_module_options({"enable_backward": False})
 # reason of a world's last step
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
-_STALLED = 8  # iterations that do not halve the error: no more will
+_STALLED = 12  # iterations that do not halve the error [J^1/2]: no more will
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
@@ -72,7 +72,7 @@ class Worlds:
     iterations: wp.array(dtype=int)
     limit: wp.array(dtype=int)  # of iterations, at which the present try ends
     error: wp.array(dtype=real)
-    best: wp.array(dtype=real)  # error of this try that none has halved since iteration `since`
+    best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
     since: wp.array(dtype=int)
     reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
     ahead: wp.array(dtype=real)  # that is tried
@@ -243,8 +243,8 @@ def judge_balance(
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     st.error[w] = wp.sqrt(wp.abs(rz) / work)
-    if st.error[w] < real(0.5) * st.best[w]:
-        st.best[w] = st.error[w]
+    if wp.abs(rz) < real(0.25) * st.best[w]:
+        st.best[w] = wp.abs(rz)
         st.since[w] = st.iterations[w]
     settled = int(1)
     if has_liquid == 1:
