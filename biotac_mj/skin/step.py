@@ -44,12 +44,12 @@ _FREE = (
     "tolerance",
     "max_newton",
     "max_cg",
+    "max_work",
     "stick_ratio",
     "mass_damping",
     "stiffness_damping",
     "max_core_depth",
 )
-_PARTS = 3  # times the iterations of a try: when a step begins no further part of its way
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
@@ -318,7 +318,7 @@ class SkinStep:
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(limits.refuse_deep, dim, constants, outputs)
         self._newton()
-        bounds = [_SHORTEST if g.count else 1.0, _PARTS * m.options.max_newton]
+        bounds = [_SHORTEST if g.count else 1.0, m.options.max_work]
         self._launch(worlds.judge_way, self.d.nworld, [*bounds, self.st, self._again])
 
     def _go_on(self):
@@ -375,7 +375,7 @@ class SkinStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, int(m.has_liquid)]
+        bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid)]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
 
     def _precondition(self):

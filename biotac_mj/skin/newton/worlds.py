@@ -92,6 +92,7 @@ class Worlds:
     side: wp.array(dtype=int)
     tries: wp.array(dtype=int)
     iterations_cg: wp.array(dtype=int)
+    work: wp.array(dtype=int)  # evaluations and products of this step so far
 
 
 BLOCK = 128  # threads that share the sums of one world
@@ -200,6 +201,7 @@ def begin_worlds(
     st.deep[w] = 0
     st.inverted[w] = 0
     st.iterations[w] = 0
+    st.work[w] = 0
     begin_try(st, w, limit)
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
@@ -214,6 +216,7 @@ def begin_worlds(
 def judge_balance(
     # In:
     tolerance: real,
+    max_work: int,
     has_liquid: int,
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
@@ -246,6 +249,9 @@ def judge_balance(
     if wp.abs(rz) < real(0.25) * st.best[w]:
         st.best[w] = wp.abs(rz)
         st.since[w] = st.iterations[w]
+    allowed = max_work
+    if st.stride[w] == real(0.0):  # what the first try leaves is for the way in parts
+        allowed = max_work / 3
     settled = int(1)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
@@ -253,7 +259,9 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED:
+    elif (
+        st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED or st.work[w] >= allowed
+    ):
         st.active[w] = 0
         st.failed[w] = 1
     else:
@@ -264,7 +272,7 @@ def judge_balance(
 
 
 @wp.kernel
-def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int)):
+def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
     The first try is the whole way from a guess, the second the whole way from where the step began, if the
@@ -290,7 +298,7 @@ def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int
             stride = real(0.5)
     else:
         stride = real(0.5) * stride
-    if stride < shortest or st.iterations[w] >= budget:
+    if stride < shortest or st.work[w] >= max_work:
         st.asked[w] = 0
         return
     st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
@@ -325,6 +333,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     slope = total_of(part, 1, w, t)
     if t > 0:
         return
+    st.work[w] = st.work[w] + 1
     if st.tries[w] == 0:
         st.slope[w] = slope
         st.slope_low[w] = slope
