@@ -166,7 +166,7 @@ def attach(
         parent = spec.worldbody if body is None else spec.body(body)
         spec.attach(child, frame=parent.add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
-    _collide(spec, core, config)
+    _collide(spec, core, config.friction, config.priority, config.geoms)
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
         _add_slots(spec, core, prefix, slots)
@@ -231,20 +231,20 @@ def _model(geometry):
     return spec
 
 
-def _collide(spec, core, config):
+def _collide(spec, core, friction, priority, geoms):
     """Core, nail and clamp meet what the skin meets: the geoms that are named, or all that collide."""
     for solid in core.geoms:
-        solid.friction[0], solid.priority = config.friction, config.priority
-        if config.geoms is None:
+        solid.friction[0], solid.priority = friction, priority
+        if geoms is None:
             continue
         solid.contype = solid.conaffinity = 0
-        for name in config.geoms:
+        for name in geoms:
             spec.add_pair(
                 geomname1=solid.name,
                 geomname2=name,
                 condim=3,
                 solref=solid.solref,
-                friction=[max(config.friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
+                friction=[max(friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
             )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..geometry.rigid import displace, displacement
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
@@ -21,7 +22,7 @@ from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
 from .touching import Touching
 
-__all__ = ["Instance", "Setup", "forget_skins", "reset_state", "state_size"]
+__all__ = ["Instance", "Setup", "forget_skins", "reset_state", "skin_thickness", "state_size"]
 
 # head of the plugin state: steps that did not converge, whether the last committed step did, whether a step
 # was made since the reset, and the energy that is in the skin at most [J]
@@ -47,9 +48,7 @@ class _Skin:
 
     @functools.cached_property
     def thickness(self):
-        geometry = self.geometry
-        free = np.setdiff1d(geometry.outer_face, geometry.fixed)
-        return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
+        return skin_thickness(self.geometry)
 
     @functools.cached_property
     def untouched(self):
@@ -57,6 +56,12 @@ class _Skin:
         state, n = np.empty(self.stepper.nstate), self.ngroup
         self.stepper.reset(state)
         return SkinResult(None, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.stepper.vert_xpos(state).copy())
+
+
+def skin_thickness(geometry: SkinGeometry) -> float:
+    """From the skin's outside to the core at most [m]."""
+    free = np.setdiff1d(geometry.outer_face, geometry.fixed)
+    return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
 
 
 class _SkinKey:

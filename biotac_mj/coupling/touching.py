@@ -135,7 +135,7 @@ def _select(model, core, names):
     parent = model.body_weldid[
         model.body_parentid
     ]  # as in MuJoCo's filter: links joined by one joint do not collide
-    biotacs = np.flatnonzero(np.isin(model.body_plugin, _alike(model, core)))
+    biotacs = _biotacs(model)
     out = []
     for i in range(model.ngeom):
         body = model.geom_bodyid[i]
@@ -149,9 +149,11 @@ def _select(model, core, names):
     return np.array(out, dtype=np.int64)
 
 
-def _alike(model, core):
-    """Instances of the plugin that the BioTac's body has."""
-    return np.flatnonzero(model.plugin == model.plugin[model.body_plugin[core]])
+def _biotacs(model):
+    """Bodies of all BioTacs, with a plugin or without: those that bear electrodes."""
+    user = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_USER))
+    bearing = [i for i in user if "electrodes" in model.name("sensor", i)]
+    return model.site_bodyid[model.sensor_objid[bearing]]
 
 
 def _not_excluded(model, core, ids):
