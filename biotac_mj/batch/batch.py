@@ -66,6 +66,7 @@ class Batch(Skins):
             for name in ("here", "start", "", "asked", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
+            r.drift, r.moved = (wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2))
             r.spent = wp.zeros(self.nworld, dtype=int)
             r.off, r.share, r.store = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
@@ -80,12 +81,12 @@ class Batch(Skins):
         r = self._of_step
         bodies = [self._core, self._body, d.xpos, d.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
-        arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof]
+        arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof, d.qvel]
         self._launch(
             dynamics.advance_groups,
             self.groups,
             [self._core, self._body, self.dt, *arrays],
-            [r.start_pos, r.start_mat, self._jacobian],
+            [r.start_pos, r.start_mat, self._jacobian, r.drift],
         )
         self.begin_step()
         if self.moving:
@@ -115,7 +116,7 @@ class Batch(Skins):
         """Finds where the bodies go with d.qacc."""
         r = self._of_step
         going = [self.dt**2, self._jacobian, d.qacc, r.start_pos, r.start_mat]
-        self._launch(dynamics.follow, self.groups, going, [r.pos, r.mat])
+        self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the wanted skins where the bodies go, or on the way there; one-way without acceleration."""
@@ -169,12 +170,16 @@ class Batch(Skins):
 
     def restrain(self, again: wp.array) -> None:
         """Withholds what was not paid for, after `aim`; sets again[0] where that changes how bodies move."""
-        models = [self.model, self._last, self._solid]
-        self._launch(rounds.restrain, self.nworld, models, [self._of_step, again])
+        r = self._of_step
+        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+        inputs = [self.model, self._last, self._wrench, self._solid]
+        self._launch(rounds.restrain, self.nworld, inputs, [r, again])
 
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
-        self._launch(rounds.conclude, self.nworld, [self.model, self._solid], [self._of_step])
+        r = self._of_step
+        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+        self._launch(rounds.conclude, self.nworld, [self.model, self._wrench, self._solid], [r])
 
     def _find_wrenches(self, pos, mat, withheld, out):
         inputs = [self.model, pos, mat, withheld, self._of_step]

@@ -60,13 +60,15 @@ def advance_groups(
     com: wp.array2d(dtype=wp.vec3),
     cvel: wp.array2d(dtype=wp.spatial_vector),
     cdof: wp.array2d(dtype=wp.spatial_vector),
+    qvel: wp.array2d(dtype=float),
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
     jacobian_out: wp.array3d(dtype=vec6),
+    drift_out: wp.array2d(dtype=vec6),
 ):
-    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative
-    to the BioTac."""
+    """Poses of the touching bodies after h at present velocities [group, world], their Jacobians relative to
+    the BioTac, and their motion h J v."""
     g, w = wp.tid()
     b = body[g]
     frame = _ahead_mat(core, w, h, xmat, cvel)
@@ -78,6 +80,7 @@ def advance_groups(
     finite = is_finite(pos, mat)  # what is lost takes no part in the dynamics
     turn = wp.transpose(matrix(xmat[w, core]))
     here = vector(xpos[w, core])
+    drift = vec6()
     for i in range(jacobian_out.shape[2]):
         share = real(
             isdofancestor[b, i] - isdofancestor[core, i]
@@ -90,6 +93,8 @@ def advance_groups(
             angular = share * (turn * spin)
             j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
         jacobian_out[g, w, i] = j
+        drift += h * real(qvel[w, i]) * j
+    drift_out[g, w] = drift
 
 
 @wp.kernel
@@ -140,6 +145,7 @@ def follow(
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
     # Out:
+    moved_out: wp.array2d(dtype=vec6),
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
@@ -148,6 +154,7 @@ def follow(
     m = vec6()
     for i in range(jacobian.shape[2]):
         m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
+    moved_out[g, w] = m
     p, R = displace(pos[g, w], mat[g, w], m)
     pos_out[g, w] = p
     mat_out[g, w] = R

@@ -138,8 +138,8 @@ def accept_models(
     # Out:
     model: Model,
 ):
-    """The linear models of skins that were asked for poses pos, mat: where their way ended, which began at the
-    last step's model; that model, where there was no way; no force on what is nowhere.
+    """The linear models of skins that were asked for poses pos, mat: where their way ended, which began at
+    the last step's model; that model, where there was no way; no force on what is nowhere.
 
     A world's first step has not `began`: its way came from outside."""
     g, w = wp.tid()

@@ -1,4 +1,4 @@
-"""Rigid motions in Warp: poses, rotation vectors and small motions, as `geometry.rigid` has them in numpy.
+"""Rigid motions in Warp: poses, rotation vectors and small motions.
 
 A small motion has the translation of the origin's point first, then the rotation vector."""
 
@@ -58,9 +58,9 @@ def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
 
 @wp.func
 def displace(pos: vec3, mat: mat33, m: vec6):
-    """The pose moved by a small motion, the inverse of `motion` to first order."""
-    turn = rotation(vec3(m[3], m[4], m[5]))
-    return turn * pos + vec3(m[0], m[1], m[2]), turn * mat
+    """The pose moved by a small motion, the inverse of `motion`: the body's own point goes straight on."""
+    turn = vec3(m[3], m[4], m[5])
+    return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, pos), rotation(turn) * mat
 
 
 @wp.func

@@ -52,6 +52,8 @@ class Rounds:
     start_mat: wp.array2d(dtype=mat33)
     pos: wp.array2d(dtype=vec3)
     mat: wp.array2d(dtype=mat33)
+    drift: wp.array2d(dtype=vec6)  # motion without acceleration, in MuJoCo's linear measure h J v
+    moved: wp.array2d(dtype=vec6)  # by acceleration: h^2 J a
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
     end_pos: wp.array2d(dtype=vec3)
@@ -62,9 +64,7 @@ class Rounds:
     began: wp.array(dtype=int)  # a step was made since the reset
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
     share: wp.array(dtype=real)  # of the way between them that the next round goes
-    push: wp.array(
-        dtype=real
-    )  # of the wrench at the present pose that acts: 1, or 0 where it is not paid for
+    push: wp.array(dtype=real)  # of the wrench at the present pose that acts: 1, or 0 where not paid for
     store: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
 
@@ -259,21 +259,22 @@ def judge(
 
 
 @wp.func
-def given(r: Rounds, model: Model, w: int, push: real):
-    """Work that the skin does on the bodies on their way, with a share of its push [J]."""
+def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
+    """What acts on a body, as MuJoCo takes it: linear in the accelerations, from its wrench without them."""
+    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w]
+
+
+@wp.func
+def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
+    """Work of what acts on the bodies on their way [J]."""
     work = real(0.0)
     for g in range(r.pos.shape[0]):
-        pos = r.pos[g, w]
-        mat = r.mat[g, w]
-        if is_finite(pos, mat):
-            wrench = wrench_at(model, g, w, pos, mat)
-            wrench -= (real(1.0) - push) * wrench_at(model, g, w, r.here_pos[g, w], r.here_mat[g, w])
-            work += wp.dot(wrench, motion(pos, mat, r.here_pos[g, w], r.here_mat[g, w]))
+        work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
     return work
 
 
 @wp.func
-def most_energy(r: Rounds, model: Model, solid: Solid, w: int):
+def most_energy(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), solid: Solid, w: int):
     """The most that a skin with these wrenches can hold: its force over the whole way to the core [J]."""
     if solid.inertial == 1:
         return real(wp.inf)
@@ -281,8 +282,7 @@ def most_energy(r: Rounds, model: Model, solid: Solid, w: int):
     if r.surface.shape[0] > 0:
         most = r.surface[w] * solid.area
     for g in range(r.pos.shape[0]):
-        if is_finite(r.pos[g, w], r.mat[g, w]):
-            most += solid.thickness * force_of(wrench_at(model, g, w, r.pos[g, w], r.mat[g, w]))
+        most += solid.thickness * force_of(acting(r, model, wrench, g, w))
     return most
 
 
@@ -291,6 +291,7 @@ def restrain(
     # In:
     model: Model,
     last: Model,
+    wrench: wp.array2d(dtype=vec6),
     solid: Solid,
     # In and out:
     r: Rounds,
@@ -302,7 +303,7 @@ def restrain(
     last step, and what those have put in who have moved bodies since.
     """
     w = wp.tid()
-    most = most_energy(r, model, solid, w)
+    most = most_energy(r, model, wrench, solid, w)
     store = r.store[w]
     known = r.began[w]
     before = real(0.0)
@@ -312,10 +313,10 @@ def restrain(
         if not size_of(jump) <= _TELEPORT:
             known = 0
         before += wp.dot(last.wrench0[g, w], jump)
-        now += wp.dot(wrench_at(model, g, w, r.pos[g, w], r.mat[g, w]), jump)
+        now += wp.dot(acting(r, model, wrench, g, w), jump)
     store = wp.where(known == 1, wp.min(store - wp.min(before, now), most), most)
     r.store[w] = store
-    if given(r, model, w, real(1.0)) > wp.max(store, real(0.0)):
+    if given(r, model, wrench, w) > wp.max(store, real(0.0)):
         r.push[w] = real(0.0)
         again[0] = 1
 
@@ -324,13 +325,15 @@ def restrain(
 def conclude(
     # In:
     model: Model,
+    wrench: wp.array2d(dtype=vec6),
     solid: Solid,
     # In and out:
     r: Rounds,
 ):
     """Keeps the energy that is left, and where the bodies go."""
     w = wp.tid()
-    r.store[w] = wp.min(r.store[w] - given(r, model, w, r.push[w]), most_energy(r, model, solid, w))
+    left = r.store[w] - given(r, model, wrench, w)
+    r.store[w] = wp.min(left, most_energy(r, model, wrench, solid, w))
     for g in range(r.pos.shape[0]):
         r.end_pos[g, w] = r.pos[g, w]
         r.end_mat[g, w] = r.mat[g, w]
