@@ -94,6 +94,6 @@ def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.nd
 
 
 def displace(pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
-    turn = rotation(motion[:, 3:])
-    return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
+    """Poses moved by (n, 6) small motions, the inverse of `displacement`: their own points go straight on, as
+    MuJoCo moves bodies that spin."""
+    return pos + motion[:, :3] + cross(motion[:, 3:], pos), rotation(motion[:, 3:]) @ mat
