@@ -67,7 +67,8 @@ class Batch(Skins):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             r.drift, r.moved = (wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2))
-            r.spent = wp.zeros(self.nworld, dtype=int)
+            r.spent, r.far = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
+            r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
             r.off, r.share, r.store = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
@@ -125,6 +126,10 @@ class Batch(Skins):
         if self.moving:
             self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self.model], [r])
             pos, mat = r.asked_pos, r.asked_mat
+            self.place_geoms(pos, mat, m.geom_pos, m.geom_quat)
+            x = self.skin.x
+            self._launch(rounds.look_ahead, x.shape, [self.skin.geoms.struct, x], [r])
+            self._launch(rounds.draw_near, self.nworld, [], [r])
         if self.skin.inertial:
             skin, data = self.skin, self.skin.data
             arrays = [

@@ -5,18 +5,23 @@ Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
+from ..skin.contact.faces import Geoms
+from ..skin.contact.shapes import distance_bound
 from ..skin.newton.worlds import CONVERGED
 from .kernels import Model, wrench_at
 from .rigid import LEVER, displace, is_finite, motion, size_of
 
 __all__ = [
+    "SHARES",
     "Rounds",
     "ask",
     "begin_rounds",
     "change_forces",
     "conclude",
+    "draw_near",
     "judge",
     "look",
+    "look_ahead",
     "restrain",
     "wrenches",
 ]
@@ -35,6 +40,7 @@ _DEEPER = wp.constant(wp.float64(5e-4))  # [m] beyond the last known pose, a ski
 _CLOSER = wp.constant(wp.float64(0.7))  # a round that leaves more of the distance than this was too bold
 _LEAST_STEP = wp.constant(wp.float64(0.125))
 _MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the last model must do
+SHARES = 8  # of a way that crosses the skin are looked at
 _TELEPORT = wp.constant(wp.float64(1e-3))  # [m] a body moved further than this from outside was put there
 
 
@@ -62,6 +68,8 @@ class Rounds:
     rounds: wp.array(dtype=int)  # solves of the skin
     spent: wp.array(dtype=int)  # iterations of its solver
     began: wp.array(dtype=int)  # a step was made since the reset
+    far: wp.array(dtype=int)  # so far the bodies go from where nothing touches that they may cross the skin
+    depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
     share: wp.array(dtype=real)  # of the way between them that the next round goes
     push: wp.array(dtype=real)  # of the wrench at the present pose that acts: 1, or 0 where not paid for
@@ -122,7 +130,8 @@ def begin_rounds(r: Rounds):
 
 @wp.func
 def within_reach(r: Rounds, model: Model, w: int):
-    """Share of the way from the model's pose to the asked ones that leads no deeper than is known."""
+    """Share of the way from the model's pose to the asked ones that leads no deeper than is known; and
+    whether anything touches there."""
     touched = int(0)
     depth = real(0.0)
     for g in range(r.pos.shape[0]):
@@ -135,7 +144,7 @@ def within_reach(r: Rounds, model: Model, w: int):
     share = real(1.0)
     if touched == 1 and depth > _DEEPER:
         share = _DEEPER / depth
-    return share
+    return share, touched
 
 
 @wp.kernel
@@ -160,7 +169,7 @@ def ask(
             p, R = displace(p0, R0, r.share[w] * motion(p, R, p0, R0))
         r.asked_pos[g, w] = p
         r.asked_mat[g, w] = R
-    near = within_reach(r, model, w)
+    near, touched = within_reach(r, model, w)
     if near < real(1.0):
         for g in range(r.pos.shape[0]):
             p0 = model.pos0[g, w]
@@ -168,7 +177,63 @@ def ask(
             p, R = displace(p0, R0, near * motion(r.asked_pos[g, w], r.asked_mat[g, w], p0, R0))
             r.asked_pos[g, w] = p
             r.asked_mat[g, w] = R
+    far = real(0.0)
+    for g in range(r.pos.shape[0]):
+        way = motion(r.asked_pos[g, w], r.asked_mat[g, w], r.here_pos[g, w], r.here_mat[g, w])
+        far = wp.max(far, size_of(way))
+    r.far[w] = 0
+    if touched == 0 and far > _DEEPER:
+        r.far[w] = 1
+    for k in range(r.depth.shape[0]):
+        r.depth[k, w] = real(-1.0)
     r.rounds[w] = r.rounds[w] + 1
+
+
+@wp.kernel
+def look_ahead(
+    # In:
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    r: Rounds,
+):
+    """How deep nodes of the skin, where it is, would be in the bodies on their way to where they are asked
+    to."""
+    i, w = wp.tid()
+    if r.far[w] == 0:
+        return
+    for g in range(geoms.count):
+        k = geoms.group[g]
+        pos = r.asked_pos[k, w]
+        mat = r.asked_mat[k, w]
+        way = motion(pos, mat, r.here_pos[k, w], r.here_mat[k, w])
+        for s in range(r.depth.shape[0]):
+            p, R = displace(r.here_pos[k, w], r.here_mat[k, w], real(s) / real(SHARES) * way)
+            y = mat * (wp.transpose(R) * (x[i, w] - p)) + pos - geoms.pos[g, w]
+            y = wp.transpose(geoms.mat[g, w]) * y
+            d = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+            wp.atomic_max(r.depth, s, w, -d)
+
+
+@wp.kernel
+def draw_near(r: Rounds):
+    """Leaves so much of a way from where nothing touches that the bodies are no deeper in the skin than one
+    round goes."""
+    w = wp.tid()
+    if r.far[w] == 0:
+        return
+    share = real(1.0)
+    for s in range(r.depth.shape[0] - 1):
+        before = r.depth[s, w]
+        after = r.depth[s + 1, w]
+        if share == real(1.0) and before <= _DEEPER and after > _DEEPER:
+            share = (real(s) + (_DEEPER - before) / (after - before)) / real(SHARES)
+    for g in range(r.pos.shape[0]):
+        p0 = r.here_pos[g, w]
+        R0 = r.here_mat[g, w]
+        p, R = displace(p0, R0, share * motion(r.asked_pos[g, w], r.asked_mat[g, w], p0, R0))
+        r.asked_pos[g, w] = p
+        r.asked_mat[g, w] = R
 
 
 @wp.func

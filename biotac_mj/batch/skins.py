@@ -126,14 +126,18 @@ class Skins:
           geom_pos, geom_quat: mujoco_warp's arrays (1 or nworld, ngeom) of the geoms on their bodies.
         """
         skin = self.skin
-        poses = [geom_pos, geom_quat, pos, mat]
-        self._launch(
-            kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
-        )
+        self.place_geoms(pos, mat, geom_pos, geom_quat)
         skin.solve_skins()
         st = skin.data.worlds
         solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, pos, mat, self._last], [self.model])
+
+    def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
+        """Puts the skins' geoms on bodies as in `solve_at`."""
+        skin, poses = self.skin, [geom_pos, geom_quat, pos, mat]
+        self._launch(
+            kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
+        )
 
     def sense(self, sensordata: wp.array) -> None:
         """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches
