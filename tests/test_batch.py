@@ -312,7 +312,8 @@ def test_a_pose_in_the_core_is_gone_to_as_far_as_it_can():
     """The force belongs to the share of the way that is told; the others do not notice, and the world goes
     on."""
     mjm, good = run()
-    _, bad = run(5, [-12e-3, -4e-3, 0])
+    start = places(3)[1]
+    _, bad = run(5, start * [1, 0.5, 0.5])
     np.testing.assert_array_equal(bad[:, [0, 2]], good[:, [0, 2]])
     status, force = reading(mjm, "status"), reading(mjm, "contact_force")
     state = bad[5, 1, status]
@@ -320,9 +321,8 @@ def test_a_pose_in_the_core_is_gone_to_as_far_as_it_can():
     assert bad[5, 1, force][1] > 3 * good[5, 1, force][1] > 0  # it pushes out
     assert (np.delete(bad[:, 1, status][:, 0], 5) == 1).all()
     assert (np.delete(bad[:, 1, status][:, 6], 5) == 1).all()
-    np.testing.assert_allclose(
-        bad[-1, 1, force][:3], good[-1, 1, force][:3], atol=0.05 * good[-1, 1, force][1]
-    )
+    there, here = (np.linalg.norm(x[-1, 1, force][:3]) for x in (good, bad))
+    assert here == pytest.approx(there, rel=0.3)  # but for friction, which remembers
 
 
 def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():

@@ -66,10 +66,11 @@ class Batch(Skins):
             for name in ("here", "start", "", "asked", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
-            r.drift, r.moved = (wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2))
-            r.spent, r.far = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
+            for name in ("drift", "moved", "full_wrench", "full_motion"):
+                setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
+            r.spent, r.far, r.trial = (wp.zeros(self.nworld, dtype=int) for _ in range(3))
             r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
-            r.off, r.share, r.store = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
+            r.off, r.share, r.store, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(4))
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         self._solid = rounds.Solid()
@@ -174,17 +175,27 @@ class Batch(Skins):
         self.solve_skins(m, d)
 
     def restrain(self, again: wp.array) -> None:
-        """Withholds what was not paid for, after `aim`; sets again[0] where that changes how bodies move."""
-        r = self._of_step
-        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
-        inputs = [self.model, self._last, self._wrench, self._solid]
-        self._launch(rounds.restrain, self.nworld, inputs, [r, again])
+        """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
+        changes how bodies move."""
+        self._settle(rounds.restrain, [self._last], [self._solid], [again])
+
+    def share_push(self) -> None:
+        """Gives those as much push as they have energy for, after `aim` without any."""
+        self._settle(rounds.share_push)
+
+    def withhold(self, again: wp.array) -> None:
+        """Takes it again where it still is too much, as `restrain`."""
+        self._settle(rounds.withhold, outputs=[again])
 
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
+        self._settle(rounds.conclude, solid=[self._solid])
+
+    def _settle(self, kernel, last=(), solid=(), outputs=()):
         r = self._of_step
         self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
-        self._launch(rounds.conclude, self.nworld, [self.model, self._wrench, self._solid], [r])
+        inputs = [self.model, *last, self._wrench, *solid]
+        self._launch(kernel, self.nworld, inputs, [r, *outputs])
 
     def _find_wrenches(self, pos, mat, withheld, out):
         inputs = [self.model, pos, mat, withheld, self._of_step]
@@ -246,6 +257,18 @@ class Hook:
             for batch in moving:
                 batch.solve_again(m, d)
 
+        def withhold():
+            self._accelerate(m, d, moving)
+            again.zero_()
+            for batch in moving:
+                batch.withhold(again)
+
+        def restrain():
+            self._accelerate(m, d, moving)
+            for batch in moving:
+                batch.share_push()
+            wp.capture_while(again, withhold)
+
         _begin_dynamics(m, d)
         self._accelerate(m, d, moving, first=True)
         again.zero_()
@@ -254,7 +277,7 @@ class Hook:
         wp.capture_while(again, go_on)
         for batch in moving:
             batch.restrain(again)
-        wp.capture_if(again, lambda: self._accelerate(m, d, moving))
+        wp.capture_if(again, restrain)
         for batch in moving:
             batch.conclude()
 

@@ -23,6 +23,8 @@ __all__ = [
     "look",
     "look_ahead",
     "restrain",
+    "share_push",
+    "withhold",
     "wrenches",
 ]
 
@@ -40,6 +42,9 @@ _DEEPER = wp.constant(wp.float64(5e-4))  # [m] beyond the last known pose, a ski
 _CLOSER = wp.constant(wp.float64(0.7))  # a round that leaves more of the distance than this was too bold
 _LEAST_STEP = wp.constant(wp.float64(0.125))
 _MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the last model must do
+_BISECTIONS = 12
+_TRIALS = 4
+_CAUTION = wp.constant(wp.float64(0.9))
 SHARES = 8  # of a way that crosses the skin are looked at
 _TELEPORT = wp.constant(wp.float64(1e-3))  # [m] a body moved further than this from outside was put there
 
@@ -72,7 +77,12 @@ class Rounds:
     depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
     share: wp.array(dtype=real)  # of the way between them that the next round goes
-    push: wp.array(dtype=real)  # of the wrench at the present pose that acts: 1, or 0 where not paid for
+    push: wp.array(dtype=real)  # of the wrench at the present pose that acts: less than 1 where not paid for
+    trial: wp.array(dtype=int)  # of shares of the push
+    without: wp.array(dtype=real)  # [J] work without any push
+    # with all of the push: wrenches that act, and motions of the bodies
+    full_wrench: wp.array2d(dtype=vec6)
+    full_motion: wp.array2d(dtype=vec6)
     store: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
 
@@ -351,6 +361,12 @@ def most_energy(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), solid: 
     return most
 
 
+@wp.func
+def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
+    """Whether what acts gives more energy than there is."""
+    return given(r, model, wrench, w) > wp.max(r.store[w], real(0.0))
+
+
 @wp.kernel
 def restrain(
     # In:
@@ -362,14 +378,13 @@ def restrain(
     r: Rounds,
     again: wp.array(dtype=int),
 ):
-    """Withholds the push of skins that would give more energy than was put into them.
+    """Finds the energy in the skins, and takes the push of those that would give more.
 
     What remains without it is the skin's tangent about the present pose: a damper. The energy is that of the
     last step, and what those have put in who have moved bodies since.
     """
     w = wp.tid()
     most = most_energy(r, model, wrench, solid, w)
-    store = r.store[w]
     known = r.began[w]
     before = real(0.0)
     now = real(0.0)
@@ -377,13 +392,71 @@ def restrain(
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         if not size_of(jump) <= _TELEPORT:
             known = 0
+        acts = acting(r, model, wrench, g, w)
         before += wp.dot(last.wrench0[g, w], jump)
-        now += wp.dot(acting(r, model, wrench, g, w), jump)
-    store = wp.where(known == 1, wp.min(store - wp.min(before, now), most), most)
-    r.store[w] = store
-    if given(r, model, wrench, w) > wp.max(store, real(0.0)):
+        now += wp.dot(acts, jump)
+        r.full_wrench[g, w] = acts
+        r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
+    r.store[w] = wp.where(known == 1, wp.min(r.store[w] - wp.min(before, now), most), most)
+    if overdraws(r, model, wrench, w):
         r.push[w] = real(0.0)
         again[0] = 1
+
+
+@wp.kernel
+def share_push(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+):
+    """As much push as there is energy for, of skins without any: what acts, and how bodies move, is linear in
+    it while no other contact changes."""
+    w = wp.tid()
+    if r.push[w] == real(1.0):
+        return
+    # of the work: without push, with all of it, and half of the curve between them
+    none = given(r, model, wrench, w)
+    full = real(0.0)
+    bend = real(0.0)
+    for g in range(r.pos.shape[0]):
+        full += wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
+        change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
+        bend += wp.dot(change, r.full_motion[g, w] - r.drift[g, w] - r.moved[g, w])
+    low = real(0.0)
+    high = real(1.0)
+    for _ in range(_BISECTIONS):
+        p = real(0.5) * (low + high)
+        if none + p * (full - none - bend) + p * p * bend > wp.max(r.store[w], real(0.0)):
+            high = p
+        else:
+            low = p
+    r.push[w] = low
+    r.without[w] = none
+    r.trial[w] = 0
+
+
+@wp.kernel
+def withhold(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+    again: wp.array(dtype=int),
+):
+    """Withholds more where a share of the push still gives too much, at last all."""
+    w = wp.tid()
+    if r.push[w] == real(1.0) or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+        return
+    none = r.without[w]
+    room = (wp.max(r.store[w], real(0.0)) - none) / (given(r, model, wrench, w) - none)
+    r.push[w] = _CAUTION * room * r.push[w]
+    r.trial[w] = r.trial[w] + 1
+    if r.trial[w] == _TRIALS:
+        r.push[w] = real(0.0)
+    again[0] = 1
 
 
 @wp.kernel

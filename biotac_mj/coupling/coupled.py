@@ -5,6 +5,7 @@ import numpy as np
 
 from ..geometry.rigid import displace, displacement, rotation
 from .instance import LEVER, Instance
+from .stepper import SkinResult
 from .structs import DataView
 
 __all__ = ["Coupled"]
@@ -77,7 +78,7 @@ class Coupled:
         """What `use` takes to come back to the present model."""
         return self.asked, self.result
 
-    def use(self, asked: tuple, result) -> None:
+    def use(self, asked: tuple, result: SkinResult) -> None:
         """Takes the model of a solve at `asked`."""
         if asked is None:
             return
