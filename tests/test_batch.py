@@ -399,6 +399,97 @@ def test_finger_and_ball_exchange_momentum_and_lose_none():
     np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=2e-3 * np.abs(before[:, 3:]).max())
 
 
+def thrown(speeds, spins, mass, timestep, steps, neighbours=0):
+    """Steps a ball thrown at a fixed finger in each world, and a quiet one in as many worlds more; yields
+    kinetic energies (nworld,) [J], then the model, its Data and velocities at the start."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]
+    ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
+    ball.add_freejoint()
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=mass)
+    nworld = len(speeds) + neighbours
+    mjm, m, d, _ = make(spec, nworld, readings=False)
+    velocity = np.zeros((nworld, 6))
+    velocity[: len(speeds), 1], velocity[: len(speeds), 3:] = speeds, spins
+    velocity[len(speeds) :, 1] = 0.02
+    d.qvel.assign(velocity)
+    weight = np.array([mass] * 3 + [0.4 * mass * RADIUS**2] * 3)
+    for _ in range(steps):
+        yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
+        mjw.step(m, d)
+    yield 0.5 * (weight * d.qvel.numpy().astype(float) ** 2).sum(axis=1), mjm, d, velocity
+
+
+def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
+    speeds, timestep, steps = [0.05, 0.3, 0.6], 2e-3, 20
+    rounds = []
+    for _, mjm, d, velocity in thrown(speeds, 0.0, 0.02, timestep, steps):  # noqa: B007
+        rounds.append(read(mjm, d, "status")[:, 5].copy())
+    assert (np.max(rounds, axis=0)[1:] > 1).all() and (read(mjm, d, "status")[:, 7] == 0).all()
+    for w, v in enumerate(velocity):
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]
+        ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
+        ball.add_freejoint()
+        ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.02)
+        biotac_mj.attach(spec, skin=shell(), readings="none")
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qvel[:] = v
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+        assert data.qvel[1] < 0.5 * v[1]
+        np.testing.assert_allclose(d.qvel.numpy()[w, :3], data.qvel[:3], atol=0.03 * v[1])
+
+
+@pytest.mark.parametrize("mass, spin", [(1e-3, 5.0), (1e-3, 50.0), (0.5, 5.0)])
+def test_no_ball_gains_energy(mass, spin):
+    """Light ones that spin, in steps of 4 ms; the neighbours notice nothing."""
+    speeds = [0.05, 0.3, 1.0]
+    spins = spin * np.random.default_rng(3).normal(size=(3, 3))
+    seen = thrown(speeds, spins, mass, 4e-3, 12, neighbours=1)
+    alone = thrown([], 0.0, mass, 4e-3, 12, neighbours=1)
+    start, mjm, d, _ = next(seen)
+    *_, other, _ = next(alone)
+    force = np.zeros(4)
+    for energy, *_ in seen:
+        next(alone)
+        assert (energy <= 1.05 * start).all()
+        force = np.maximum(force, np.linalg.norm(read(mjm, d, "contact_force")[:, :3], axis=1))
+    assert (force[:3] > 5e-3).all() and (d.qpos.numpy()[:, 1] < -4e-3).all()  # none is past the middle
+    np.testing.assert_allclose(d.qpos.numpy()[3], other.qpos.numpy()[0], atol=1e-7)
+
+
+def test_a_skin_without_energy_pushes_nobody():
+    """A ball that was pressed in and let go; of the second skin is forgotten what was put into it."""
+    mjm, m, d, batch = make(ball_spec(), 2, readings=False)
+    d.qfrc_applied.assign(np.full((2, 1), 1.0))
+    for _ in range(60):
+        mjw.step(m, d)
+    d.qfrc_applied.zero_()
+    batch._of_step.store.assign(batch._of_step.store.numpy() * [1, 0])
+    mjw.step(m, d)
+    (free, held), status = d.qvel.numpy()[:, 0], read(mjm, d, "status")
+    assert free < -0.04 and 0.5 * 0.01 * held**2 < 0.05 * 0.5 * 0.01 * free**2
+    assert status[0, 7] == 0 and 0.5 < status[1, 7] <= 1
+
+
+def test_the_model_of_a_way_that_was_not_gone_to_its_end_belongs_to_where_it_ended():
+    _, m, d, batch = make(press_spec(), 1, readings=False)
+    start = places(1)
+    for _ in press(m, d, start, 4, [1e-3]):
+        pass
+    before = batch.model.pos0.numpy()[0, 0].copy()
+    np.testing.assert_allclose(before, d.mocap_pos.numpy()[0, 0], atol=1e-8)
+    move(d, start * [1, 0.5, 0.5])
+    mjw.step(m, d)
+    reached, after = batch.skin.data.reached[0], batch.model.pos0.numpy()[0, 0]
+    assert 0 < reached < 1 and batch.wrench[0, 0, 1] < -1
+    asked = d.mocap_pos.numpy()[0, 0]
+    np.testing.assert_allclose(after, before + reached * (asked - before), atol=1e-9)
+    np.testing.assert_allclose(batch.skin.geoms.struct.pos_last.numpy()[0, 0], after, atol=1e-9)
+
+
 INERTIA = {"dynamics": "implicit", "mass_damping": 50.0, "contact_stiffness": K, "tolerance": 1e-5}
 
 

@@ -68,7 +68,8 @@ class Batch(Skins):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             for name in ("drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            r.spent, r.far, r.trial = (wp.zeros(self.nworld, dtype=int) for _ in range(3))
+            for name in ("spent", "far", "trial", "placed", "inside"):
+                setattr(r, name, wp.zeros(self.nworld, dtype=int))
             r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
             r.off, r.share, r.store, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(4))
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
@@ -117,7 +118,7 @@ class Batch(Skins):
     def aim(self, d: "mjw.Data") -> None:
         """Finds where the bodies go with d.qacc."""
         r = self._of_step
-        going = [self.dt**2, self._jacobian, d.qacc, r.start_pos, r.start_mat]
+        going = [self.dt**2, self._jacobian, d.qacc, r.here_pos, r.start_pos, r.start_mat]
         self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:

@@ -7,7 +7,7 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
-from .rigid import displace, is_finite, matrix, rotation, vector
+from .rigid import displace_from, is_finite, matrix, rotation, vector
 
 __all__ = [
     "add_forces",
@@ -142,6 +142,7 @@ def follow(
     h2: real,
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
+    here: wp.array2d(dtype=vec3),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
     # Out:
@@ -155,7 +156,7 @@ def follow(
     for i in range(jacobian.shape[2]):
         m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
     moved_out[g, w] = m
-    p, R = displace(pos[g, w], mat[g, w], m)
+    p, R = displace_from(here[g, w], pos[g, w], mat[g, w], m)
     pos_out[g, w] = p
     mat_out[g, w] = R
 

@@ -4,7 +4,7 @@ A small motion has the translation of the origin's point first, then the rotatio
 
 import warp as wp
 
-__all__ = ["displace", "is_finite", "matrix", "motion", "rotation", "size_of", "vector"]
+__all__ = ["displace", "displace_from", "is_finite", "matrix", "motion", "rotation", "size_of", "vector"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,10 +57,16 @@ def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
 
 
 @wp.func
+def displace_from(here: vec3, pos: vec3, mat: mat33, m: vec6):
+    """The pose moved by a small motion that was measured with the body's own point `here`."""
+    turn = vec3(m[3], m[4], m[5])
+    return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here), rotation(turn) * mat
+
+
+@wp.func
 def displace(pos: vec3, mat: mat33, m: vec6):
     """The pose moved by a small motion, the inverse of `motion`: the body's own point goes straight on."""
-    turn = vec3(m[3], m[4], m[5])
-    return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, pos), rotation(turn) * mat
+    return displace_from(pos, pos, mat, m)
 
 
 @wp.func

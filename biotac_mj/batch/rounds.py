@@ -73,6 +73,8 @@ class Rounds:
     rounds: wp.array(dtype=int)  # solves of the skin
     spent: wp.array(dtype=int)  # iterations of its solver
     began: wp.array(dtype=int)  # a step was made since the reset
+    placed: wp.array(dtype=int)  # bodies were put where they are from outside
+    inside: wp.array(dtype=int)  # and into the skin
     far: wp.array(dtype=int)  # so far the bodies go from where nothing touches that they may cross the skin
     depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
@@ -130,6 +132,12 @@ def wrenches(
 @wp.kernel
 def begin_rounds(r: Rounds):
     w = wp.tid()
+    r.placed[w] = 1 - r.began[w]
+    for g in range(r.pos.shape[0]):
+        jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
+        if not size_of(jump) <= _TELEPORT:
+            r.placed[w] = 1
+    r.inside[w] = r.placed[w]
     r.settled[w] = 1
     r.rounds[w] = 0
     r.spent[w] = 0
@@ -194,6 +202,8 @@ def ask(
     r.far[w] = 0
     if touched == 0 and far > _DEEPER:
         r.far[w] = 1
+    if r.rounds[w] == 0 and r.placed[w] == 1:
+        r.far[w] = 1
     for k in range(r.depth.shape[0]):
         r.depth[k, w] = real(-1.0)
     r.rounds[w] = r.rounds[w] + 1
@@ -232,6 +242,8 @@ def draw_near(r: Rounds):
     w = wp.tid()
     if r.far[w] == 0:
         return
+    if r.rounds[w] == 1 and r.depth[0, w] <= real(0.0):
+        r.inside[w] = 0
     share = real(1.0)
     for s in range(r.depth.shape[0] - 1):
         before = r.depth[s, w]
@@ -385,19 +397,23 @@ def restrain(
     """
     w = wp.tid()
     most = most_energy(r, model, wrench, solid, w)
-    known = r.began[w]
     before = real(0.0)
     now = real(0.0)
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
-        if not size_of(jump) <= _TELEPORT:
-            known = 0
         acts = acting(r, model, wrench, g, w)
         before += wp.dot(last.wrench0[g, w], jump)
         now += wp.dot(acts, jump)
         r.full_wrench[g, w] = acts
         r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
-    r.store[w] = wp.where(known == 1, wp.min(r.store[w] - wp.min(before, now), most), most)
+    store = r.store[w] - wp.min(before, now)
+    if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with
+        store = real(0.0)
+        if r.inside[w] == 1 or solid.inertial == 1:
+            store = most
+        elif r.surface.shape[0] > 0:
+            store = r.surface[w] * solid.area
+    r.store[w] = wp.min(store, most)
     if overdraws(r, model, wrench, w):
         r.push[w] = real(0.0)
         again[0] = 1
