@@ -234,6 +234,11 @@ class Hook:
                 batch.solve_skins(m, d)
         if moving:
             if self._outside is None:
+                if d.qacc.device.is_cuda and d.qacc.device.is_capturing:
+                    raise ValueError(
+                        "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
+                        "the memory for the loops in it"
+                    )
                 self._outside, self._again = wp.empty_like(d.qfrc_passive), wp.zeros(1, dtype=int)
                 self._scratch = Scratch(d.qacc.device)
             wp.copy(self._outside, d.qfrc_passive)
