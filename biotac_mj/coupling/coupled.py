@@ -59,7 +59,7 @@ class Coupled:
         solved [m]."""
         self.acceleration = acceleration
         self.moved = self.horizon**2 * (self.jacobian @ acceleration)
-        self.target = displace(*self.pose, self.moved)
+        self.target = displace(*self.pose, self.moved, self.here[0])
         self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
         return self.off
 

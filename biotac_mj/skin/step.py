@@ -18,7 +18,8 @@ A world that finds no balance goes there in parts: its geoms move from where the
 ended, as far as the skin finds a balance; no skin fits between the core and a geom deep inside it. A world
 that does not come to the end stays where it came to (`data.reached`), is counted in
 `data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not finite, which
-stays where it was. The others do not notice. Worlds that are done idle inside the loops."""
+stays where it was. The others do not notice. Worlds that are done idle inside the loops; those that are not
+`data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
 import weakref
@@ -483,8 +484,8 @@ class SkinStep:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
         self._launch(worlds.release_geoms, (g.count, w), [g.struct, self._way, st])
         frame = [d.frame_pos, d.frame_mat]
-        self._launch(nodes.end_nodes, d.x.shape, [int(self.implicit), d.x, k.world, *frame, d.dt, d.x_last],
-                     [d.increment, d.velocity])  # fmt: skip
+        end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
+        self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])
         if self.implicit:
             self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])

@@ -58,6 +58,7 @@ class Worlds:
     last_pressure: wp.array(dtype=real)  # when the last step ended, above the surroundings [Pa]
     pressure: wp.array(dtype=real)  # at the last evaluation [Pa]
     volume: wp.array(dtype=real)  # of the liquid there [m^3]
+    wanted: wp.array(dtype=int)  # takes part in this step; who does not stays as the last one left it
     asked: wp.array(dtype=int)  # its input can be solved, and its way is not at its end
     active: wp.array(dtype=int)  # not yet in balance
     running: wp.array(dtype=int)  # its linear solve goes on
@@ -154,6 +155,16 @@ def begin_worlds(
     if w == 0:
         for k in range(flags.shape[0]):
             flags[k] = 0
+    m = st.mu[w]
+    l = st.lam[w]
+    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
+    if law == 2:
+        E = real(9.0) * l * m / (real(3.0) * l + m)
+    st.softness[w] = youngs_modulus / E
+    if st.wanted[w] == 0:
+        st.asked[w] = 0
+        st.active[w] = 0
+        return
     st.reason[w] = CONVERGED
     finite = int(1)
     now_last = real(0.0)
@@ -181,12 +192,6 @@ def begin_worlds(
             now_last += wp.dot(p - last, was)
             square += wp.dot(was, was)
         touched_by[g, w] = 0
-    m = st.mu[w]
-    l = st.lam[w]
-    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
-    if law == 2:
-        E = real(9.0) * l * m / (real(3.0) * l + m)
-    st.softness[w] = youngs_modulus / E
     if not (wp.isfinite(E + st.kappa[w] + st.natural[w]) and E > real(0.0)):
         finite = 0
     repeat = real(0.0)
@@ -439,7 +444,9 @@ def end_way(
     w = wp.tid()
     f = st.reached[w]
     st.moving[w] = 0
-    st.failed[w] = 0
+    st.failed[w] = 1 - st.wanted[w]
+    if st.wanted[w] == 0:
+        return
     if f < real(1.0):
         st.moving[w] = 1
         any_short[0] = 1
@@ -458,6 +465,8 @@ def end_way(
 def release_geoms(geoms: Geoms, way: Way, st: Worlds):
     """Makes the poses that were reached those of the last step, and writes back what was set."""
     g, w = wp.tid()
+    if st.wanted[w] == 0:
+        return
     if st.reason[w] != NOT_FINITE:
         geoms.pos_last[g, w] = geoms.pos[g, w]
         geoms.mat_last[g, w] = geoms.mat[g, w]
@@ -469,6 +478,8 @@ def release_geoms(geoms: Geoms, way: Way, st: Worlds):
 def end_worlds(st: Worlds):
     w = wp.tid()
     st.active[w] = 0
+    if st.wanted[w] == 0:
+        return
     if st.reason[w] != CONVERGED:
         st.nonconverged[w] = st.nonconverged[w] + 1
     if st.failed[w] == 0:
