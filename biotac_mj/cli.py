@@ -622,7 +622,8 @@ def _add_diagnose(verbs):
 def _diagnose(args):
     from .discrepancy import verbs
 
-    _check_device(args)
+    if args.tier == "full":
+        _check_device(args)
     verbs.diagnose_verb(args)
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import pathlib
 import typing
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -122,6 +123,9 @@ def read_npz(
     path: pathlib.Path | str, what: str, remedy: str, wanted: Mapping[str, Array] | None = None
 ) -> dict:
     """Arrays of an .npz file, the wanted ones or all; see `check_arrays`."""
+    with reading(path, what, remedy):
+        if pathlib.Path(path).is_file() and not zipfile.is_zipfile(path):
+            raise Unfit(f"{path} is no {what}, not even an .npz file: {remedy}")
     with reading(path, what, remedy), np.load(path, allow_pickle=False) as file:
         names = file.files if wanted is None else [name for name in wanted if name in file.files]
         found = {name: file[name] for name in names}

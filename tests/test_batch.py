@@ -432,7 +432,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
         ball = spec.worldbody.add_body(name="ball", pos=[-0.009, -0.011, 0.001])
         ball.add_freejoint()
         ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.02)
-        biotac_mj.attach(spec, skin=shell(), readings="none")
+        biotac_mj.attach(spec, body="world", skin=shell(), readings="none")
         model = spec.compile()
         data = mujoco.MjData(model)
         data.qvel[:] = v

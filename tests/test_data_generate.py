@@ -413,8 +413,9 @@ def test_the_command_reports_what_it_made(tmp_path, capsys):
     assert cli.main(arguments) == 0
     text = capsys.readouterr().out
     assert "1 interactions, 8 time steps, 0 of them not converged" in text and "1 shards made" in text
-    assert cli.main([*arguments, "--count", "-3"]) == 2
-    assert "count is -3" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main([*arguments, "--count", "-3"])
+    assert "--count: '-3' is not a whole number" in capsys.readouterr().err
 
 
 def test_skins_that_vary_and_relax(tmp_path):

@@ -118,7 +118,7 @@ def test_colour_of_noise_is_told_from_differences():
             "line 1: e1 is 'x1', not a finite number",
         ),
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like volts"),
-        ((" ".join(["-40"] * 19) + "\n") * 500, "give the raw values, not tared"),
+        ((" ".join(["-40"] * 19) + "\n") * 500, "raw counts 0..4095 are needed, not tared"),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
         ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
     ],

@@ -250,12 +250,12 @@ def test_default_range_is_what_the_mesh_resolves():
     "law, text",
     [
         (dict(adhesion=-0.1), "adhesion is -0.1: pass a work >= 0"),
-        (dict(adhesion=np.nan), "pass a work >= 0 in J/m\\^2"),
+        (dict(adhesion=np.nan), "adhesion is nan: pass a finite number"),
         (dict(adhesion_hysteresis=0.5), "pass >= 1"),
         (dict(adhesion_range=0.0), "pass a positive length in m, or None"),
         (dict(friction_exponent=5.0), "from -1 to 2; 0 is Coulomb's law"),
         (dict(friction_pressure=0.0), "pass a positive number of Pa"),
-        (dict(adhesive=1.0), "or a dict with some of friction_exponent, friction_pressure, adhesion"),
+        (dict(adhesive=1.0), "did you mean 'adhesion'"),
         (0.05, "contact_law is 0.05: pass a ContactLaw, or a dict"),
     ],
 )

@@ -317,7 +317,11 @@ def test_stiffening_alone_has_no_state():
 
     def config(**material):
         return SimpleNamespace(
-            material={"element": "linear", **material}, options={}, liquid=None, device="cpu"
+            material={"element": "linear", **material},
+            options={},
+            liquid=None,
+            coupling="one-way",
+            device="cpu",
         )
 
     plain, stiff = (

@@ -479,7 +479,12 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
     go_on = wp.zeros(1, dtype=int, device="cpu")
     wp.launch_tiled(
-        judge_balance, dim=[1], inputs=[1e-4, 0, *arrays, st], outputs=[go_on], block_dim=1, device="cpu"
+        judge_balance,
+        dim=[1],
+        inputs=[1e-4, 1500, 0, *arrays, st],
+        outputs=[go_on],
+        block_dim=1,
+        device="cpu",
     )
     assert bool(st.active.numpy()[0]) is not balanced and bool(go_on.numpy()[0]) is not balanced
     assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)

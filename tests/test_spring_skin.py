@@ -9,7 +9,9 @@ from biotac_mj.geometry.rigid import displace
 
 def test_tangent_is_the_derivative_of_the_wrench():
     geom = Geom("box", "box", np.array([0.05, 0.005, 0.05]), 0.5, 0)
-    skin = spring_skin.SpringSkin(Config(options={"stiffness": 1e3}), spring_skin.pad_geometry(), [geom])
+    skin = spring_skin.SpringSkin(
+        Config(stepper="springs", options={"stiffness": 1e3}), spring_skin.pad_geometry(), [geom]
+    )
     state = np.zeros(skin.nstate)
     skin.reset(state)
     pos, mat = np.array([[-0.01, spring_skin.HEIGHT - 0.0049, 0.0]]), np.eye(3)[None]

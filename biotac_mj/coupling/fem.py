@@ -41,7 +41,7 @@ class FemStepper:
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
-        self._settings = skin_settings(config)
+        self._settings = _in_time(config, skin_settings(config))
         self._material, self._options, _ = self._settings
         solved, element = solved_geometry(geometry, self._material, self._options)
         self._nodes = solved.vert  # maybe with more nodes behind the geometry's
@@ -310,9 +310,15 @@ def skin_settings(config: Config) -> Settings:
     # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
     liquid = {} if config.liquid is None else {"liquid": config.liquid}
     mine = {name: config.options[name] for name in ("skin", "modulus") if name in config.options}
-    # a body that nothing holds can be met again in the next step, and somebody waits for this one
-    work = {"max_work": _WORK} if config.coupling == "two-way" else {}
-    return read_settings(config.material, mine, tolerance=3e-4, **work, **liquid)
+    return read_settings(config.material, mine, tolerance=3e-4, **liquid)
+
+
+def _in_time(config, settings):
+    """Two-way, somebody waits for the step, and a body that nothing holds can be met again in the next."""
+    rubber, options, modulus = settings
+    if config.coupling == "two-way" and "max_work" not in config.options.get("skin", {}):
+        options = dataclasses.replace(options, max_work=_WORK)
+    return Settings(rubber, options, modulus)
 
 
 def _filled(options):

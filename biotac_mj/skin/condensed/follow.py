@@ -16,6 +16,7 @@ _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
 _FAR = 1.0  # geoms are moved out of the skin by no more [m]
 _EFFORT = 6e4  # of a step, for each outer node: about 0.1 s on the coarse skin
+_SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
 _FIRST, _EACH = 0.4, 0.5  # shares of the effort left that the step at once and each part may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
@@ -23,7 +24,8 @@ _SPENT = 0.05  # of the effort: so little is not worth a part
 def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
-    effort = Effort(_EFFORT * skin.nouter)
+    most = _EFFORT * max(skin.nouter, _SMALL)
+    effort = Effort(most)
     motion = skin.pose(memory, pos, mat)
     if np.abs(motion).max(initial=0.0) <= _PART:
         effort.allow(_FIRST)
@@ -35,9 +37,10 @@ def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
     if memory.started:
         out, u, blocked = _go(skin, memory, pos, mat, effort)
-        if not blocked or deep:
+        if deep or not blocked and out.reached > 0:
             return out, u
-    # the way there, if there is one, leads through the core; or nobody knows it
+        effort = Effort(most / 2)
+    # the way there, if there is one, leads through the core or does not begin; or nobody knows it
     out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
     return out, u
 

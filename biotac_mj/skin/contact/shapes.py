@@ -347,6 +347,6 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
         bound = d - _TRILINEAR * h
         # a large mesh has large cells, and what is centimetres away is not near
         if h > _COARSE and bound < _NEAR and d > -h:
-            bound = _to_triangles(grids, grid, p)[3]
+            bound = wp.max(bound, _to_triangles(grids, grid, p)[3])
         return bound
     return distance(kind, size, rounding, grids, grid, p)[3]
