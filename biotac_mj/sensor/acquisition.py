@@ -6,8 +6,8 @@ odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Source of ra
 channel has which slot is not published: CHOSEN as above.
 
 Slot k lies at time k / 4400 s, so what is sampled when depends on the time alone, never on the time step. All
-memory lies in state vectors of NSTATE numbers; noise is numpy's Philox 4x64 with one counter block per slot,
-a function of (seed, slot), so a replay from a saved state is bit-equal.
+memory lies in state vectors of NSTATE numbers; noise is made of numpy's Philox 4x64 with one counter block
+per slot, a function of (seed, slot), so a replay from a saved state is bit-equal.
 
 `Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
 their device; both launch the kernels below."""
@@ -46,10 +46,12 @@ SLOT_RATE = 4400.0  # [Hz]
 SLOTS_PER_FRAME = 44
 
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
-# temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; counts.
+# temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; PAC's
+# last noise; counts.
 PRESSURE = NELECTRODE
 TEMPERATURE, IMPEDANCE_TIME, FILTER = PRESSURE + 1, PRESSURE + 2, PRESSURE + 3
-HELD = FILTER + 3  # e1..e19, pdc, tac, tdc
+_HISS = FILTER + 3
+HELD = _HISS + 1  # e1..e19, pdc, tac, tdc
 HELD_PDC, HELD_TAC, HELD_TDC = HELD + NELECTRODE, HELD + NELECTRODE + 1, HELD + NELECTRODE + 2
 PAC = HELD_TDC + 1  # the frame's slots
 NSTATE = PAC + NPAC
@@ -213,8 +215,9 @@ def sample_slots(
         address = PAC + channel
         fast = _ramp(old, rise, low, real(_LOW), since)
         value = _pac_counts(real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since)))
-        deviation = real(channels.OTHER_NOISE)
+        deviation = real(channels.PAC_NOISE)
         if position % 2 == 1:
+            deviation = real(channels.OTHER_NOISE)
             address = HELD + channel
             if channel < NELECTRODE:
                 z = state[w, channel]
@@ -231,7 +234,11 @@ def sample_slots(
             else:
                 value = _thermistor_counts(_temperature_exponent(warm + heating * since))
         if noise == 1:
-            value += deviation * _normal(slot, seed[w])
+            hiss = deviation * _normal(slot, seed[w])
+            if position % 2 == 0:
+                hiss += real(channels.PAC_COLOUR) * state[w, _HISS]
+                state[w, _HISS] = hiss
+            value += hiss
         # a step longer than a frame meets a channel more than once: the last one stays
         state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
     state[w, FILTER] = _ramp(old, rise, low, real(_LOW), dt)
@@ -306,7 +313,7 @@ class Acquisition:
         state[:NELECTRODE] = self._check_impedance(impedance)
         state[PRESSURE], state[TEMPERATURE] = self._check_scalars(pressure, temperature)
         state[IMPEDANCE_TIME] = time
-        state[FILTER:HELD] = pressure, pressure, 0.0
+        state[FILTER:HELD] = pressure, pressure, 0.0, 0.0
         state[HELD:HELD_PDC] = channels.counts_from_impedance(impedance)
         state[HELD_PDC] = channels.counts_from_pressure(pressure)
         state[HELD_TAC] = channels.counts_from_heating(0.0)
