@@ -842,7 +842,7 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
 )
 def test_attach_refuses_options_that_nothing_reads(options, said):
     with pytest.raises((ValueError, FileNotFoundError), match=said):
-        biotac_mj.attach(mujoco.MjSpec(), skin="coarse", options=options)
+        biotac_mj.attach(mujoco.MjSpec(), body="world", skin="coarse", options=options)
 
 
 def test_the_table_is_long():

@@ -287,3 +287,23 @@ def test_startup_beside_another_checkout(repo, tmp_path):
     assert f"({ratio:.2f})" in done.stdout
     done = _run(repo, "startup.py", "--json", out, *case, "--against", tmp_path)
     assert done.returncode and "give the root of a checkout" in done.stderr
+
+
+def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatch, capsys):
+    """Presses of worlds that differ are made, counted and kept; the totals are those of the rows."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import robustness
+
+    monkeypatch.setattr(robustness, "MOST", 2)
+    arguments = ["--json", str(tmp_path / "out.json"), "--tier", "full", "--worlds", "2", "--seed", "3"]
+    first = robustness.main([*arguments, "--presses", "2"])
+    assert first["presses"] == 2 and first["nan"] == first["exceptions"] == first["stuck"] == 0
+    rows = [json.loads(line)["rows"] for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert len(rows) == 1 and all(row["most_N"] > 0 and row["steps"] > 5 for row in rows[0])
+    assert rows[0][0]["geom"] != rows[0][1]["geom"]
+    asked, made = [], rows[0][0] | {"steps": 7, "stuck": True, "not_converged": 5}
+    monkeypatch.setattr(robustness, "press_batch", lambda *a: asked.append(a[-1]) or [made, made])
+    both = robustness.main([*arguments, "--presses", "4"])
+    assert asked == [1]
+    assert both["steps"] == first["steps"] + 14 and both["stuck"] == 2 and both["presses"] == 4
+    assert json.loads((tmp_path / "out.json").read_text()) == both

@@ -17,6 +17,7 @@ def pressed(thermal, seconds=0.75, readings=None, depth=1.6e-3):
     plate.add_geom(name="plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.005, 0.03])
     handle = attach(
         spec,
+        body="world",
         skin="coarse",
         tier="condensed",
         coupling="one-way",

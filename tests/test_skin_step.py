@@ -236,7 +236,7 @@ def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
 
 
 def test_a_step_in_parts_is_the_step(model, monkeypatch):
-    """Where the whole way fails twice, its parts lead to the same balance; a turned geom turns on the way."""
+    """Where the whole way fails, its parts lead to the same balance; a turned geom turns on the way."""
     newton, failing = SkinStep._newton, []
 
     def stubborn(self):
@@ -248,7 +248,7 @@ def test_a_step_in_parts_is_the_step(model, monkeypatch):
     turn = np.tile(np.eye(3), (2, 1, 1))
     turn[1] = [[np.cos(0.3), 0, -np.sin(0.3)], [0, 1, 0], [np.sin(0.3), 0, np.cos(0.3)]]
     found = []
-    for script in ([], [0, 0, 1, 1], [0, 0, 1, 0, 0, 1, 1, 1]):  # taken from the end
+    for script in ([], [0, 0, 1], [0, 0, 1, 0, 0, 1, 1]):  # taken from the end
         data, touching = press(exact, [0], [0.6e-3])
         failing[:] = script
         touching.set_pose(pose(1.2e-3), turn)
@@ -260,7 +260,7 @@ def test_a_step_in_parts_is_the_step(model, monkeypatch):
         np.testing.assert_allclose(other[1], found[0][1], rtol=0, atol=1e-5 * abs(found[0][1]).max())
         assert (other[2] == found[0][2]).all()
     halfway, touching = press(exact, [0], [0.6e-3])
-    failing[:] = [1] * 20 + [0, 1, 1]
+    failing[:] = [1] * 20 + [0, 1]
     touching.set_pose(pose(1.2e-3), turn)
     step(exact, halfway, touching)
     assert halfway.reached[0] == 0.5 and not halfway.converged[0]
@@ -320,7 +320,7 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
             tries.clear()
             geoms.set_pose([[-0.012, -0.00825 + depth - 3.5e-3, 0.0]])
             step(model, data, geoms)
-            assert data.converged.all() and len(tries) == fail + 1
+            assert data.converged.all() and len(tries) in ((1,), (2, 3))[fail]
             assert tries[0] is model.factor
         monkeypatch.setattr(SkinStep, "_newton", newton)
         return data, model, tries

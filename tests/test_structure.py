@@ -18,7 +18,7 @@ LAYERS = {
     "skin": "geometry fields files reading threads calm",
     "calm": "",
     "features": "",
-    "sensor": "geometry threads calm",
+    "sensor": "fields geometry threads calm",
     "effects": "skin sensor geometry",
     "coupling": "skin sensor geometry fields learning.serve",
     "plugin": "coupling",

@@ -395,7 +395,11 @@ def _readings(choice, geometry, nworld, seed, device):
     from ..sensor.film import BatchFilm, FilmConduction
     from ..sensor.readings import check_settings
 
-    settings = {} if choice is True else {**check_settings(choice, more=("signal", "weights"))}
+    settings = (
+        {}
+        if choice is True
+        else {**check_settings(choice, {"signal": str, "weights": str | None}, "readings")}
+    )
     signal = settings.pop("signal", "physics")
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")

@@ -189,7 +189,7 @@ def _material_choices(material, liquid, friction):
 def _check(config, geometry):
     """What would fail in the plugin's first call, or on the way of the readings."""
     check_names(config)
-    make_readings(config, geometry)
+    make_readings(config, geometry, [])
     if config.stepper == "fem":
         from ..skin.condensed.refusals import refuse
         from ..skin.model import check_modulus
@@ -290,6 +290,8 @@ def _collide(spec, core, config):
             continue
         solid.contype = solid.conaffinity = 0
         for name in config.geoms:
+            if not (spec.geom(name).contype or spec.geom(name).conaffinity):
+                continue  # nothing solid stops it
             spec.add_pair(
                 geomname1=solid.name,
                 geomname2=name,

@@ -27,7 +27,7 @@ class SensorReadings:
 
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
-        self._options = check_settings(config.options.get("readings", {}))
+        self._options = check_settings(config.options.get("readings", {}), {"cold": bool})
         self._bodies: list[Material] | None = None
         self.nstate = Acquisition.nstate
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.rigid import cross, matrix, rotation
 from ..geometry.solid import bounds_solid, convex_hull, ground
-from .config import Config
+from .config import SOLID, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
@@ -154,23 +154,17 @@ def _select(model, core, names):
     parent = model.body_weldid[
         model.body_parentid
     ]  # as in MuJoCo's filter: links joined by one joint do not collide
-    biotacs = np.flatnonzero(np.isin(model.body_plugin, _alike(model, core)))
     out = []
     for i in range(model.ngeom):
         body = model.geom_bodyid[i]
         if not (model.geom_contype[i] or model.geom_conaffinity[i]) or weld[body] == own:
             continue
-        if body in biotacs:  # the solid parts of another BioTac, which meet those of this one
+        if model.geom_contype[i] == SOLID:  # of another BioTac: it meets the solid parts of this one
             continue
         if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
         out.append(i)
     return np.array(out, dtype=np.int64)
-
-
-def _alike(model, core):
-    """Instances of the plugin that the BioTac's body has."""
-    return np.flatnonzero(model.plugin == model.plugin[model.body_plugin[core]])
 
 
 def _not_excluded(model, core, ids):

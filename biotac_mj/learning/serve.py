@@ -105,7 +105,7 @@ class LearnedReadings:
     it."""
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
-        settings = check_settings(config.options.get("readings", {}), more=("weights",))
+        settings = check_settings(config.options.get("readings", {}), more={"weights": str | None})
         self._network = NetworkReadings(geometry, seed=config.seed, **settings)
         self.nstate = self._network.nstate
 

@@ -1,11 +1,9 @@
 """What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for
 stored motions."""
 
-import math
-import numbers
-
 import numpy as np
 
+from biotac_mj.fields import check_entries, refuse_unknown
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import REST_COUNTS, REST_TEMPERATURE
@@ -15,7 +13,7 @@ from biotac_mj.sensor.materials import Material
 
 __all__ = ["PhysicsReadings", "check_settings", "record"]
 
-_SETTINGS = ("noise", "sensor", "film_every_step", "temperature")
+_SETTINGS = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float}
 
 
 class PhysicsReadings:
@@ -138,26 +136,21 @@ class PhysicsReadings:
         return self.acquisition.readings(self._counts(state))
 
 
-def check_settings(given: dict, more: tuple[str, ...] = ()) -> dict:
+def check_settings(given: dict, more: dict | None = None, what: str = "options['readings']") -> dict:
     """Settings of `PhysicsReadings`, given by name, as they are.
 
     Args:
-      given: of noise, sensor, film_every_step, temperature. more: further names.
+      given: of noise, sensor, film_every_step, temperature. more: further names and their types.
+      what: they are, in errors.
 
     Raises:
       ValueError: not a dict, another name, or a value that cannot be.
     """
-    if not isinstance(given, dict):
-        raise ValueError(f"readings is {given!r}: give a dict of {', '.join(_SETTINGS + more)}")
-    for name, value in given.items():
-        if name not in _SETTINGS + more:
-            raise ValueError(f"readings has {name!r}: choose from {', '.join(_SETTINGS + more)}")
-        if name in ("noise", "film_every_step") and value not in (True, False):
-            raise ValueError(f"{name} of the readings is {value!r}: give True or False")
-        if name == "sensor" and value not in list(REST_COUNTS):
-            raise ValueError(f"sensor is {value!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
-        if name == "temperature" and not (isinstance(value, numbers.Real) and math.isfinite(value)):
-            raise ValueError(f"temperature of the readings is {value!r}: give a finite number of degrees C")
+    known = _SETTINGS | (more or {})
+    check_entries(what, given, known, known)
+    refuse_unknown(given, known, what)
+    if given.get("sensor", "") not in ("", *REST_COUNTS):
+        raise ValueError(f"sensor is {given['sensor']!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
     return given
 
 

@@ -49,8 +49,8 @@ _FREE = (
     "stiffness_damping",
     "max_core_depth",
 )
-_PARTS = 3  # times the iterations of a try: all that a step may take to go its way in parts
-_SHORTEST = 1 / 64  # part of the way of the geoms that is tried
+_PARTS = 3  # times the iterations of a try: when a step begins no further part of its way
+_SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 

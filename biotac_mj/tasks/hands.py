@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..coupling.config import integer
+from ..coupling.config import SOLID, integer
 from ..geometry.rigid import quaternion
 
 if typing.TYPE_CHECKING:
@@ -276,7 +276,9 @@ def _let_touch(spec, name, own):
     geom = spec.geom(name)
     if geom is None or geom.contype or geom.conaffinity or geom.parent.name in own:
         return
-    used = np.bitwise_or.reduce([bits for g in spec.geoms for bits in (g.contype, g.conaffinity)])
+    used = np.bitwise_or.reduce(
+        [bits for g in spec.geoms if g.contype != SOLID for bits in (g.contype, g.conaffinity)], initial=0
+    )
     free = [1 << i for i in range(31) if not used >> i & 1]
     if not free:
         raise ValueError(

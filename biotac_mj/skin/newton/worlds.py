@@ -33,6 +33,7 @@ wp.set_module_options({"enable_backward": False})
 # reason of a world's last step
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
+_STALLED = 12  # iterations that do not halve the error [J^1/2]: no more will
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
@@ -71,6 +72,8 @@ class Worlds:
     iterations: wp.array(dtype=int)
     limit: wp.array(dtype=int)  # of iterations, at which the present try ends
     error: wp.array(dtype=real)
+    best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
+    since: wp.array(dtype=int)
     reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
     ahead: wp.array(dtype=real)  # that is tried
     stride: wp.array(dtype=real)  # between them; 0: the first try
@@ -121,6 +124,13 @@ def clear_line(st: Worlds, w: int):
     st.side[w] = 0
     st.tries[w] = 0
     st.alpha[w] = real(1.0)
+
+
+@wp.func
+def begin_try(st: Worlds, w: int, limit: int):
+    st.limit[w] = st.iterations[w] + limit
+    st.since[w] = st.iterations[w]
+    st.best[w] = real(1.0e300)
 
 
 @wp.kernel
@@ -190,7 +200,7 @@ def begin_worlds(
     st.deep[w] = 0
     st.inverted[w] = 0
     st.iterations[w] = 0
-    st.limit[w] = limit
+    begin_try(st, w, limit)
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
@@ -233,6 +243,9 @@ def judge_balance(
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     st.error[w] = wp.sqrt(wp.abs(rz) / work)
+    if wp.abs(rz) < real(0.25) * st.best[w]:
+        st.best[w] = wp.abs(rz)
+        st.since[w] = st.iterations[w]
     settled = int(1)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
@@ -240,7 +253,7 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif st.iterations[w] >= st.limit[w]:
+    elif st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED:
         st.active[w] = 0
         st.failed[w] = 1
     else:
@@ -254,7 +267,8 @@ def judge_balance(
 def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
-    The first try is the whole way from a guess, the second the whole way from where the step began.
+    The first try is the whole way from a guess, the second the whole way from where the step began, if the
+    guess was not that.
     """
     w = wp.tid()
     st.active[w] = 0
@@ -270,7 +284,7 @@ def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int
         stride = real(2.0) * stride
     elif stride == real(0.0):
         st.reason[w] = NOT_CONVERGED
-        stride = real(1.0)
+        stride = wp.where(st.repeat[w] > real(0.0), real(1.0), real(0.5))
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
             stride = real(0.5)
@@ -295,7 +309,7 @@ def start_part(limit: int, st: Worlds, again: wp.array(dtype=int)):
         st.failed[w] = 0
         st.deep[w] = 0
         st.inverted[w] = 0
-        st.limit[w] = st.iterations[w] + limit
+        begin_try(st, w, limit)
 
 
 @wp.kernel

@@ -151,10 +151,15 @@ class SparsePreconditioner:
             program.call(watch)
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Takes the factor of the shape x."""
+        """Takes the factor of the shape x, once in a step."""
         x = x.numpy()
+
+        def renew():
+            if self._products >= 0:
+                self._renew(x)
+
         if self._renews:
-            program.call(lambda: self._renew(x))
+            program.call(renew)
 
     @property
     def _renews(self):

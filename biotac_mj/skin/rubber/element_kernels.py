@@ -27,6 +27,9 @@ from .law import (
     polar,
     polar_single,
     polar_upright,
+    squeezed_derivative,
+    squeezed_energy,
+    squeezed_stress,
     stress,
     stress_derivative,
 )
@@ -39,7 +42,7 @@ __all__ = ["ElementForces"]
 
 wp.set_module_options({"enable_backward": False})
 
-# det F below which a step of the line search is refused where the law cannot recover from inversion
+# det F below which a step of the line search is refused where friction elements measure isochoric strain
 _INVERTED = 0.02
 _ABREAST = 8  # worlds whose threads lie side by side: what they read does too
 
@@ -167,7 +170,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                 P += pressure * dilatation_gradient(rubber.law, F, R)
         if wp.static(len(beyond) > 0):
             P += beyond_stress(rubber, e, i, w, mu, lam, F, R)
-        return P
+        return P + squeezed_stress(rubber.law, mu, F)
 
     @wp.func
     def direction_of(law: int, F: mat, R: mat):
@@ -197,7 +200,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             )
             if wp.static(len(beyond) > 0):
                 dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
-            return dP
+            return dP + thin(squeezed_derivative(rubber.law, mu, wide(F), wide(dF)))
         D = wide(dF)
         Q = wide(R)
         G = wide(F)
@@ -206,7 +209,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             total += pressure * dilatation_hessian(rubber.law, G, Q, D)
         if wp.static(len(beyond) > 0):
             total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
-        return thin(total)
+        return thin(total + squeezed_derivative(rubber.law, mu, G, D))
 
     @wp.func
     def share(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):
@@ -259,7 +262,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                 return
             F = deformation(mesh, e, q, x, w)
             R = rotation(F)
-            if not wp.static(corotational):
+            if wp.static("hysteresis" in options):
                 if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
                     inverted_out[w] = 1
             mu = rubber.mu[w]
@@ -388,7 +391,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         C = positions()
         for q in range(wp.static(npoint)):
             F = X * shape[q] * mesh.inverse[e, q]
-            if not wp.static(corotational):
+            if wp.static("hysteresis" in options):
                 if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
                     inverted_out[w] = 1
             R = rotation(F)
@@ -536,7 +539,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             F = deformation(mesh, e, q, x, w)
             R = rotation(F)
             mean += mesh.weight[e, q] * theta(rubber.law, F, R)
-            total += share(rubber, mesh, e, q, w) * energy_density(rubber.law, mu, local, F, R)
+            density = energy_density(rubber.law, mu, local, F, R) + squeezed_energy(rubber.law, mu, F)
+            total += share(rubber, mesh, e, q, w) * density
         factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
         energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
 

@@ -6,11 +6,20 @@ The four laws take the same two Lame-like constants and differ in the energy W(F
   svk          W = lambda/2 tr(E)^2 + mu tr(E^2)                      E = (F^T F - I)/2, St. Venant-Kirchhoff
   neo_hookean  W = mu/2 (J^(-2/3) tr(F^T F) - 3) + kappa/2 (J - 1)^2  isochoric split: ANSYS, CalculiX
   linear       W = lambda/2 tr(e)^2 + mu e:e                          e = sym(F) - I: small rotations only
+
+None of them keeps rubber from being squeezed to nothing or turned inside out: at a sharp edge, or between a
+geom and the core, forces would balance there. So where less than a fifth of its volume is left, all but the
+linear law gain
+
+  W += mu J0 f(J / J0),   f(t) = (1 - t)^3 / t,   J = det F < J0 = 0.2,
+
+which is nothing above, with two derivatives, and grows without bound below. Newton's method passes shapes
+that no rubber can have: from J = 0.02 down the parabolas of f and of J^(-2/3) go on, so that it finds back.
 """
 
 import warp as wp
 
-from ..types import double, mat33, narrow, real, single, widen
+from ..types import double, mat33, narrow, real, single, vec3, widen
 
 __all__ = [
     "LAWS",
@@ -21,11 +30,17 @@ __all__ = [
     "polar",
     "polar_single",
     "polar_upright",
+    "squeezed_derivative",
+    "squeezed_energy",
+    "squeezed_stress",
     "stress",
     "stress_derivative",
 ]
 
 wp.set_module_options({"enable_backward": False})
+
+_SQUEEZED = wp.constant(wp.float64(0.2))  # J0
+_FLAT = wp.constant(wp.float64(0.02))  # J below which parabolas go on
 
 LAWS = {"corotational": 0, "svk": 1, "neo_hookean": 2, "linear": 3}
 
@@ -126,6 +141,42 @@ def polar(F: mat33):
 
 
 @wp.func
+def cofactor(F: mat33):
+    """dJ / dF of the determinant J."""
+    a = vec3(F[0, 0], F[1, 0], F[2, 0])
+    b = vec3(F[0, 1], F[1, 1], F[2, 1])
+    c = vec3(F[0, 2], F[1, 2], F[2, 2])
+    return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+
+@wp.func
+def cofactor_change(F: mat33, dF: mat33):
+    """Directional derivative of `cofactor`."""
+    a = vec3(F[0, 0], F[1, 0], F[2, 0])
+    b = vec3(F[0, 1], F[1, 1], F[2, 1])
+    c = vec3(F[0, 2], F[1, 2], F[2, 2])
+    da = vec3(dF[0, 0], dF[1, 0], dF[2, 0])
+    db = vec3(dF[0, 1], dF[1, 1], dF[2, 1])
+    dc = vec3(dF[0, 2], dF[1, 2], dF[2, 2])
+    return wp.matrix_from_cols(
+        wp.cross(db, c) + wp.cross(b, dc),
+        wp.cross(dc, a) + wp.cross(c, da),
+        wp.cross(da, b) + wp.cross(a, db),
+    )
+
+
+@wp.func
+def isochoric(J: real):
+    """J^(-2/3) and its two derivatives."""
+    j = wp.max(J, _FLAT)
+    over = J - j  # negative where the parabola goes on
+    value = wp.pow(j, -real(2.0) / real(3.0))
+    slope = -real(2.0) / real(3.0) * value / j
+    bend = -real(5.0) / real(3.0) * slope / j
+    return vec3(value + (slope + real(0.5) * bend * over) * over, slope + bend * over, bend)
+
+
+@wp.func
 def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
     """W(F) [J/m^3]; for neo_hookean `lam` is the bulk modulus."""
     eye = wp.identity(n=3, dtype=real)
@@ -137,9 +188,8 @@ def energy_density(law: int, mu: real, lam: real, F: mat33, R: mat33):
         return real(0.5) * lam * wp.trace(E) * wp.trace(E) + mu * wp.ddot(E, E)
     if law == 2:
         J = wp.determinant(F)
-        return real(0.5) * mu * (wp.pow(J, -real(2.0) / real(3.0)) * wp.ddot(F, F) - real(3.0)) + real(
-            0.5
-        ) * lam * (J - real(1.0)) * (J - real(1.0))
+        shear = isochoric(J)[0] * wp.ddot(F, F) - real(3.0)
+        return real(0.5) * (mu * shear + lam * (J - real(1.0)) * (J - real(1.0)))
     e = real(0.5) * (F + wp.transpose(F)) - eye
     return real(0.5) * lam * wp.trace(e) * wp.trace(e) + mu * wp.ddot(e, e)
 
@@ -155,11 +205,8 @@ def stress(law: int, mu: real, lam: real, F: mat33, R: mat33):
         return F * (lam * wp.trace(E) * eye + real(2.0) * mu * E)
     if law == 2:
         J = wp.determinant(F)
-        G = wp.transpose(wp.inverse(F))
-        return (
-            mu * wp.pow(J, -real(2.0) / real(3.0)) * (F - wp.ddot(F, F) / real(3.0) * G)
-            + lam * (J - real(1.0)) * J * G
-        )
+        a = isochoric(J)
+        return mu * a[0] * F + (real(0.5) * mu * a[1] * wp.ddot(F, F) + lam * (J - real(1.0))) * cofactor(F)
     e = real(0.5) * (F + wp.transpose(F)) - eye
     return lam * wp.trace(e) * eye + real(2.0) * mu * e
 
@@ -186,15 +233,13 @@ def stress_derivative(law: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat
         )
     if law == 2:
         J = wp.determinant(F)
-        G = wp.transpose(wp.inverse(F))
-        a = wp.pow(J, -real(2.0) / real(3.0))
-        GdF = wp.ddot(G, dF)
-        dG = -G * wp.transpose(dF) * G
-        I1 = wp.ddot(F, F) / real(3.0)
-        iso = a * (dF - real(2.0) / real(3.0) * wp.ddot(F, dF) * G - I1 * dG) - real(2.0) / real(
-            3.0
-        ) * a * GdF * (F - I1 * G)
-        return mu * iso + lam * J * ((real(2.0) * J - real(1.0)) * GdF * G + (J - real(1.0)) * dG)
+        a = isochoric(J)
+        I1 = wp.ddot(F, F)
+        G = cofactor(F)
+        dJ = wp.ddot(G, dF)
+        along_G = mu * (a[1] * wp.ddot(F, dF) + real(0.5) * a[2] * I1 * dJ) + lam * dJ
+        along_dG = real(0.5) * mu * a[1] * I1 + lam * (J - real(1.0))
+        return mu * (a[0] * dF + a[1] * dJ * F) + along_G * G + along_dG * cofactor_change(F, dF)
     de = real(0.5) * (dF + wp.transpose(dF))
     return lam * wp.trace(de) * eye + real(2.0) * mu * de
 
@@ -221,7 +266,7 @@ def dilatation_gradient(law: int, F: mat33, R: mat33):
     if law == 1:
         return F
     if law == 2:
-        return wp.determinant(F) * wp.transpose(wp.inverse(F))
+        return cofactor(F)
     return wp.identity(n=3, dtype=real)
 
 
@@ -235,6 +280,45 @@ def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
     if law == 1:
         return dF
     if law == 2:
-        G = wp.transpose(wp.inverse(F))
-        return wp.determinant(F) * (wp.ddot(G, dF) * G - G * wp.transpose(dF) * G)
+        return cofactor_change(F, dF)
     return mat33()
+
+
+@wp.func
+def squeeze(J: real):
+    """f and its two derivatives with t at t = J / J0."""
+    t = wp.max(J, _FLAT) / _SQUEEZED
+    over = J / _SQUEEZED - t  # as in `isochoric`
+    bend = real(2.0) / (t * t * t) - real(2.0)
+    slope = real(3.0) - real(2.0) * t - real(1.0) / (t * t)
+    value = real(1.0) / t - real(3.0) + (real(3.0) - t) * t
+    return vec3(value + (slope + real(0.5) * bend * over) * over, slope + bend * over, bend)
+
+
+@wp.func
+def squeezed_energy(law: int, mu: real, F: mat33):
+    """What is added to the energy of rubber without room [J/m^3]."""
+    J = wp.determinant(F)
+    if law == 3 or J >= _SQUEEZED:
+        return real(0.0)
+    return mu * _SQUEEZED * squeeze(J)[0]
+
+
+@wp.func
+def squeezed_stress(law: int, mu: real, F: mat33):
+    """The same of its stress [Pa]."""
+    J = wp.determinant(F)
+    if law == 3 or J >= _SQUEEZED:
+        return mat33()
+    return mu * squeeze(J)[1] * cofactor(F)
+
+
+@wp.func
+def squeezed_derivative(law: int, mu: real, F: mat33, dF: mat33):
+    """The same of its stress' directional derivative [Pa]."""
+    J = wp.determinant(F)
+    if law == 3 or J >= _SQUEEZED:
+        return mat33()
+    f = squeeze(J)
+    G = cofactor(F)
+    return mu * (f[2] / _SQUEEZED * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
