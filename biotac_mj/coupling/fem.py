@@ -110,6 +110,15 @@ class FemStepper:
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
+    @property
+    def model(self) -> SkinModel:
+        """What of the skin does not change."""
+        return self._model
+
+    def contact_rows(self, state: np.ndarray) -> np.ndarray:
+        """(k, 5) sample of the outer surface, geom and anchor in its frame [m] of what touches in a state."""
+        return _contacts(self._part(state, "contacts"))
+
     @functools.cached_property
     def _sample_area(self):
         """What a contact sample of each face stands for [m^2], and how many a face has."""
@@ -118,7 +127,7 @@ class FemStepper:
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
-        contacts = _contacts(self._part(state, "contacts"))
+        contacts = self.contact_rows(state)
         share, nsample = self._sample_area
         group = np.array([g.group for g in self._geoms], int)
         face = contacts[:, 0].astype(int) // nsample

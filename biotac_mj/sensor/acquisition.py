@@ -84,7 +84,7 @@ _electrode_noise = _compiled(channels.electrode_noise)
 
 
 @wp.func
-def _slots_until(time: real):
+def slots_until(time: real):
     """How many slots lie up to a time, slot 0 left out; the allowance keeps a slot on one side of a time that
     was summed up with rounding."""
     return wp.int64(wp.floor(time * real(SLOT_RATE) + real(1.0e-6)))
@@ -108,8 +108,8 @@ def find_due(
 ):
     """`Acquisition.needs_impedance` of each world."""
     w = wp.tid()
-    before = _slots_until(time[w])
-    count = wp.int32(_slots_until(time[w] + dt) - before)
+    before = slots_until(time[w])
+    count = wp.int32(slots_until(time[w] + dt) - before)
     due = int(0)
     if every_step == 1:
         for k in range(1, wp.min(count, SLOTS_PER_FRAME) + 1):
@@ -162,7 +162,7 @@ def philox(counter: wp.uint64, key: wp.uint64):
 
 
 @wp.func
-def _normal(slot: wp.int64, seed: wp.uint64):
+def draw_normal(slot: wp.int64, seed: wp.uint64):
     """Standard normal draw of a slot (Box-Muller: a fixed number of draws)."""
     raw = philox(wp.uint64(slot) + wp.uint64(1), seed)  # numpy counts on before it draws
     shift = wp.uint64(11)
@@ -190,6 +190,7 @@ def sample_slots(
     impedance: wp.array2d(dtype=real),
     pressure: wp.array(dtype=real),
     temperature: wp.array(dtype=real),
+    shaken: wp.array2d(dtype=real),
     # In, out:
     time: wp.array(dtype=real),
     state: wp.array2d(dtype=real),
@@ -206,15 +207,18 @@ def sample_slots(
     low = state[w, FILTER]
     high = state[w, FILTER + 1]
     tac = state[w, FILTER + 2]
-    before = _slots_until(now)
-    for k in range(1, wp.int32(_slots_until(now + dt) - before) + 1):
+    before = slots_until(now)
+    for k in range(1, wp.int32(slots_until(now + dt) - before) + 1):
         slot = before + wp.int64(k)
         since = real(slot) / real(SLOT_RATE) - now
         position = _position(slot)
         channel = position / 2
         address = PAC + channel
         fast = _ramp(old, rise, low, real(_LOW), since)
-        value = _pac_counts(real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since)))
+        sound = real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since))
+        if k <= shaken.shape[1]:
+            sound += shaken[w, k - 1]
+        value = _pac_counts(sound)
         deviation = real(channels.PAC_NOISE)
         if position % 2 == 1:
             deviation = real(channels.OTHER_NOISE)
@@ -234,7 +238,7 @@ def sample_slots(
             else:
                 value = _thermistor_counts(_temperature_exponent(warm + heating * since))
         if noise == 1:
-            hiss = deviation * _normal(slot, seed[w])
+            hiss = deviation * draw_normal(slot, seed[w])
             if position % 2 == 0:
                 hiss += real(channels.PAC_COLOUR) * state[w, _HISS]
                 state[w, _HISS] = hiss
@@ -340,6 +344,7 @@ class Acquisition:
         impedance: ArrayLike | None = None,
         pressure: float = 0.0,
         temperature: float | None = None,
+        shaken: wp.array | None = None,
     ) -> None:
         """Samples the slots in (time, time + dt].
 
@@ -349,6 +354,8 @@ class Acquisition:
           impedance: (19,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
           pressure: at the end of the step, above rest [Pa].
           temperature: of the core at the end of the step [C]; None keeps the last one.
+          shaken: (1, n) float64 on the CPU, what PAC feels besides at each of the slots [Pa], of its band
+            already (`vibration`).
 
         Raises:
           ValueError: wrong shape, not finite, impedance not positive, or dt not positive. The state is
@@ -360,7 +367,7 @@ class Acquisition:
         if impedance is not None:
             impedance = self._check_impedance(impedance)
         signals = self._check_scalars(pressure, state[TEMPERATURE] if temperature is None else temperature)
-        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals)
+        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals, shaken)
 
     def readings(self, state: np.ndarray) -> dict:
         """What the bus would report now.
@@ -435,7 +442,9 @@ class _One:
         )
         self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
         valid = wp.ones(1, dtype=int, device="cpu")
+        self._still = self._shaken = wp.zeros((1, 0), dtype=real, device="cpu")
         inputs = [1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
+        inputs.append(self._still)
         state = [self._time, self._state]
         self._sample = wp.launch(sample_slots, 1, inputs, state, device="cpu", record_cmd=True)
         self._find = wp.launch(find_due, 1, [self._time, 1.0, 0], [self._due], device="cpu", record_cmd=True)
@@ -447,7 +456,11 @@ class _One:
         self._find.launch()
         return bool(self.due[0])
 
-    def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature):
+    def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature, shaken):
+        shaken = self._still if shaken is None else shaken
+        if shaken is not self._shaken:
+            self._shaken = shaken
+            self._sample.set_param_at_index(8, shaken)
         self.state[:] = state
         self.seed[0], self.time[0], self.pressure[0], self.temperature[0] = seed, time, pressure, temperature
         self.due[0] = impedance is not None
@@ -521,6 +534,7 @@ class BatchAcquisition:
             self.time = wp.zeros(nworld, dtype=real)
             self.temperature = wp.full(nworld, temperature, dtype=real)
             self.due = wp.zeros(nworld, dtype=int)
+            self._still = wp.zeros((nworld, 0), dtype=real)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
@@ -544,4 +558,5 @@ class BatchAcquisition:
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
         """
         inputs = [dt, self._noise, self.seed, self.due, valid, impedance, pressure, self.temperature]
+        inputs.append(self._still)
         wp.launch(sample_slots, self.nworld, inputs, [self.time, self.state], device=self.device)
