@@ -2,6 +2,7 @@
 make, and how fast bodies slip."""
 
 import functools
+import math
 
 import numpy as np
 
@@ -55,40 +56,38 @@ class Shaking:
         """
         if result.state is None:
             return None
-        rows, old = self._stepper.contact_rows(result.state), self._stepper.contact_rows(before)
+        rows = self._stepper.contact_rows(result.state)
         if not len(rows):
             return None
         drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
         slip, area = np.zeros(self._ngroup), self._stepper.touched_area(result.state)
         group = self._group[rows[:, 1].astype(int)]
         face = rows[:, 0].astype(int) // len(self._stepper.model.sample)
-        moved = _moved(old, rows)
-        for g in np.flatnonzero(area):
-            force, mine = -result.wrench[g, :3], group == g
-            size = np.sqrt(force @ force)
+        way, known = _moved(self._stepper.contact_rows(before), rows)
+        for g in area.nonzero()[0]:
+            force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
+            size = math.sqrt(force @ force)
             if size == 0:
                 continue
             along = force / size
-            heard = self._faces[face[mine]].mean(0).reshape(-1, 3) @ along
+            heard = (self._faces.take(face[mine], 0).sum(0) / len(mine)).reshape(-1, 3) @ along
             drive += size * heard[:-1]
             gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
-            way = moved[mine]
-            way = way[np.isfinite(way[:, 0])]
-            if len(way):
-                slip[g] = np.linalg.norm(way.mean(0)) / dt
+            also = known[mine]
+            mean = also @ way[mine] / max(also.sum(), 1.0)
+            slip[g] = math.sqrt(mean @ mean) / dt
         return drive, gain, slip, area
 
 
 def _moved(old, new):
-    """(k, 3) how far the anchors of the contacts (k, 5) went over their geoms [m]; NaN where they are new."""
-    out = np.full((len(new), 3), np.nan)
+    """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were
+    contacts before: (k,) 1 or 0."""
     if not len(old):
-        return out
+        return np.zeros((len(new), 3)), np.zeros(len(new))
+    if old.shape == new.shape and (old[:, :2] == new[:, :2]).all():  # most steps
+        return new[:, 2:] - old[:, 2:], np.ones(len(new))
     many = 1 + max(old[:, 1].max(), new[:, 1].max())
-    key = old[:, 0] * many + old[:, 1]
-    order = np.argsort(key)
-    wanted = new[:, 0] * many + new[:, 1]
-    found = order[np.minimum(np.searchsorted(key, wanted, sorter=order), len(key) - 1)]
-    same = key[found] == wanted
-    out[same] = new[same, 2:] - old[found[same], 2:]
-    return out
+    key, wanted = (rows[:, 0] * many + rows[:, 1] for rows in (old, new))
+    order = key.argsort()
+    found = order[np.minimum(key.searchsorted(wanted, sorter=order), len(key) - 1)]
+    return new[:, 2:] - old[found, 2:], (key[found] == wanted).astype(float)

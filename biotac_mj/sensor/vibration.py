@@ -10,8 +10,8 @@ contact force is the skin's own (FEM); here only how the modes differ from it. W
 nobody else's, so it counts whole: modes, and the static part of those that are not there.
 
 A texture is a height under the contact that passes at the speed of slip: regular ridges, and roughness as
-the sum of two first-order processes along the way slid (`_LONG`, `_SHORT`). Half of a pitch under the contact takes
-back what the other half gives, so what counts is the mean over the touched area.
+the sum of waves (a second-order process along the way slid) and grain (a first-order one). Half a pitch of
+ridges takes back what the other half gives, so what counts of them is the mean over the touched area.
 
 Slots are those of `acquisition`, 4.4 kHz; the state is short and noise a function of seed and slot, so frames
 join and a replay is equal to the bit."""
@@ -44,15 +44,23 @@ real = wp.float64
 
 # Of the rubber: silicones have about 0.1 to 0.3 between 10 Hz and 3 kHz (typical, not fitted).
 LOSS_FACTOR = 0.2
-# Roughness: length [m] of its two parts and their share of the mean square. FITTED with ROUGHNESS.
-_LONG, _SHORT = 2.0e-3, 2.0e-5
-_FINE = 0.1  # of the second part's RMS
-_COARSE = math.sqrt(1 - _FINE**2)
-# RMS [m] of six materials under a BioTac at 25 mm/s (`benchmarks/vibration.py`). FITTED on one slide of each.
-ROUGHNESS = {"carpet": 1e-6}
+# Roughness: length of the waves, of the grain [m], and the grain's share of the mean square. FITTED, as is
+# ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each of six materials, in three bands
+# (`benchmarks/vibration.py`). An effective number: what of it the contact averages out is not in it.
+_WAVE, _GRAIN = 4.15e-4, 2.0e-6
+_SHARE = 1.13e-3
+ROUGHNESS = {
+    "carpet": 0.80e-6,
+    "rubber": 1.03e-6,
+    "cork": 0.96e-6,
+    "fiberboard": 0.81e-6,
+    "sponge": 0.69e-6,
+    "steel": 0.62e-6,
+}
 _LOW, _HIGH = (math.tan(math.pi * hertz / SLOT_RATE) for hertz in (1040.0, 10.0))  # of the band-pass
 _FILTER = 4  # numbers of the band-pass, behind the modes in the state
-_BODY, _SPEED = 4, 3  # of a body: phase, two parts of the roughness over its RMS, speed; then the gains
+# of a body: phase, waves and what makes them, grain (over their RMS), speed; then the gains
+_BODY, _SPEED = 5, 4
 _KEY = 0x1E3779B97F4A7C15  # by which the seeds of the roughness differ from the noise's
 
 
@@ -189,13 +197,20 @@ def shake(
             state[w, b] = phase - turn * wp.floor(phase / turn)
             h = real(0.5) * t[1] * wp.sin(phase) * _average(wave * wp.sqrt(area[w, g] * real(1.0 / math.pi)))
             if t[2] > real(0.0) and speed > real(0.0):
-                for j in range(2):
-                    length = wp.where(j == 0, real(_LONG), real(_SHORT))
-                    keep = wp.exp(-speed * period / length)
-                    key = seed[w] + wp.uint64(_KEY) * wp.uint64(2 * g + j + 1)
-                    fresh = wp.sqrt(one - keep * keep) * draw_normal(slot, key)
-                    state[w, b + 1 + j] = keep * state[w, b + 1 + j] + fresh
-            h += t[2] * (real(_COARSE) * state[w, b + 1] + real(_FINE) * state[w, b + 2])
+                keep = wp.exp(-speed * period / real(_WAVE))
+                fresh = wp.sqrt(one - keep * keep) * draw_normal(
+                    slot, seed[w] + wp.uint64(_KEY) * wp.uint64(2 * g + 1)
+                )
+                state[w, b + 1] = keep * state[w, b + 1] + fresh
+                state[w, b + 2] = keep * state[w, b + 2] + (one - keep) * wp.sqrt(real(2.0)) * state[w, b + 1]
+                keep = wp.exp(-speed * period / real(_GRAIN))
+                fresh = wp.sqrt(one - keep * keep) * draw_normal(
+                    slot, seed[w] + wp.uint64(_KEY) * wp.uint64(2 * g + 2)
+                )
+                state[w, b + 3] = keep * state[w, b + 3] + fresh
+            h += t[2] * (
+                wp.sqrt(one - real(_SHARE)) * state[w, b + 2] + wp.sqrt(real(_SHARE)) * state[w, b + 3]
+            )
             height[w, g] = h
             last = state[w, b + _BODY + nmode]
             sound += (last + s * (gain[w, g, nmode] - last)) * h
