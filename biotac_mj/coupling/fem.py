@@ -120,15 +120,15 @@ class FemStepper:
         return _contacts(self._part(state, "contacts"))
 
     @functools.cached_property
-    def _sample_area(self):
-        """What a contact sample of each face stands for [m^2], and how many a face has."""
+    def sample_area(self) -> tuple[np.ndarray, int]:
+        """What a contact sample of each face stands for (nface,) [m^2], and how many a face has."""
         nsample = len(self._model.sample)
         return self._model.outer.area.numpy() / nsample, nsample
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
         contacts = self.contact_rows(state)
-        share, nsample = self._sample_area
+        share, nsample = self.sample_area
         group = np.array([g.group for g in self._geoms], int)
         face = contacts[:, 0].astype(int) // nsample
         return np.bincount(

@@ -60,17 +60,21 @@ class Shaking:
         if not len(rows):
             return None
         drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
-        slip, area = np.zeros(self._ngroup), self._stepper.touched_area(result.state)
-        group = self._group[rows[:, 1].astype(int)]
-        face = rows[:, 0].astype(int) // len(self._stepper.model.sample)
-        way, known = _moved(self._stepper.contact_rows(before), rows)
-        for g in area.nonzero()[0]:
+        slip, area = np.zeros(self._ngroup), np.zeros(self._ngroup)
+        share, nsample = self._stepper.sample_area
+        sample, geom = rows[:, :2].T.astype(int)
+        group, face = self._group[geom], sample // nsample
+        way, known = self._moved(self._stepper.contact_rows(before), rows, sample)
+        for g in np.bincount(group).nonzero()[0]:
             force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
             size = math.sqrt(force @ force)
             if size == 0:
                 continue
-            along = force / size
-            heard = (self._faces.take(face[mine], 0).sum(0) / len(mine)).reshape(-1, 3) @ along
+            along, count = force / size, np.bincount(face[mine])
+            at = count.nonzero()[0]
+            count = count[at].astype(np.float32)
+            heard = (count @ self._faces.take(at, 0) / len(mine)).reshape(-1, 3) @ along
+            area[g] = count @ share[at]
             drive += size * heard[:-1]
             gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
             also = known[mine]
@@ -78,16 +82,19 @@ class Shaking:
             slip[g] = math.sqrt(mean @ mean) / dt
         return drive, gain, slip, area
 
+    @functools.cached_property
+    def _place(self):
+        share, nsample = self._stepper.sample_area
+        return np.full(len(share) * nsample, -1)
 
-def _moved(old, new):
-    """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were
-    contacts before: (k,) 1 or 0."""
-    if not len(old):
-        return np.zeros((len(new), 3)), np.zeros(len(new))
-    if old.shape == new.shape and (old[:, :2] == new[:, :2]).all():  # most steps
-        return new[:, 2:] - old[:, 2:], np.ones(len(new))
-    many = 1 + max(old[:, 1].max(), new[:, 1].max())
-    key, wanted = (rows[:, 0] * many + rows[:, 1] for rows in (old, new))
-    order = key.argsort()
-    found = order[np.minimum(key.searchsorted(wanted, sorter=order), len(key) - 1)]
-    return new[:, 2:] - old[found, 2:], (key[found] == wanted).astype(float)
+    def _moved(self, old, new, sample):
+        """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were
+        contacts before: (k,) 1 or 0."""
+        if not len(old):
+            return np.zeros((len(new), 3)), np.zeros(len(new))
+        before = old[:, 0].astype(int)
+        self._place[before] = np.arange(len(old))
+        found = self._place[sample]
+        self._place[before] = -1
+        known = (found >= 0) & (old[found, 1] == new[:, 1])
+        return new[:, 2:] - old[found, 2:], known.astype(float)
