@@ -54,7 +54,8 @@ class Handle:
         """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m]
         on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
         converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
-        measured)."""
+        measured; rounds through MuJoCo's solver; share of the bodies' motion for which the skin was solved;
+        share of its push that was withheld): see docs/coupling.md."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
     def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

@@ -26,9 +26,6 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-# by how many cells a trilinear value may be off: distances change no faster than places, and the corners of a
-# cell are half of its diagonal from its middle. A thin edge between them comes near that
-_TRILINEAR = 0.8661
 
 # MuJoCo's mjtGeom
 GEOM_TYPES = {"plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
