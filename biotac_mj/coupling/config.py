@@ -118,7 +118,8 @@ class Config:
         self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
             refuse_unknown(self.options, ("skin", "modulus", "readings"), "options")
-            if self.thermal is None and self.options.get("readings", {}).get("cold"):
+            readings = self.options.get("readings")
+            if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
 
     def _set(self, name, value):

@@ -45,21 +45,20 @@ real = wp.float64
 # Of the rubber: silicones have about 0.1 to 0.3 between 10 Hz and 3 kHz (typical, not fitted).
 LOSS_FACTOR = 0.2
 # Roughness: length of the waves, of the grain [m], and the grain's share of the mean square. FITTED, as is
-# ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each of six materials, in three bands
+# ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each, in three bands
 # (`benchmarks/vibration.py`). An effective number: what of it the contact averages out is not in it.
 _WAVE, _GRAIN = 4.15e-4, 2.0e-6
 _SHARE = 1.13e-3
 ROUGHNESS = {
-    "carpet": 0.80e-6,
-    "rubber": 1.03e-6,
-    "cork": 0.96e-6,
-    "fiberboard": 0.81e-6,
-    "sponge": 0.69e-6,
-    "steel": 0.62e-6,
+    "carpet": 0.69e-6,
+    "cork": 0.83e-6,
+    "fiberboard": 0.70e-6,
+    "sponge": 0.61e-6,
+    "steel": 0.55e-6,
 }
 _LOW, _HIGH = (math.tan(math.pi * hertz / SLOT_RATE) for hertz in (1040.0, 10.0))  # of the band-pass
 _FILTER = 4  # numbers of the band-pass, behind the modes in the state
-# of a body: phase, waves and what makes them, grain (over their RMS), speed; then the gains
+# of a body: phase; what makes the waves, waves and grain, over their RMS; speed; then the gains
 _BODY, _SPEED = 5, 4
 _KEY = 0x1E3779B97F4A7C15  # by which the seeds of the roughness differ from the noise's
 
