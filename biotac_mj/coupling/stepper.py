@@ -221,9 +221,10 @@ def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> S
 
 
 def make_readings(
-    config: Config, geometry: SkinGeometry, geoms: list[Geom], stepper: SkinStepper
+    config: Config, geometry: SkinGeometry, geoms: list[Geom], stepper: SkinStepper | None
 ) -> Readings:
-    """The readings that `config.readings` names, of the stepper's skin.
+    """The readings that `config.readings` names, of the stepper's skin; without one they only serve to
+    check the settings.
 
     Raises:
       ValueError: the name is unknown, or `config` asks for heat or vibration that the readings or the stepper
@@ -236,7 +237,9 @@ def make_readings(
             raise ValueError(f"readings {config.readings!r} know no heat: leave thermal out")
         readings.feel_heat(geoms)
     if config.textures is not None:
-        if not (hasattr(readings, "feel_vibration") and hasattr(stepper, "contact_rows")):
+        if not (
+            hasattr(readings, "feel_vibration") and (stepper is None or hasattr(stepper, "contact_rows"))
+        ):
             raise ValueError(
                 f"readings {config.readings!r} on stepper {config.stepper!r} know no vibration: leave "
                 "textures out"
