@@ -163,6 +163,32 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     np.testing.assert_allclose(force, expected, rtol=0, atol=5e-3 * abs(expected).max())
 
 
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_worlds_that_are_not_wanted_wait(model, kind):
+    """A step of every second world, then one of the others: bit for bit a step of all."""
+    worlds = random_worlds(4, seed=9)
+    (data, geoms), (at_once, others) = (walk(model, worlds, kind, DEPTHS[:2]) for _ in range(2))
+
+    def state(data, geoms):
+        arrays = data.x, data.x_last, data.increment, data.outer.anchor, geoms.struct.pos_last
+        return [a.numpy().copy() for a in (*arrays, data.worlds.last_pressure, data.worlds.nonconverged)]
+
+    before = state(data, geoms)
+    for g in (geoms, others):
+        g.set_pose(poses(worlds, DEPTHS[2]))
+    step(model, at_once, others)
+    for wanted in ([1, 0, 1, 0], [0, 1, 0, 1]):
+        data.worlds.wanted.assign(wanted)
+        step(model, data, geoms)
+        if wanted[0]:
+            for now, then in zip(state(data, geoms), before, strict=True):
+                by_world = (np.moveaxis(a, min(1, a.ndim - 1), 0) for a in (now, then))
+                assert all((a == b).all() for a, b in list(zip(*by_world))[1::2])
+    for now, expected in zip(state(data, geoms), state(at_once, others), strict=True):
+        assert (now == expected).all()
+    assert (data.wrench == at_once.wrench).all() and (data.reached == 1).all()
+
+
 def test_a_step_that_does_not_converge():
     hasty = finger(max_newton=1)
     data, geoms = SkinData(hasty, 2, preconditioner="dense"), geom_set(2)

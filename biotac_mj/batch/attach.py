@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _model
+from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _collide, _model
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
-from ..coupling.instance import NO_PASSIVE
+from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
@@ -75,7 +75,9 @@ def add(
         spec.attach(child, site=spec.site(site), prefix=prefix)
     else:
         spec.attach(child, frame=own.add_frame(), prefix=prefix)
-    _add_slots(spec, spec.body(prefix + "core"), prefix, len(bodies))
+    core = spec.body(prefix + "core")
+    _collide(spec, core, Config().friction, Config().priority, geoms)
+    _add_slots(spec, core, prefix, len(bodies))
     for i, name in enumerate(bodies):
         weld = spec.equality(
             f"{prefix}couple{i}"
@@ -171,9 +173,11 @@ def attach(
         _warn_of_damping(mjm, touching)
     film, acquisition = _readings(readings, rest_geometry(config, geometry), d.nworld, seed, device)
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
-    batch = Batch(
-        mjm, touching, slots, skin_of(bool(slots)), film, acquisition, addresses, coupling == "two-way"
-    )
+    skins = skin_of(bool(slots)), film, acquisition
+    solid = (
+        skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
+    )  # one-way nothing moves by its forces
+    batch = Batch(mjm, touching, slots, *skins, addresses, solid)
     Hook.of(m).add(batch)
     return batch
 

@@ -5,7 +5,9 @@ Once per step, when mujoco_warp asks for passive forces, as `coupling/world.py` 
 1. the linear models of the last step enter the dynamics, and mujoco_warp's own later stages say where the
    bodies go;
 2. the skins are solved there;
-3. their new linear models take the old ones' place, and mujoco_warp goes on.
+3. their new linear models take the old ones' place. Where the bodies may now go elsewhere, mujoco_warp is
+   asked again, and the skins that were not solved where their bodies go are solved again;
+4. what acts at last gives no more energy than was put into the skins, and mujoco_warp goes on.
 The readings are written when it asks for the velocity sensors.
 """
 
@@ -16,7 +18,8 @@ import numpy as np
 import warp as wp
 
 from ..coupling.touching import Touching
-from . import dynamics
+from . import dynamics, kernels, rounds
+from .scratch import Scratch
 from .skin import BatchSkin
 from .skins import Skins
 
@@ -43,11 +46,11 @@ class Batch(Skins):
         film: object,
         acquisition: object,
         addresses: list,
-        two_way: bool,
+        thickness: float | None,
     ):
         super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, addresses)
         self.active = True
-        self.moving = two_way and mjm.nv > 0  # whether forces change where anything goes
+        self.moving = thickness is not None  # whether forces change where anything goes
         weld = sorted(set(slots.values()))
         group_slot = [weld.index(slots[g]) if g in slots else -1 for g in range(skin.ngroup)]
         with wp.ScopedDevice(self.device):
@@ -55,32 +58,51 @@ class Batch(Skins):
             self._group_slot = wp.array(np.array(group_slot, np.int32), dtype=int)
             self._row = wp.full((len(weld), self.nworld), -1, dtype=int)
             self._jacobian = wp.zeros((*self.groups, mjm.nv), dtype=wp.spatial_vectord)
-            self._start_pos, self._start_mat = (
-                wp.zeros(self.groups, dtype=wp.vec3d),
-                wp.zeros(self.groups, dtype=wp.mat33d),
+            self._wrench, self._wrench_before = (
+                wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2)
             )
-            self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
+            self._change, self._changed = (wp.zeros((self.nworld, mjm.nv), dtype=float) for _ in range(2))
+            self._of_step = r = rounds.Rounds()
+            for name in ("here", "start", "", "asked", "end"):
+                for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
+                    setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
+            for name in ("drift", "moved", "full_wrench", "full_motion"):
+                setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
+            for name in ("spent", "far", "trial", "placed", "inside"):
+                setattr(r, name, wp.zeros(self.nworld, dtype=int))
+            r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
+            r.off, r.share, r.store, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(4))
+        r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
+        r.surface = skin.data.laws.struct.work
+        self._solid = rounds.Solid()
+        self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
+        self._solid.area = float(skin.model.outer.area.numpy().sum())
 
     def predict(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Where the bodies go without acceleration, and their Jacobians; finds this step's rows."""
-        arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof]
+        """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
+        finds this step's rows."""
+        r = self._of_step
+        bodies = [self._core, self._body, d.xpos, d.xmat]
+        self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
+        arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof, d.qvel]
         self._launch(
             dynamics.advance_groups,
             self.groups,
             [self._core, self._body, self.dt, *arrays],
-            [self._start_pos, self._start_mat, self._jacobian],
+            [r.start_pos, r.start_mat, self._jacobian, r.drift],
         )
+        self.begin_step()
         if self.moving:
+            self._launch(rounds.begin_rounds, self.nworld, [], [r])
+            self.skin.keep()
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
 
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Puts the linear models into the forces and the rows."""
-        model = [self.wrench0, self.tangent0, self.pos0, self.mat0]
-        self._launch(
-            dynamics.linear_models, self.groups, [self._start_pos, self._start_mat, *model], [self._wrench]
-        )
+        r = self._of_step
+        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
         self._launch(
             dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive]
         )
@@ -88,22 +110,28 @@ class Batch(Skins):
         self._launch(
             dynamics.write_rows,
             self._row.shape,
-            [self.dt**2, self._group_slot, self._row, self._jacobian, self.tangent0]
+            [self.dt**2, self._group_slot, self._row, self._jacobian, self.model.tangent0]
             + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def solve_skins(self, m: "mjw.Model", d: "mjw.Data", accelerated: bool) -> None:
-        """Solves the skins where the bodies go, with d.qacc or without acceleration."""
-        pos, mat = self._start_pos, self._start_mat
-        if accelerated:
-            self._launch(
-                dynamics.follow,
-                self.groups,
-                [self.dt**2, self._jacobian, d.qacc, pos, mat],
-                [self._pos, self._mat],
-            )
-            pos, mat = self._pos, self._mat
+    def aim(self, d: "mjw.Data") -> None:
+        """Finds where the bodies go with d.qacc."""
+        r = self._of_step
+        going = [self.dt**2, self._jacobian, d.qacc, r.here_pos, r.start_pos, r.start_mat]
+        self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
+
+    def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Solves the wanted skins where the bodies go, or on the way there; one-way without acceleration."""
+        r = self._of_step
+        pos, mat = r.start_pos, r.start_mat
+        if self.moving:
+            self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self.model], [r])
+            pos, mat = r.asked_pos, r.asked_mat
+            self.place_geoms(pos, mat, m.geom_pos, m.geom_quat)
+            x = self.skin.x
+            self._launch(rounds.look_ahead, x.shape, [self.skin.geoms.struct, x], [r])
+            self._launch(rounds.draw_near, self.nworld, [], [r])
         if self.skin.inertial:
             skin, data = self.skin, self.skin.data
             arrays = [
@@ -119,10 +147,60 @@ class Batch(Skins):
             self._launch(
                 dynamics.advance_core,
                 self.nworld,
-                [self._core, self.dt, int(accelerated), *arrays],
+                [self._core, self.dt, int(self.moving), *arrays],
                 [skin.core_pos, skin.core_mat, data.frame_pos, data.frame_mat],
             )
         self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
+
+    def solve_first(self, m: "mjw.Model", d: "mjw.Data", again: wp.array) -> None:
+        """The first round; sets again[0] where the bodies of a world may go elsewhere under its new model."""
+        from mujoco_warp._src import smooth
+
+        r = self._of_step
+        self._find_wrenches(r.pos, r.mat, 0, self._wrench_before)
+        self.solve_skins(m, d)
+        self._find_wrenches(r.pos, r.mat, 0, self._wrench)
+        forces = [self._jacobian, self._wrench, self._wrench_before]
+        self._launch(rounds.change_forces, self._change.shape, forces, [self._change])
+        smooth.solve_m(m, d, self._changed, self._change)
+        self._launch(rounds.look, self.nworld, [self.dt**2, self._jacobian, self._changed], [r, again])
+
+    def judge(self, again: wp.array) -> None:
+        """Sets again[0] where a skin is to be solved again, after `aim`."""
+        st = self.skin.data.worlds
+        self._launch(rounds.judge, self.nworld, [st.reason, st.iterations], [self._of_step, st.wanted, again])
+
+    def solve_again(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Another round of the worlds that want one."""
+        self.skin.put_back()
+        self.solve_skins(m, d)
+
+    def restrain(self, again: wp.array) -> None:
+        """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
+        changes how bodies move."""
+        self._settle(rounds.restrain, [self._last], [self._solid], [again])
+
+    def share_push(self) -> None:
+        """Gives those as much push as they have energy for, after `aim` without any."""
+        self._settle(rounds.share_push)
+
+    def withhold(self, again: wp.array) -> None:
+        """Takes it again where it still is too much, as `restrain`."""
+        self._settle(rounds.withhold, outputs=[again])
+
+    def conclude(self) -> None:
+        """Ends the step, after `aim`."""
+        self._settle(rounds.conclude, solid=[self._solid])
+
+    def _settle(self, kernel, last=(), solid=(), outputs=()):
+        r = self._of_step
+        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+        inputs = [self.model, *last, self._wrench, *solid]
+        self._launch(kernel, self.nworld, inputs, [r, *outputs])
+
+    def _find_wrenches(self, pos, mat, withheld, out):
+        inputs = [self.model, pos, mat, withheld, self._of_step]
+        self._launch(rounds.wrenches, self.groups, inputs, [out])
 
 
 class Hook:
@@ -151,19 +229,79 @@ class Hook:
         for batch in batches:
             batch.predict(m, d)
         moving = [b for b in batches if b.moving]
+        for batch in batches:
+            if batch not in moving:
+                batch.solve_skins(m, d)
         if moving:
             if self._outside is None:
-                self._outside = wp.empty_like(d.qfrc_passive)
+                if d.qacc.device.is_cuda and d.qacc.device.is_capturing:
+                    raise ValueError(
+                        "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
+                        "the memory for the loops in it"
+                    )
+                self._outside, self._again = wp.empty_like(d.qfrc_passive), wp.zeros(1, dtype=int)
+                self._scratch = Scratch(d.qacc.device)
             wp.copy(self._outside, d.qfrc_passive)
-            for batch in moving:
-                batch.act(m, d)
-            _accelerate(m, d)
+            with self._scratch:
+                self._find_balance(m, d, moving)
+            self._act(m, d, moving)
         for batch in batches:
-            batch.solve_skins(m, d, batch.moving)
-        if moving:
-            wp.copy(d.qfrc_passive, self._outside)
+            batch.end_step()
+
+    def _find_balance(self, m, d, moving):
+        """Models of the skins that hold where they lead, and that give no energy which is not there."""
+        again = self._again
+
+        def go_on():
+            self._accelerate(m, d, moving)
+            again.zero_()
             for batch in moving:
-                batch.act(m, d)
+                batch.judge(again)
+            wp.capture_if(again, solve)
+
+        def solve():
+            for batch in moving:
+                batch.solve_again(m, d)
+
+        def withhold():
+            self._accelerate(m, d, moving)
+            again.zero_()
+            for batch in moving:
+                batch.withhold(again)
+
+        def restrain():
+            self._accelerate(m, d, moving)
+            for batch in moving:
+                batch.share_push()
+            wp.capture_while(again, withhold)
+
+        _begin_dynamics(m, d)
+        self._accelerate(m, d, moving, first=True)
+        again.zero_()
+        for batch in moving:
+            batch.solve_first(m, d, again)
+        wp.capture_while(again, go_on)
+        for batch in moving:
+            batch.restrain(again)
+        wp.capture_if(again, restrain)
+        for batch in moving:
+            batch.conclude()
+
+    def _act(self, m, d, moving):
+        wp.copy(d.qfrc_passive, self._outside)
+        for batch in moving:
+            batch.act(m, d)
+
+    def _accelerate(self, m, d, moving, first=False):
+        """Where the bodies go under the present models."""
+        import mujoco_warp as mjw
+
+        self._act(m, d, moving)
+        mjw.fwd_acceleration(m, d, factorize=first)
+        mjw.solve(m, d)
+        wp.copy(d.qacc_warmstart, d.qacc)
+        for batch in moving:
+            batch.aim(d)
 
     def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
         from mujoco_warp._src.types import Stage
@@ -176,8 +314,8 @@ class Hook:
                     batch.sense(d.sensordata)
 
 
-def _accelerate(m, d):
-    """The accelerations under the present passive forces and rows, by mujoco_warp's own later stages; it does
+def _begin_dynamics(m, d):
+    """The stages of mujoco_warp between passive forces and accelerations, which forces do not change; it does
     them again afterwards."""
     import mujoco_warp as mjw
     from mujoco_warp._src import smooth
@@ -188,6 +326,3 @@ def _accelerate(m, d):
     if not m.opt.disableflags & mjw.DisableBit.ACTUATION and m.callback.control:
         m.callback.control(m, d)
     mjw.fwd_actuation(m, d)
-    mjw.fwd_acceleration(m, d, factorize=True)
-    mjw.solve(m, d)
-    wp.copy(d.qacc_warmstart, d.qacc)

@@ -7,7 +7,7 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
-from .kernels import matrix, vector
+from .rigid import displace_from, is_finite, matrix, rotation, vector
 
 __all__ = [
     "add_forces",
@@ -15,7 +15,6 @@ __all__ = [
     "advance_groups",
     "find_rows",
     "follow",
-    "linear_models",
     "write_rows",
 ]
 
@@ -30,42 +29,6 @@ mat66 = wp.spatial_matrixd
 _EQUALITY = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
 _NEGLIGIBLE = wp.constant(wp.float64(1e-15))  # mjMINVAL
 _PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is rounding
-
-
-@wp.func
-def rotation(v: vec3):
-    """Rotation matrix of a rotation vector (Rodrigues)."""
-    angle2 = wp.dot(v, v)
-    angle = wp.sqrt(angle2)
-    a = real(1.0) - angle2 / real(6.0)
-    b = real(0.5) - angle2 / real(24.0)
-    if angle > real(1.0e-4):
-        a = wp.sin(angle) / angle
-        b = (real(1.0) - wp.cos(angle)) / angle2
-    k = wp.skew(v)
-    return wp.identity(n=3, dtype=real) + a * k + b * (k * k)
-
-
-@wp.func
-def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
-    """Small motion (translation of the origin's point, rotation vector) from pose 0 to the other."""
-    turn = mat * wp.transpose(mat0)
-    v = real(0.5) * vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
-    sine = wp.length(v)
-    if sine > real(1.0e-9):
-        v = wp.atan2(sine, real(0.5) * (wp.trace(turn) - real(1.0))) / sine * v
-    t = pos - pos0 - wp.cross(v, pos0)
-    return vec6(t[0], t[1], t[2], v[0], v[1], v[2])
-
-
-@wp.func
-def is_finite(pos: vec3, mat: mat33):
-    total = real(0.0)
-    for i in range(3):
-        total += wp.abs(pos[i])
-        for j in range(3):
-            total += wp.abs(mat[i, j])
-    return total < real(1.0e6)  # false for nan, too
 
 
 @wp.func
@@ -97,13 +60,15 @@ def advance_groups(
     com: wp.array2d(dtype=wp.vec3),
     cvel: wp.array2d(dtype=wp.spatial_vector),
     cdof: wp.array2d(dtype=wp.spatial_vector),
+    qvel: wp.array2d(dtype=float),
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
     jacobian_out: wp.array3d(dtype=vec6),
+    drift_out: wp.array2d(dtype=vec6),
 ):
-    """Poses of the touching bodies after h at present velocities [group, world], and their Jacobians relative
-    to the BioTac."""
+    """Poses of the touching bodies after h at present velocities [group, world], their Jacobians relative to
+    the BioTac, and their motion h J v."""
     g, w = wp.tid()
     b = body[g]
     frame = _ahead_mat(core, w, h, xmat, cvel)
@@ -115,6 +80,7 @@ def advance_groups(
     finite = is_finite(pos, mat)  # what is lost takes no part in the dynamics
     turn = wp.transpose(matrix(xmat[w, core]))
     here = vector(xpos[w, core])
+    drift = vec6()
     for i in range(jacobian_out.shape[2]):
         share = real(
             isdofancestor[b, i] - isdofancestor[core, i]
@@ -127,6 +93,8 @@ def advance_groups(
             angular = share * (turn * spin)
             j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
         jacobian_out[g, w, i] = j
+        drift += h * real(qvel[w, i]) * j
+    drift_out[g, w] = drift
 
 
 @wp.kernel
@@ -174,9 +142,11 @@ def follow(
     h2: real,
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
+    here: wp.array2d(dtype=vec3),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
     # Out:
+    moved_out: wp.array2d(dtype=vec6),
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
@@ -185,29 +155,10 @@ def follow(
     m = vec6()
     for i in range(jacobian.shape[2]):
         m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
-    turn = rotation(vec3(m[3], m[4], m[5]))
-    pos_out[g, w] = turn * pos[g, w] + vec3(m[0], m[1], m[2])
-    mat_out[g, w] = turn * mat[g, w]
-
-
-@wp.kernel
-def linear_models(
-    # In:
-    pos: wp.array2d(dtype=vec3),
-    mat: wp.array2d(dtype=mat33),
-    wrench0: wp.array2d(dtype=vec6),
-    tangent0: wp.array2d(dtype=mat66),
-    pos0: wp.array2d(dtype=vec3),
-    mat0: wp.array2d(dtype=mat33),
-    # Out:
-    wrench_out: wp.array2d(dtype=vec6),
-):
-    """The skin's wrench on each group at the pose reached without acceleration."""
-    g, w = wp.tid()
-    total = vec6()
-    if is_finite(pos[g, w], mat[g, w]):
-        total = wrench0[g, w] - tangent0[g, w] * motion(pos[g, w], mat[g, w], pos0[g, w], mat0[g, w])
-    wrench_out[g, w] = total
+    moved_out[g, w] = m
+    p, R = displace_from(here[g, w], pos[g, w], mat[g, w], m)
+    pos_out[g, w] = p
+    mat_out[g, w] = R
 
 
 @wp.kernel

@@ -8,17 +8,19 @@ import warp as wp
 
 from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
 from ..sensor.channels import NELECTRODE, NPAC
-from ..skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE
+from ..skin.newton.worlds import CONVERGED, NOT_FINITE
+from .rigid import displace, matrix, motion, vector
 
 __all__ = [
+    "Model",
     "accept_models",
     "body_forces",
     "core_pose",
+    "count_failures",
     "geom_poses",
-    "matrix",
     "relative_poses",
     "reset_models",
-    "vector",
+    "wrench_at",
     "write_sensors",
 ]
 
@@ -31,18 +33,20 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 
-@wp.func
-def vector(v: wp.vec3):
-    return vec3(real(v[0]), real(v[1]), real(v[2]))
+@wp.struct
+class Model:
+    """Linear models of skins [group, world]: wrench0 - tangent0 (pose - pose0)."""
+
+    wrench0: wp.array2d(dtype=vec6)
+    tangent0: wp.array2d(dtype=mat66)
+    pos0: wp.array2d(dtype=vec3)
+    mat0: wp.array2d(dtype=mat33)
 
 
 @wp.func
-def matrix(m: wp.mat33):
-    return mat33(
-        real(m[0, 0]), real(m[0, 1]), real(m[0, 2]),
-        real(m[1, 0]), real(m[1, 1]), real(m[1, 2]),
-        real(m[2, 0]), real(m[2, 1]), real(m[2, 2]),
-    )  # fmt: skip
+def wrench_at(model: Model, g: int, w: int, pos: vec3, mat: mat33):
+    way = motion(pos, mat, model.pos0[g, w], model.mat0[g, w])
+    return model.wrench0[g, w] - model.tangent0[g, w] * way
 
 
 @wp.kernel
@@ -122,36 +126,62 @@ def geom_poses(
 @wp.kernel
 def accept_models(
     # In:
+    wanted: wp.array(dtype=int),
     reason: wp.array(dtype=int),
+    reached: wp.array(dtype=real),
+    began: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
-    # In, out:
-    wrench0: wp.array2d(dtype=vec6),
-    tangent0: wp.array2d(dtype=mat66),
-    pos0: wp.array2d(dtype=vec3),
-    mat0: wp.array2d(dtype=mat33),
-    failed: wp.array(dtype=int),
+    last: Model,
+    # Out:
+    model: Model,
 ):
-    """The linear models of this step: of the skin just solved; its last wrench where it found no balance;
-    none where the input was bad."""
+    """The linear models of skins that were asked for poses pos, mat: where their way ended, which began at
+    the last step's model; that model, where there was no way; no force on what is nowhere.
+
+    A world's first step has not `began`: its way came from outside."""
     g, w = wp.tid()
-    why = reason[w]
-    if why == NOT_FINITE or why == INSIDE_CORE:
-        wrench0[g, w] = vec6()
-        tangent0[g, w] = mat66()
-        pos0[g, w] = vec3()
-        mat0[g, w] = wp.identity(n=3, dtype=real)
-    elif why == NOT_CONVERGED:
-        tangent0[g, w] = mat66()
-        if g == 0:
-            failed[w] += 1
+    if wanted[w] == 0:
+        return
+    p = last.pos0[g, w]
+    R = last.mat0[g, w]
+    far = reached[w]
+    if reason[w] == NOT_FINITE:
+        model.wrench0[g, w] = vec6()
+        model.tangent0[g, w] = mat66()
+    elif began[w] == 1 and far == real(0.0):
+        model.wrench0[g, w] = last.wrench0[g, w]
+        model.tangent0[g, w] = last.tangent0[g, w]
     else:
-        wrench0[g, w] = wrench[g, w]
-        tangent0[g, w] = tangent[g, w]
-        pos0[g, w] = pos[g, w]
-        mat0[g, w] = mat[g, w]
+        if began[w] == 1 and far < real(1.0):
+            p, R = displace(p, R, far * motion(pos[g, w], mat[g, w], p, R))
+        else:
+            p = pos[g, w]
+            R = mat[g, w]
+        model.wrench0[g, w] = wrench[g, w]
+        model.tangent0[g, w] = tangent[g, w]
+    model.pos0[g, w] = p
+    model.mat0[g, w] = R
+
+
+@wp.kernel
+def count_failures(
+    # In:
+    reason: wp.array(dtype=int),
+    settled: wp.array(dtype=int),
+    # In and out:
+    failed: wp.array(dtype=int),
+    began: wp.array(dtype=int),
+):
+    """Ends a step: counts those that found no balance, of skin or of skin and bodies."""
+    w = wp.tid()
+    if reason[w] == NOT_FINITE:
+        return
+    began[w] = 1
+    if reason[w] != CONVERGED or settled[w] == 0:
+        failed[w] += 1
 
 
 @wp.kernel
@@ -159,21 +189,20 @@ def reset_models(
     # In:
     mask: wp.array(dtype=bool),
     # Out:
-    wrench_out: wp.array2d(dtype=vec6),
-    tangent_out: wp.array2d(dtype=mat66),
-    pos_out: wp.array2d(dtype=vec3),
-    mat_out: wp.array2d(dtype=mat33),
+    model: Model,
     failed_out: wp.array(dtype=int),
+    began_out: wp.array(dtype=int),
 ):
     w = wp.tid()
     if not mask[w]:
         return
-    for g in range(wrench_out.shape[0]):
-        wrench_out[g, w] = vec6()
-        tangent_out[g, w] = mat66()
-        pos_out[g, w] = vec3()
-        mat_out[g, w] = wp.identity(n=3, dtype=real)
+    for g in range(model.pos0.shape[0]):
+        model.wrench0[g, w] = vec6()
+        model.tangent0[g, w] = mat66()
+        model.pos0[g, w] = vec3()
+        model.mat0[g, w] = wp.identity(n=3, dtype=real)
     failed_out[w] = 0
+    began_out[w] = 0
 
 
 @wp.kernel
@@ -222,9 +251,13 @@ def write_sensors(
     wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
     valid: wp.array(dtype=int),
+    settled: wp.array(dtype=int),
     failed: wp.array(dtype=int),
     iterations: wp.array(dtype=int),
     error: wp.array(dtype=real),
+    rounds: wp.array(dtype=int),
+    reached: wp.array(dtype=real),
+    push: wp.array(dtype=real),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
@@ -250,12 +283,11 @@ def write_sensors(
         for i in range(6):
             sensordata_out[w, address[5] + i] = float(-total[i])
     if address[6] >= 0:
-        why = reason[w]
-        good = float(1.0)
+        good = float(0.0)
+        if reason[w] == CONVERGED and settled[w] == 1:
+            good = 1.0
         residual = float(error[w])
-        if why != CONVERGED:
-            good = 0.0
-        if why == NOT_FINITE or why == INSIDE_CORE:
+        if reason[w] == NOT_FINITE:
             residual = wp.nan
         if residual != residual or valid[w] == 0:
             good = -1.0
@@ -263,4 +295,7 @@ def write_sensors(
         sensordata_out[w, address[6] + 1] = float(failed[w])
         sensordata_out[w, address[6] + 2] = float(iterations[w])
         sensordata_out[w, address[6] + 3] = residual
-        sensordata_out[w, address[6] + 4] = 0.0
+        sensordata_out[w, address[6] + 4] = 0.0  # the tier
+        sensordata_out[w, address[6] + 5] = float(rounds[w])
+        sensordata_out[w, address[6] + 6] = float(reached[w])
+        sensordata_out[w, address[6] + 7] = float(real(1.0) - push[w])

@@ -88,6 +88,7 @@ class BatchSkin:
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
             self.fresh = wp.full(nworld, 1, dtype=int)
             self._rest = self.data.rest_vert
+        self._kept = None
 
     @property
     def nbytes(self) -> int:
@@ -95,8 +96,8 @@ class BatchSkin:
         return _world_bytes(self.nworld, self.data, self.geoms.struct, self)
 
     def solve_skins(self) -> None:
-        """Solves every world for the geoms where they are now. Launches only: may be captured in a CUDA
-        graph.
+        """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
+        may be captured in a CUDA graph.
 
         A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
         not finite stays as it was."""
@@ -119,6 +120,36 @@ class BatchSkin:
         )
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+
+    def keep(self) -> None:
+        """Keeps what the skins remember, for `put_back`. Launches only, but for the first time."""
+        if self._kept is None:
+            self._kept = {}
+            for array in self._memory():
+                if array.size:
+                    self._kept[array.ptr] = array, wp.empty_like(array)
+        for array, kept in self._kept.values():
+            wp.copy(kept, array)
+
+    def put_back(self) -> None:
+        """Gives the wanted worlds back what they remembered. Launches only."""
+        wanted = self.data.worlds.wanted
+        for array, kept in self._kept.values():
+            now, then = _words(array), _words(kept)
+            self._launch(kernels.put_back, now.shape[:2], [then, wanted], [now])
+
+    def _memory(self):
+        """All that a step starts from, and changes."""
+        d, geoms, st = self.data, self.geoms.struct, self.data.worlds
+        arrays = [d.x, d.x_last, d.increment, d.outer.anchor_geom, d.outer.anchor, d.outer.kept]
+        arrays += [geoms.pos_last, geoms.mat_last, self._motion, self._touched_by]
+        arrays += [st.last_pressure, st.nonconverged]
+        if d.memory:
+            rubber = d.memory.rubber
+            arrays += [rubber.overstress, rubber.last, rubber.worst, rubber.slip]
+        if self.inertial:
+            arrays += [d.velocity, d.frame_pos_last, d.frame_mat_last, self.fresh]
+        return arrays
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
@@ -156,6 +187,13 @@ class BatchSkin:
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
+
+
+def _words(array):
+    """A wp.array [..., world] as numbers of 32 bits [item, world, word]."""
+    words = wp.types.type_size_in_bytes(array.dtype) // 4
+    shape = (array.size // array.shape[-1], array.shape[-1], words)
+    return wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device, copy=False)
 
 
 def _world_bytes(nworld, *roots):

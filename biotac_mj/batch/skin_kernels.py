@@ -7,6 +7,7 @@ from ..skin.newton.worlds import Worlds
 __all__ = [
     "begin_at_rest",
     "begin_frames",
+    "put_back",
     "read_outputs",
     "reset_faces",
     "reset_geoms",
@@ -169,3 +170,17 @@ def begin_frames(
     fresh_out[w] = 0
     pos_out[w] = pos[w]
     mat_out[w] = mat[w]
+
+
+@wp.kernel
+def put_back(
+    # In:
+    kept: wp.array3d(dtype=int),
+    wanted: wp.array(dtype=int),
+    # Out:
+    out: wp.array3d(dtype=int),
+):
+    i, w = wp.tid()
+    if wanted[w] == 1:
+        for k in range(out.shape[2]):
+            out[i, w, k] = kept[i, w, k]

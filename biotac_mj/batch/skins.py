@@ -27,8 +27,8 @@ class Skins:
     Attributes:
       nworld: number of worlds.
       failed: (nworld,) wp.array int, steps that found no balance since the reset.
-      wrench0, tangent0: (ngroup, nworld) wp.arrays, linear models in force: of the skin ON each touching body
-        in the BioTac frame.
+      model: `kernels.Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
+      began: (nworld,) wp.array int, whether a step was made since the reset.
     """
 
     def __init__(
@@ -51,11 +51,14 @@ class Skins:
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
             self._group = wp.array(touching.group.astype(np.int32), dtype=int)
             self._addresses = wp.array(np.array(addresses, np.int32), dtype=int)
-            self._pos, self.pos0 = (wp.zeros(shape, dtype=wp.vec3d) for _ in range(2))
-            self._mat, self.mat0 = (wp.zeros(shape, dtype=wp.mat33d) for _ in range(2))
-            self.wrench0 = wp.zeros(shape, dtype=wp.spatial_vectord)
-            self.tangent0 = wp.zeros(shape, dtype=wp.spatial_matrixd)
-            self.failed = wp.zeros(self.nworld, dtype=int)
+            self.model, self._last = kernels.Model(), kernels.Model()
+            for name, variable in kernels.Model.vars.items():
+                for model in (self.model, self._last):
+                    setattr(model, name, wp.zeros(shape, dtype=variable.type.dtype))
+            self.failed, self.began = (wp.zeros(self.nworld, dtype=int) for _ in range(2))
+            # how a step goes in which bodies and skin do not meet: one round, all of the push
+            self._settled, self._rounds = (wp.ones(self.nworld, dtype=int) for _ in range(2))
+            self._push = wp.ones(self.nworld, dtype=wp.float64)
             self._valid = film.valid if film else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
@@ -82,8 +85,7 @@ class Skins:
                 f"pass ({self.nworld},) of bool, True resets"
             )
         self.skin.reset(mask)
-        models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
-        self._launch(kernels.reset_models, self.nworld, [mask], models)
+        self._launch(kernels.reset_models, self.nworld, [mask], [self.model, self.failed, self.began])
         if self.acquisition:
             self.acquisition.reset(mask)
 
@@ -96,7 +98,7 @@ class Skins:
     def wrench(self) -> np.ndarray:
         """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a
         copy on the host."""
-        return np.swapaxes(self.wrench0.numpy(), 0, 1).copy()
+        return np.swapaxes(self.model.wrench0.numpy(), 0, 1).copy()
 
     @property
     def nbytes(self) -> int:
@@ -105,21 +107,36 @@ class Skins:
             self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0
         )
 
+    def begin_step(self) -> None:
+        """Before the first `solve_at` of a step. Launches only."""
+        for name in kernels.Model.vars:
+            wp.copy(getattr(self._last, name), getattr(self.model, name))
+        self.skin.data.worlds.wanted.fill_(1)
+
+    def end_step(self) -> None:
+        """After the last one. Launches only."""
+        how = [self.skin.reason, self._settled]
+        self._launch(kernels.count_failures, self.nworld, how, [self.failed, self.began])
+
     def solve_at(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
-        """Solves the skins for touching bodies at pos, mat [group, world] in the BioTac frame. Launches only.
+        """Solves the skins of the wanted worlds for touching bodies at pos, mat [group, world] in the BioTac
+        frame. Launches only.
 
         Args:
           geom_pos, geom_quat: mujoco_warp's arrays (1 or nworld, ngeom) of the geoms on their bodies.
         """
         skin = self.skin
-        poses = [geom_pos, geom_quat, pos, mat]
+        self.place_geoms(pos, mat, geom_pos, geom_quat)
+        skin.solve_skins()
+        st = skin.data.worlds
+        solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
+        self._launch(kernels.accept_models, self.groups, [*solved, pos, mat, self._last], [self.model])
+
+    def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
+        """Puts the skins' geoms on bodies as in `solve_at`."""
+        skin, poses = self.skin, [geom_pos, geom_quat, pos, mat]
         self._launch(
             kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
-        )
-        skin.solve_skins()
-        models = [self.wrench0, self.tangent0, self.pos0, self.mat0, self.failed]
-        self._launch(
-            kernels.accept_models, self.groups, [skin.reason, skin.wrench, skin.tangent, pos, mat], models
         )
 
     def sense(self, sensordata: wp.array) -> None:
@@ -130,13 +147,14 @@ class Skins:
             self.film.solve_film(skin.x, self.acquisition.find_due(self.dt))
             self.acquisition.advance(self.dt, self.film.impedance, self.film.valid, skin.pressure)
             state = self.acquisition.state
-        outputs = [state, self.wrench0, skin.reason, self._valid, self.failed, skin.iterations, skin.error]
-        self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs], [sensordata])
+        outputs = [state, self.model.wrench0, skin.reason, self._valid, self._settled, self.failed]
+        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
+        self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs, *how], [sensordata])
 
     @property
     def groups(self) -> tuple:
         """(ngroup, nworld)."""
-        return self.wrench0.shape
+        return self.model.wrench0.shape
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -153,7 +171,7 @@ class PoseBatch(Skins):
     Attributes:
       xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre
         of mass, world frame.
-      sensordata: (nworld, 55) wp.array float, the channels of `readings` one after another.
+      sensordata: (nworld, 58) wp.array float, the channels of `readings` one after another.
     """
 
     def __init__(
@@ -166,6 +184,8 @@ class PoseBatch(Skins):
             self._geom_quat = wp.array(
                 mjm.geom_quat[None].astype(np.float32), dtype=wp.quat
             )  # (w, x, y, z), as mujoco_warp keeps it
+            self._pos = wp.zeros(self.groups, dtype=wp.vec3d)
+            self._mat = wp.zeros(self.groups, dtype=wp.mat33d)
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
@@ -200,8 +220,10 @@ class PoseBatch(Skins):
                 [self._core, xpos, xmat, skin.fresh],
                 [data.frame_pos, data.frame_mat, skin.core_pos, skin.core_mat],
             )
+        self.begin_step()
         self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
-        bodies = [self._core, self._body, self.wrench0, xpos, xmat, xipos]
+        self.end_step()
+        bodies = [self._core, self._body, self.model.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
         self.sense(self.sensordata)
 

@@ -182,7 +182,7 @@ def attach(
     else:
         spec.attach(child, frame=spec.body(body).add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
-    _collide(spec, core, config)
+    _collide(spec, core, config.friction, config.priority, config.geoms)
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
         _add_slots(spec, core, prefix, slots)
@@ -292,14 +292,14 @@ def _model(geometry):
     return spec
 
 
-def _collide(spec, core, config):
+def _collide(spec, core, friction, priority, geoms):
     """Core, nail and clamp meet what the skin meets: the geoms that are named, or all that collide."""
     for solid in core.geoms:
-        solid.friction[0], solid.priority = config.friction, config.priority
-        if config.geoms is None:
+        solid.friction[0], solid.priority = friction, priority
+        if geoms is None:
             continue
         solid.contype = solid.conaffinity = 0
-        for name in config.geoms:
+        for name in geoms:
             if not (spec.geom(name).contype or spec.geom(name).conaffinity):
                 continue  # nothing solid stops it
             spec.add_pair(
@@ -307,7 +307,7 @@ def _collide(spec, core, config):
                 geomname2=name,
                 condim=3,
                 solref=solid.solref,
-                friction=[max(config.friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
+                friction=[max(friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
             )
 
 

@@ -13,7 +13,7 @@ __all__ = ["Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 _DEEPER = 5e-4
-_MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the model that came closest must do
+_MOST_ITERATIONS = 45  # of the skin's solver in a step, after which the model that came closest must do
 _TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
 
 
@@ -59,7 +59,7 @@ class Coupled:
         solved [m]."""
         self.acceleration = acceleration
         self.moved = self.horizon**2 * (self.jacobian @ acceleration)
-        self.target = displace(*self.pose, self.moved)
+        self.target = displace(*self.pose, self.moved, self.here[0])
         self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
         return self.off
 

@@ -20,6 +20,7 @@ from .stepper import Geom, SkinResult
 
 __all__ = ["FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
+_WORK = 300  # of two-way skins, see SkinOptions.max_work
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
@@ -318,7 +319,9 @@ def skin_settings(config: Config) -> Settings:
     # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
     liquid = {} if config.liquid is None else {"liquid": config.liquid}
     mine = {name: config.options[name] for name in ("skin", "modulus") if name in config.options}
-    return read_settings(config.material, mine, tolerance=3e-4, **liquid)
+    # a body that nothing holds can be met again in the next step, and somebody waits for this one
+    work = {"max_work": _WORK} if config.coupling == "two-way" else {}
+    return read_settings(config.material, mine, tolerance=3e-4, **work, **liquid)
 
 
 def _filled(options):

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..geometry.rigid import displace, displacement
+from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .metric import Metric
@@ -23,7 +24,7 @@ from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
 from .touching import Touching, forget_notes
 
-__all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "state_size"]
+__all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "skin_thickness", "state_size"]
 
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
@@ -58,9 +59,7 @@ class _Skin:
 
     @functools.cached_property
     def thickness(self):
-        geometry = self.geometry
-        free = np.setdiff1d(geometry.outer_face, geometry.fixed)
-        return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
+        return skin_thickness(self.geometry)
 
     @functools.cached_property
     def untouched(self):
@@ -68,6 +67,12 @@ class _Skin:
         state, n = np.empty(self.stepper.nstate), self.ngroup
         self.stepper.reset(state)
         return SkinResult(None, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.stepper.vert_xpos(state).copy())
+
+
+def skin_thickness(geometry: SkinGeometry) -> float:
+    """From the skin's outside to the core at most [m]."""
+    free = np.setdiff1d(geometry.outer_face, geometry.fixed)
+    return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
 
 
 # MuJoCo asks a model that it compiles for the size of its states and lets go of it: the skins of a hand

@@ -93,7 +93,11 @@ def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.nd
     return np.concatenate([pos - pos0 - cross(vector, pos0), vector], axis=1)
 
 
-def displace(pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses moved by (n, 6) small motions, the inverse of `displacement` to first order."""
-    turn = rotation(motion[:, 3:])
-    return (turn @ pos[:, :, None])[:, :, 0] + motion[:, :3], turn @ mat
+def displace(
+    pos: np.ndarray, mat: np.ndarray, motion: np.ndarray, here: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses moved by (n, 6) small motions, the inverse of `displacement`: their own points go straight on, as
+    MuJoCo moves bodies that spin; `here` (n, 3) are these points where the motions were measured, if not at
+    pos."""
+    arm = pos if here is None else here
+    return pos + motion[:, :3] + cross(motion[:, 3:], arm), rotation(motion[:, 3:]) @ mat

@@ -141,6 +141,7 @@ class SkinData:
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
+        self.worlds.wanted.fill_(1)
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
         self.worlds.density.assign([float(m.density) for m in materials])
         stiffness = [model.options.contact_stiffness or stiffness_of_contact(m) for m in materials]

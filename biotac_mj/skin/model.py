@@ -65,7 +65,9 @@ class SkinOptions:
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
       tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below
         this fraction of the energy norm of the load.
-      max_newton, max_cg: iteration limits of a step and of each linear solve.
+      max_newton, max_cg: iteration limits of a try and of each linear solve.
+      max_work: evaluations of all forces and products with their tangent in a step, some 80 in a contact;
+        then the step goes no further than it has come.
 
     Raises:
       ValueError: an option is out of its range.
@@ -88,6 +90,7 @@ class SkinOptions:
     tolerance: float = 1e-3
     max_newton: int = 30
     max_cg: int = 40
+    max_work: int = 1500
     element: str | None = None
 
     def __post_init__(self):
@@ -130,7 +133,12 @@ class SkinOptions:
                 "mass_damping and stiffness_damping act on a skin in motion: "
                 "add dynamics='implicit', or leave them out"
             )
-        for name, most in (("samples", 16), ("max_newton", 100_000), ("max_cg", 100_000)):
+        for name, most in (
+            ("samples", 16),
+            ("max_newton", 100_000),
+            ("max_cg", 100_000),
+            ("max_work", 10**9),
+        ):
             if not 1 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} is {getattr(self, name)}: pass a number from 1 to {most}")
 

@@ -18,7 +18,8 @@ A world that finds no balance goes there in parts: its geoms move from where the
 ended, as far as the skin finds a balance; no skin fits between the core and a geom deep inside it. A world
 that does not come to the end stays where it came to (`data.reached`), is counted in
 `data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not finite, which
-stays where it was. The others do not notice. Worlds that are done idle inside the loops."""
+stays where it was. The others do not notice. Worlds that are done idle inside the loops; those that are not
+`data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
 import weakref
@@ -44,12 +45,12 @@ _FREE = (
     "tolerance",
     "max_newton",
     "max_cg",
+    "max_work",
     "stick_ratio",
     "mass_damping",
     "stiffness_damping",
     "max_core_depth",
 )
-_PARTS = 3  # times the iterations of a try: when a step begins no further part of its way
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
@@ -318,7 +319,7 @@ class SkinStep:
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(limits.refuse_deep, dim, constants, outputs)
         self._newton()
-        bounds = [_SHORTEST if g.count else 1.0, _PARTS * m.options.max_newton]
+        bounds = [_SHORTEST if g.count else 1.0, m.options.max_work]
         self._launch(worlds.judge_way, self.d.nworld, [*bounds, self.st, self._again])
 
     def _go_on(self):
@@ -375,7 +376,7 @@ class SkinStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, int(m.has_liquid)]
+        bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid)]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
 
     def _precondition(self):
@@ -483,8 +484,8 @@ class SkinStep:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
         self._launch(worlds.release_geoms, (g.count, w), [g.struct, self._way, st])
         frame = [d.frame_pos, d.frame_mat]
-        self._launch(nodes.end_nodes, d.x.shape, [int(self.implicit), d.x, k.world, *frame, d.dt, d.x_last],
-                     [d.increment, d.velocity])  # fmt: skip
+        end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
+        self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])
         if self.implicit:
             self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])

@@ -43,6 +43,7 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
     curvature = pq + st.kappa[w] * gp * gp
     first = st.iterations_cg[w] == 0
     st.iterations_cg[w] = st.iterations_cg[w] + 1
+    st.work[w] = st.work[w] + 1
     if not (curvature > real(0.0)):
         # the tangent is not positive definite there: what has been found so far is a descent direction; at
         # once, it is the first one

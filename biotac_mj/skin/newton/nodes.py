@@ -146,6 +146,7 @@ def assemble_force(
 def end_nodes(
     # In:
     implicit: int,
+    wanted: wp.array(dtype=int),
     x: wp.array2d(dtype=vec3),
     world: wp.array2d(dtype=vec3),
     pos: wp.array(dtype=vec3),
@@ -158,6 +159,8 @@ def end_nodes(
     velocity_out: wp.array2d(dtype=vec3),
 ):
     i, w = wp.tid()
+    if wanted[w] == 0:
+        return
     increment_out[i, w] = x[i, w] - x_last[i, w]
     x_last[i, w] = x[i, w]
     if implicit == 1:

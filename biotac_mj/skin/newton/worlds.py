@@ -58,6 +58,7 @@ class Worlds:
     last_pressure: wp.array(dtype=real)  # when the last step ended, above the surroundings [Pa]
     pressure: wp.array(dtype=real)  # at the last evaluation [Pa]
     volume: wp.array(dtype=real)  # of the liquid there [m^3]
+    wanted: wp.array(dtype=int)  # takes part in this step; who does not stays as the last one left it
     asked: wp.array(dtype=int)  # its input can be solved, and its way is not at its end
     active: wp.array(dtype=int)  # not yet in balance
     running: wp.array(dtype=int)  # its linear solve goes on
@@ -92,6 +93,7 @@ class Worlds:
     side: wp.array(dtype=int)
     tries: wp.array(dtype=int)
     iterations_cg: wp.array(dtype=int)
+    work: wp.array(dtype=int)  # evaluations and products of this step so far
 
 
 BLOCK = 128  # threads that share the sums of one world
@@ -153,6 +155,16 @@ def begin_worlds(
     if w == 0:
         for k in range(flags.shape[0]):
             flags[k] = 0
+    m = st.mu[w]
+    l = st.lam[w]
+    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
+    if law == 2:
+        E = real(9.0) * l * m / (real(3.0) * l + m)
+    st.softness[w] = youngs_modulus / E
+    if st.wanted[w] == 0:
+        st.asked[w] = 0
+        st.active[w] = 0
+        return
     st.reason[w] = CONVERGED
     finite = int(1)
     now_last = real(0.0)
@@ -180,12 +192,6 @@ def begin_worlds(
             now_last += wp.dot(p - last, was)
             square += wp.dot(was, was)
         touched_by[g, w] = 0
-    m = st.mu[w]
-    l = st.lam[w]
-    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
-    if law == 2:
-        E = real(9.0) * l * m / (real(3.0) * l + m)
-    st.softness[w] = youngs_modulus / E
     if not (wp.isfinite(E + st.kappa[w] + st.natural[w]) and E > real(0.0)):
         finite = 0
     repeat = real(0.0)
@@ -200,6 +206,7 @@ def begin_worlds(
     st.deep[w] = 0
     st.inverted[w] = 0
     st.iterations[w] = 0
+    st.work[w] = 0
     begin_try(st, w, limit)
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
@@ -214,6 +221,7 @@ def begin_worlds(
 def judge_balance(
     # In:
     tolerance: real,
+    max_work: int,
     has_liquid: int,
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
@@ -246,6 +254,9 @@ def judge_balance(
     if wp.abs(rz) < real(0.25) * st.best[w]:
         st.best[w] = wp.abs(rz)
         st.since[w] = st.iterations[w]
+    allowed = max_work
+    if st.stride[w] == real(0.0):  # what the first try leaves is for the way in parts
+        allowed = max_work / 3
     settled = int(1)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
@@ -253,7 +264,9 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED:
+    elif (
+        st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED or st.work[w] >= allowed
+    ):
         st.active[w] = 0
         st.failed[w] = 1
     else:
@@ -264,7 +277,7 @@ def judge_balance(
 
 
 @wp.kernel
-def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int)):
+def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
     The first try is the whole way from a guess, the second the whole way from where the step began, if the
@@ -290,7 +303,7 @@ def judge_way(shortest: real, budget: int, st: Worlds, again: wp.array(dtype=int
             stride = real(0.5)
     else:
         stride = real(0.5) * stride
-    if stride < shortest or st.iterations[w] >= budget:
+    if stride < shortest or st.work[w] >= max_work:
         st.asked[w] = 0
         return
     st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
@@ -325,6 +338,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     slope = total_of(part, 1, w, t)
     if t > 0:
         return
+    st.work[w] = st.work[w] + 1
     if st.tries[w] == 0:
         st.slope[w] = slope
         st.slope_low[w] = slope
@@ -430,7 +444,9 @@ def end_way(
     w = wp.tid()
     f = st.reached[w]
     st.moving[w] = 0
-    st.failed[w] = 0
+    st.failed[w] = 1 - st.wanted[w]
+    if st.wanted[w] == 0:
+        return
     if f < real(1.0):
         st.moving[w] = 1
         any_short[0] = 1
@@ -449,6 +465,8 @@ def end_way(
 def release_geoms(geoms: Geoms, way: Way, st: Worlds):
     """Makes the poses that were reached those of the last step, and writes back what was set."""
     g, w = wp.tid()
+    if st.wanted[w] == 0:
+        return
     if st.reason[w] != NOT_FINITE:
         geoms.pos_last[g, w] = geoms.pos[g, w]
         geoms.mat_last[g, w] = geoms.mat[g, w]
@@ -460,6 +478,8 @@ def release_geoms(geoms: Geoms, way: Way, st: Worlds):
 def end_worlds(st: Worlds):
     w = wp.tid()
     st.active[w] = 0
+    if st.wanted[w] == 0:
+        return
     if st.reason[w] != CONVERGED:
         st.nonconverged[w] = st.nonconverged[w] + 1
     if st.failed[w] == 0:

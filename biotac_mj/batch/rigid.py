@@ -1,0 +1,88 @@
+"""Rigid motions in Warp: poses, rotation vectors and small motions.
+
+A small motion has the translation of the origin's point first, then the rotation vector."""
+
+import warp as wp
+
+__all__ = ["displace", "displace_from", "is_finite", "matrix", "motion", "rotation", "size_of", "vector"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec3 = wp.vec3d
+mat33 = wp.mat33d
+vec6 = wp.spatial_vectord
+
+LEVER = 0.01  # [m] about the size of a fingertip: compares rotations with translations
+
+
+@wp.func
+def vector(v: wp.vec3):
+    return vec3(real(v[0]), real(v[1]), real(v[2]))
+
+
+@wp.func
+def matrix(m: wp.mat33):
+    return mat33(
+        real(m[0, 0]), real(m[0, 1]), real(m[0, 2]),
+        real(m[1, 0]), real(m[1, 1]), real(m[1, 2]),
+        real(m[2, 0]), real(m[2, 1]), real(m[2, 2]),
+    )  # fmt: skip
+
+
+@wp.func
+def rotation(v: vec3):
+    """Rotation matrix of a rotation vector (Rodrigues)."""
+    angle2 = wp.dot(v, v)
+    angle = wp.sqrt(angle2)
+    a = real(1.0) - angle2 / real(6.0)
+    b = real(0.5) - angle2 / real(24.0)
+    if angle > real(1.0e-4):
+        a = wp.sin(angle) / angle
+        b = (real(1.0) - wp.cos(angle)) / angle2
+    k = wp.skew(v)
+    return wp.identity(n=3, dtype=real) + a * k + b * (k * k)
+
+
+@wp.func
+def motion(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33):
+    """Small motion from pose 0 to the other."""
+    turn = mat * wp.transpose(mat0)
+    v = real(0.5) * vec3(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
+    sine = wp.length(v)
+    if sine > real(1.0e-9):
+        v = wp.atan2(sine, real(0.5) * (wp.trace(turn) - real(1.0))) / sine * v
+    t = pos - pos0 - wp.cross(v, pos0)
+    return vec6(t[0], t[1], t[2], v[0], v[1], v[2])
+
+
+@wp.func
+def displace_from(here: vec3, pos: vec3, mat: mat33, m: vec6):
+    """The pose moved by a small motion that was measured with the body's own point `here`."""
+    turn = vec3(m[3], m[4], m[5])
+    return pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here), rotation(turn) * mat
+
+
+@wp.func
+def displace(pos: vec3, mat: mat33, m: vec6):
+    """The pose moved by a small motion, the inverse of `motion`: the body's own point goes straight on."""
+    return displace_from(pos, pos, mat, m)
+
+
+@wp.func
+def size_of(m: vec6):
+    """Of a small motion [m]."""
+    size = real(0.0)
+    for i in range(3):
+        size = wp.max(size, wp.max(wp.abs(m[i]), real(LEVER) * wp.abs(m[3 + i])))
+    return size
+
+
+@wp.func
+def is_finite(pos: vec3, mat: mat33):
+    total = real(0.0)
+    for i in range(3):
+        total += wp.abs(pos[i])
+        for j in range(3):
+            total += wp.abs(mat[i, j])
+    return total < real(1.0e6)  # false for nan, too

@@ -1,0 +1,40 @@
+"""Memory for code that allocates as it goes, inside loops of a CUDA graph, which may not."""
+
+import warp as wp
+
+__all__ = ["Scratch"]
+
+
+class Scratch:
+    """Warp's allocator on one CUDA device while it is entered; on the CPU nothing changes.
+
+    What was freed is given again to who asks for as much: code that ran once outside of a loop finds there
+    all that it needs when it runs inside.
+    """
+
+    def __init__(self, device: wp.DeviceLike):
+        self._device, self._free, self._blocks = wp.get_device(device), {}, {}
+        self._scopes = []
+
+    def __enter__(self) -> "Scratch":
+        if self._device.is_cuda:
+            self._scopes.append(wp.ScopedAllocator(self._device, self))
+            self._scopes[-1].__enter__()
+        return self
+
+    def __exit__(self, *error) -> None:
+        if self._device.is_cuda:
+            self._scopes.pop().__exit__(*error)
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """Device pointer to as many bytes."""
+        free = self._free.setdefault(size_in_bytes, [])
+        if free:
+            return free.pop()
+        with wp.ScopedAllocator(self._device, self._scopes[-1].saved):
+            block = wp.empty(size_in_bytes, dtype=wp.uint8, device=self._device)
+        self._blocks[block.ptr] = block
+        return block.ptr
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        self._free[size_in_bytes].append(ptr)
