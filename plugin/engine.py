@@ -27,6 +27,7 @@ ATTRIBUTES = (
     "geoms",
     "rounding",
     "thermal",
+    "textures",
     "friction",
     "priority",
     "tier",

@@ -150,6 +150,7 @@ def test_noise_is_that_of_numpys_philox(seed):
     """One counter for each slot of 4.4 kHz, two of its four words through Box and Muller's formula."""
     acquisition, state = started(seed=seed)
     electrode = channels.counts_from_impedance(REST)
+    hiss = None
     for frame in range(-3, 40):
         acquisition.advance(state, frame * 0.01, 0.01, REST)
         raw = np.random.Philox(key=seed, counter=frame * SLOTS_PER_FRAME % 2**64).random_raw(4 * 44)
@@ -160,7 +161,29 @@ def test_noise_is_that_of_numpys_philox(seed):
         readings = acquisition.readings(state)
         assert np.array_equal(readings["electrodes"], expected)
         assert readings["pdc"] == np.rint(2000 + normal[39])
-        assert np.array_equal(readings["pac"][1:], np.rint(4095 / 2 + normal[2::2]))
+        coloured = []
+        for white in channels.PAC_NOISE * normal[::2]:
+            # the first slot of all came before the first step
+            hiss = 0.0 if hiss is None else channels.PAC_COLOUR * hiss + white
+            coloured.append(hiss)
+        assert np.array_equal(readings["pac"][1:], np.rint(4095 / 2 + np.array(coloured[1:])))
+
+
+def test_pac_at_rest_has_the_measured_spectrum():
+    """First-order noise: 3.92 counts RMS, and 4.2 dB less per hertz near 1 kHz than near 25 Hz."""
+    acquisition, state = started(seed=3)
+    pac = []
+    for frame in range(3000):
+        acquisition.advance(state, frame * 0.01, 0.01, REST)
+        pac.append(np.roll(acquisition.readings(state)["pac"], -1))  # the first is the next frame's already
+    pac = np.ravel(pac) - 4095 / 2
+    a = channels.PAC_COLOUR
+    assert pac.std() == pytest.approx(np.sqrt(channels.PAC_NOISE**2 / (1 - a * a) + 1 / 12), rel=0.02)
+    power = (np.abs(np.fft.rfft(pac.reshape(-1, 220))) ** 2).mean(0)
+    hertz = np.fft.rfftfreq(220, 1 / 2200.0)
+    near = [power[(hertz > low) & (hertz < high)].mean() for low, high in ((20, 70), (950, 1050))]
+    expected = [1 / (1 + a * a - 2 * a * np.cos(2 * np.pi * f / 2200)) for f in (45, 1000)]
+    assert near[0] / near[1] == pytest.approx(expected[0] / expected[1], rel=0.1)
 
 
 def test_clipping_to_twelve_bits():

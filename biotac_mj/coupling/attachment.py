@@ -14,6 +14,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
 from ..sensor.materials import read_thermal
+from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
 from .stepper import check_names, make_readings
 
@@ -94,6 +95,7 @@ def attach(
     geoms: list | None = None,
     rounding: dict | None = None,
     thermal: dict | None = None,
+    textures: dict | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -123,6 +125,9 @@ def attach(
       thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
         dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]. {} makes all of plastic at 23 C, None
         leaves heat out.
+      textures: geom name -> what slides feel of it: {"pitch": 1e-3, "height": 5e-5} of ridges, {"roughness":
+        1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"). {} makes all smooth: PAC feels taps and
+        stick-slip. None leaves vibration out.
       coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
 
     Raises:
@@ -149,6 +154,7 @@ def attach(
         geoms=geoms,
         rounding={} if rounding is None else rounding,
         thermal=thermal,
+        textures=textures,
         priority=priority,
         seed=seed,
         device=device,
@@ -159,7 +165,10 @@ def attach(
     _check(config, geometry)
     for value in (config.thermal or {}).values():
         read_thermal(value)
-    _check_geoms(spec, (*(config.geoms or ()), *config.rounding, *(config.thermal or {})))
+    for value in (config.textures or {}).values():
+        read_texture(value)
+    named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
+    _check_geoms(spec, named)
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:
@@ -190,7 +199,7 @@ def _material_choices(material, liquid, friction):
 def _check(config, geometry):
     """What would fail in the plugin's first call, or on the way of the readings."""
     check_names(config)
-    make_readings(config, geometry, [])
+    make_readings(config, geometry, [], None)
     if config.stepper == "fem":
         from ..skin.condensed.refusals import refuse
         from ..skin.model import check_modulus

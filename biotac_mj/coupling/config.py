@@ -56,6 +56,8 @@ class Config:
       thermal: geom name -> material, for heat between the sensor and what it touches
         (`sensor.materials.read_thermal`); geoms that are not named are of plastic. None leaves heat out: TDC
         is constant.
+      textures: geom name -> texture, for what PAC feels of sliding, taps and stick-slip within a step
+        (`sensor.vibration.read_texture`); geoms that are not named are smooth. None leaves vibration out.
       friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
         the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
@@ -77,6 +79,7 @@ class Config:
     geoms: tuple | None = None
     rounding: dict = dataclasses.field(default_factory=dict)
     thermal: dict | None = None
+    textures: dict | None = None
     friction: float = 0.783414394
     priority: int = 0
     seed: int = 0
@@ -106,8 +109,9 @@ class Config:
         for name in ("rounding", "options"):
             if not isinstance(getattr(self, name), dict):
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
-        if not (self.thermal is None or isinstance(self.thermal, dict)):
-            raise ValueError(f"thermal is {self.thermal!r}: give a dict of geoms and materials, or None")
+        for name in ("thermal", "textures"):
+            if not isinstance(value := getattr(self, name), dict | None):
+                raise ValueError(f"{name} is {value!r}: give a dict of geoms and materials, or None")
         self._set("friction", real("the skin's friction", self.friction, 0.0))
         self._set("priority", integer("priority", self.priority))
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))

@@ -111,16 +111,25 @@ class FemStepper:
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
 
+    @property
+    def model(self) -> SkinModel:
+        """What of the skin does not change."""
+        return self._model
+
+    def contact_rows(self, state: np.ndarray) -> np.ndarray:
+        """(k, 5) sample of the outer surface, geom and anchor in its frame [m] of what touches in a state."""
+        return _contacts(self._part(state, "contacts"))
+
     @functools.cached_property
-    def _sample_area(self):
-        """What a contact sample of each face stands for [m^2], and how many a face has."""
+    def sample_area(self) -> tuple[np.ndarray, int]:
+        """What a contact sample of each face stands for (nface,) [m^2], and how many a face has."""
         nsample = len(self._model.sample)
         return self._model.outer.area.numpy() / nsample, nsample
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
-        contacts = _contacts(self._part(state, "contacts"))
-        share, nsample = self._sample_area
+        contacts = self.contact_rows(state)
+        share, nsample = self.sample_area
         group = np.array([g.group for g in self._geoms], int)
         face = contacts[:, 0].astype(int) // nsample
         return np.bincount(

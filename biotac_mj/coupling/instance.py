@@ -47,7 +47,7 @@ class _Skin:
     def __init__(self, config, geoms):
         self.geometry = load_skin(config.skin)
         self.stepper = make_stepper(config, self.geometry, geoms)
-        self.readings = make_readings(config, self.geometry, geoms)
+        self.readings = make_readings(config, self.geometry, geoms, self.stepper)
         self.lock = threading.Lock()
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
 
@@ -371,6 +371,9 @@ class Instance:
                     after = result.state is not None
                     area = skin.stepper.touched_area(result.state) if after else np.zeros(self.setup.ngroup)
                     touch = {"area": area, "force": np.linalg.norm(result.wrench[:, :3], axis=1)}
+                if self.setup.config.textures is not None:
+                    before = self.setup.parts(self.state)[2]
+                    touch["shaking"] = skin.readings.shaking(before, result, self.model.opt.timestep)
                 counts = skin.readings.advance(
                     state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure, **touch
                 )

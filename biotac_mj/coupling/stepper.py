@@ -131,11 +131,17 @@ class Readings(Protocol):
     ) -> dict:
         """Advances state in place over [time, time + dt] and returns channel -> counts."""
 
-    # Readings may have the method below; `advance` then also gets area [m^2] and force [N], (ngroup,) each,
-    # of what touches at the end of the step.
+    # Readings may have the methods below. With the first `advance` also gets area [m^2] and force [N],
+    # (ngroup,) each, of what touches at the end of the step; with the others what `shaking` returns.
 
     def feel_heat(self, geoms: list[Geom]) -> None:
         """Heat flows between the sensor and these geoms; called first, it may change nstate."""
+
+    def feel_vibration(self, geoms: list[Geom], stepper: SkinStepper) -> None:
+        """The sensor feels how these geoms shake the stepper's skin; called first, it may change nstate."""
+
+    def shaking(self, before: np.ndarray, result: SkinResult, dt: float) -> object:
+        """How the skin, in state `before`, is shaken by the step of dt [s]."""
 
 
 class _NoReadings:
@@ -214,11 +220,15 @@ def make_stepper(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> S
     return _factory(_steppers, config.stepper)(config, geometry, geoms)
 
 
-def make_readings(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> Readings:
-    """The readings that `config.readings` names.
+def make_readings(
+    config: Config, geometry: SkinGeometry, geoms: list[Geom], stepper: SkinStepper | None
+) -> Readings:
+    """The readings that `config.readings` names, of the stepper's skin; without one they only serve to
+    check the settings.
 
     Raises:
-      ValueError: the name is unknown, or `config.thermal` asks for heat that the readings do not know.
+      ValueError: the name is unknown, or `config` asks for heat or vibration that the readings or the stepper
+        do not know.
     """
     check_names(config)
     readings = _factory(_readings, config.readings)(config, geometry)
@@ -226,4 +236,13 @@ def make_readings(config: Config, geometry: SkinGeometry, geoms: list[Geom]) -> 
         if not hasattr(readings, "feel_heat"):
             raise ValueError(f"readings {config.readings!r} know no heat: leave thermal out")
         readings.feel_heat(geoms)
+    if config.textures is not None:
+        if not (
+            hasattr(readings, "feel_vibration") and (stepper is None or hasattr(stepper, "contact_rows"))
+        ):
+            raise ValueError(
+                f"readings {config.readings!r} on stepper {config.stepper!r} know no vibration: leave "
+                "textures out"
+            )
+        readings.feel_vibration(geoms, stepper)
     return readings

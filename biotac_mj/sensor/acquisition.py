@@ -6,8 +6,8 @@ odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Source of ra
 channel has which slot is not published: CHOSEN as above.
 
 Slot k lies at time k / 4400 s, so what is sampled when depends on the time alone, never on the time step. All
-memory lies in state vectors of NSTATE numbers; noise is numpy's Philox 4x64 with one counter block per slot,
-a function of (seed, slot), so a replay from a saved state is bit-equal.
+memory lies in state vectors of NSTATE numbers; noise is made of numpy's Philox 4x64 with one counter block
+per slot, a function of (seed, slot), so a replay from a saved state is bit-equal.
 
 `Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
 their device; both launch the kernels below."""
@@ -46,10 +46,12 @@ SLOT_RATE = 4400.0  # [Hz]
 SLOTS_PER_FRAME = 44
 
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
-# temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; counts.
+# temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; PAC's
+# last noise; counts.
 PRESSURE = NELECTRODE
 TEMPERATURE, IMPEDANCE_TIME, FILTER = PRESSURE + 1, PRESSURE + 2, PRESSURE + 3
-HELD = FILTER + 3  # e1..e19, pdc, tac, tdc
+_HISS = FILTER + 3
+HELD = _HISS + 1  # e1..e19, pdc, tac, tdc
 HELD_PDC, HELD_TAC, HELD_TDC = HELD + NELECTRODE, HELD + NELECTRODE + 1, HELD + NELECTRODE + 2
 PAC = HELD_TDC + 1  # the frame's slots
 NSTATE = PAC + NPAC
@@ -82,7 +84,7 @@ _electrode_noise = _compiled(channels.electrode_noise)
 
 
 @wp.func
-def _slots_until(time: real):
+def slots_until(time: real):
     """How many slots lie up to a time, slot 0 left out; the allowance keeps a slot on one side of a time that
     was summed up with rounding."""
     return wp.int64(wp.floor(time * real(SLOT_RATE) + real(1.0e-6)))
@@ -106,8 +108,8 @@ def find_due(
 ):
     """`Acquisition.needs_impedance` of each world."""
     w = wp.tid()
-    before = _slots_until(time[w])
-    count = wp.int32(_slots_until(time[w] + dt) - before)
+    before = slots_until(time[w])
+    count = wp.int32(slots_until(time[w] + dt) - before)
     due = int(0)
     if every_step == 1:
         for k in range(1, wp.min(count, SLOTS_PER_FRAME) + 1):
@@ -160,7 +162,7 @@ def philox(counter: wp.uint64, key: wp.uint64):
 
 
 @wp.func
-def _normal(slot: wp.int64, seed: wp.uint64):
+def draw_normal(slot: wp.int64, seed: wp.uint64):
     """Standard normal draw of a slot (Box-Muller: a fixed number of draws)."""
     raw = philox(wp.uint64(slot) + wp.uint64(1), seed)  # numpy counts on before it draws
     shift = wp.uint64(11)
@@ -188,6 +190,7 @@ def sample_slots(
     impedance: wp.array2d(dtype=real),
     pressure: wp.array(dtype=real),
     temperature: wp.array(dtype=real),
+    shaken: wp.array2d(dtype=real),
     # In, out:
     time: wp.array(dtype=real),
     state: wp.array2d(dtype=real),
@@ -204,17 +207,21 @@ def sample_slots(
     low = state[w, FILTER]
     high = state[w, FILTER + 1]
     tac = state[w, FILTER + 2]
-    before = _slots_until(now)
-    for k in range(1, wp.int32(_slots_until(now + dt) - before) + 1):
+    before = slots_until(now)
+    for k in range(1, wp.int32(slots_until(now + dt) - before) + 1):
         slot = before + wp.int64(k)
         since = real(slot) / real(SLOT_RATE) - now
         position = _position(slot)
         channel = position / 2
         address = PAC + channel
         fast = _ramp(old, rise, low, real(_LOW), since)
-        value = _pac_counts(real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since)))
-        deviation = real(channels.OTHER_NOISE)
+        sound = real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since))
+        if k <= shaken.shape[1]:
+            sound += shaken[w, k - 1]
+        value = _pac_counts(sound)
+        deviation = real(channels.PAC_NOISE)
         if position % 2 == 1:
+            deviation = real(channels.OTHER_NOISE)
             address = HELD + channel
             if channel < NELECTRODE:
                 z = state[w, channel]
@@ -231,7 +238,11 @@ def sample_slots(
             else:
                 value = _thermistor_counts(_temperature_exponent(warm + heating * since))
         if noise == 1:
-            value += deviation * _normal(slot, seed[w])
+            hiss = deviation * draw_normal(slot, seed[w])
+            if position % 2 == 0:
+                hiss += real(channels.PAC_COLOUR) * state[w, _HISS]
+                state[w, _HISS] = hiss
+            value += hiss
         # a step longer than a frame meets a channel more than once: the last one stays
         state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
     state[w, FILTER] = _ramp(old, rise, low, real(_LOW), dt)
@@ -306,7 +317,7 @@ class Acquisition:
         state[:NELECTRODE] = self._check_impedance(impedance)
         state[PRESSURE], state[TEMPERATURE] = self._check_scalars(pressure, temperature)
         state[IMPEDANCE_TIME] = time
-        state[FILTER:HELD] = pressure, pressure, 0.0
+        state[FILTER:HELD] = pressure, pressure, 0.0, 0.0
         state[HELD:HELD_PDC] = channels.counts_from_impedance(impedance)
         state[HELD_PDC] = channels.counts_from_pressure(pressure)
         state[HELD_TAC] = channels.counts_from_heating(0.0)
@@ -333,6 +344,7 @@ class Acquisition:
         impedance: ArrayLike | None = None,
         pressure: float = 0.0,
         temperature: float | None = None,
+        shaken: wp.array | None = None,
     ) -> None:
         """Samples the slots in (time, time + dt].
 
@@ -342,6 +354,8 @@ class Acquisition:
           impedance: (19,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
           pressure: at the end of the step, above rest [Pa].
           temperature: of the core at the end of the step [C]; None keeps the last one.
+          shaken: (1, n) float64 on the CPU, what PAC feels besides at each of the slots [Pa], of its band
+            already (`vibration`).
 
         Raises:
           ValueError: wrong shape, not finite, impedance not positive, or dt not positive. The state is
@@ -353,7 +367,7 @@ class Acquisition:
         if impedance is not None:
             impedance = self._check_impedance(impedance)
         signals = self._check_scalars(pressure, state[TEMPERATURE] if temperature is None else temperature)
-        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals)
+        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals, shaken)
 
     def readings(self, state: np.ndarray) -> dict:
         """What the bus would report now.
@@ -428,7 +442,9 @@ class _One:
         )
         self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
         valid = wp.ones(1, dtype=int, device="cpu")
+        self._still = self._shaken = wp.zeros((1, 0), dtype=real, device="cpu")
         inputs = [1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
+        inputs.append(self._still)
         state = [self._time, self._state]
         self._sample = wp.launch(sample_slots, 1, inputs, state, device="cpu", record_cmd=True)
         self._find = wp.launch(find_due, 1, [self._time, 1.0, 0], [self._due], device="cpu", record_cmd=True)
@@ -440,7 +456,11 @@ class _One:
         self._find.launch()
         return bool(self.due[0])
 
-    def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature):
+    def sample(self, seed, noise, state, time, dt, impedance, pressure, temperature, shaken):
+        shaken = self._still if shaken is None else shaken
+        if shaken is not self._shaken:
+            self._shaken = shaken
+            self._sample.set_param_at_index(8, shaken)
         self.state[:] = state
         self.seed[0], self.time[0], self.pressure[0], self.temperature[0] = seed, time, pressure, temperature
         self.due[0] = impedance is not None
@@ -514,6 +534,7 @@ class BatchAcquisition:
             self.time = wp.zeros(nworld, dtype=real)
             self.temperature = wp.full(nworld, temperature, dtype=real)
             self.due = wp.zeros(nworld, dtype=int)
+            self._still = wp.zeros((nworld, 0), dtype=real)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
@@ -537,4 +558,5 @@ class BatchAcquisition:
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
         """
         inputs = [dt, self._noise, self.seed, self.due, valid, impedance, pressure, self.temperature]
+        inputs.append(self._still)
         wp.launch(sample_slots, self.nworld, inputs, [self.time, self.state], device=self.device)

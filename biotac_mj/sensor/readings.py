@@ -10,6 +10,7 @@ from biotac_mj.sensor.channels import REST_COUNTS, REST_TEMPERATURE
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.sensor.heat import LIQUID, THERMISTOR, Heat, HeatParameters, electrode_factor
 from biotac_mj.sensor.materials import Material
+from biotac_mj.sensor.vibration import Vibration
 
 __all__ = ["PhysicsReadings", "check_settings", "record"]
 
@@ -34,6 +35,8 @@ class PhysicsReadings:
         none.
       cold: the sensor is switched on at the reset: it begins at the temperature around it and warms up.
       film: a FilmConduction to share between sensors of the same geometry; None builds one.
+      vibration: of one sensor on the CPU, for what PAC feels of textures, taps and stick-slip; None: it feels
+        the pressure of whole steps alone.
 
     Attributes:
       nstate: length of the state vector.
@@ -50,6 +53,7 @@ class PhysicsReadings:
         film: FilmConduction | None = None,
         bodies: list[Material] | None = None,
         cold: bool = False,
+        vibration: Vibration | None = None,
     ):
         self.film = FilmConduction(geometry, sensor=sensor) if film is None else film
         self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
@@ -62,7 +66,11 @@ class PhysicsReadings:
             self._begin, self._liquid = begins.rest(len(bodies)), sensor.rest()[LIQUID]
         elif cold:
             raise ValueError("cold is of a sensor with heat: give bodies, in attach thermal")
-        self.nstate = self.acquisition.nstate + (0 if self._heat is None else self._heat.nstate)
+        self._warm = slice(self.acquisition.nstate, self.acquisition.nstate)
+        if self._heat is not None:
+            self._warm = slice(self._warm.start, self._warm.start + self._heat.nstate)
+        self._vibration = vibration
+        self.nstate = self._warm.stop + (0 if vibration is None else vibration.nstate)
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(
@@ -73,9 +81,10 @@ class PhysicsReadings:
         impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         temperature = self.temperature
         if self._heat is not None:
-            state[self.acquisition.nstate :] = self._begin
+            state[self._warm] = self._begin
             temperature = self._begin[THERMISTOR]
             impedance = impedance * electrode_factor(self._begin[LIQUID], self._liquid)
+        state[self._warm.stop :] = 0.0
         self.acquisition.reset(self._counts(state), impedance, pressure, temperature, time)
 
     def _counts(self, state):
@@ -90,6 +99,7 @@ class PhysicsReadings:
         pressure: float,
         area: np.ndarray | None = None,
         force: np.ndarray | None = None,
+        shaking: tuple | None = None,
     ) -> None:
         """Samples the step (time, time + dt].
 
@@ -100,6 +110,7 @@ class PhysicsReadings:
           pressure: of the liquid at the end of the step, above rest [Pa].
           area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
             touches.
+          shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
@@ -116,20 +127,36 @@ class PhysicsReadings:
             )
             if heat is not None:
                 impedance = impedance * electrode_factor(heat[LIQUID], self._liquid)
-        self.acquisition.advance(counts, time, dt, impedance, pressure, temperature)
+        moved, shaken = self._vibrate(state, time, dt, shaking)
+        self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken)
         if heat is not None:
-            state[self.acquisition.nstate :] = heat
+            state[self._warm] = heat
+        if moved is not None:
+            state[self._warm.stop :] = moved
 
     def _advance_heat(self, state, dt, area, force):
         """The heat's state after the step, None without heat."""
         if self._heat is None:
             return None
         heat, own = self._heat, self._heat.state.numpy()[0]
-        own[:] = state[self.acquisition.nstate :]
+        own[:] = state[self._warm]
         for array, given in ((heat.area, area), (heat.force, force)):
             array.numpy()[:] = 0.0 if given is None else given
         heat.advance(dt)
         return own
+
+    def _vibrate(self, state, time, dt, shaking):
+        """The vibration's state after the step and what PAC feels at its slots; None without one."""
+        if self._vibration is None:
+            return None, None
+        v = self._vibration
+        own = v.state.numpy()[0]
+        own[:] = state[self._warm.stop :]
+        v.time.numpy()[0] = time
+        for i, array in enumerate((v.drive, v.gain, v.slip, v.area)):
+            array.numpy()[0] = 0.0 if shaking is None else shaking[i]
+        v.advance(dt)
+        return own, v.pressure
 
     def readings(self, state: np.ndarray) -> dict:
         """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""

@@ -1,0 +1,100 @@
+"""What a solved step of the skin does to its modes: forces of the contacts, what heights under them would
+make, and how fast bodies slip."""
+
+import functools
+import math
+
+import numpy as np
+
+from ..sensor.vibration import Modes
+from ..skin.modes import NMODE, skin_modes
+from .fem import FemStepper
+from .stepper import Geom, SkinResult
+
+__all__ = ["Shaking"]
+
+
+class Shaking:
+    """Of one skin.
+
+    Args:
+      stepper: of the skin. geoms: that can touch it.
+    """
+
+    def __init__(self, stepper: FemStepper, geoms: list[Geom]):
+        self._stepper = stepper
+        self._group = np.array([g.group for g in geoms], int)
+        self._ngroup = 1 + max((g.group for g in geoms), default=-1)
+
+    @functools.cached_property
+    def _modes(self):
+        return skin_modes(self._stepper.model)
+
+    @property
+    def modes(self) -> Modes:
+        """What the sensor needs of the skin's modes."""
+        return Modes(self._modes.rate, self._modes.share)
+
+    @functools.cached_property
+    def _faces(self):
+        """(nface, (nmode + 1) 3) modal forces and steady pressure of a unit force on each outer face."""
+        modes = self._modes
+        place = np.zeros(self._stepper.model.nvert, int)
+        place[modes.node] = np.arange(len(modes.node))
+        each = np.concatenate([modes.shape, modes.static[None]])[:, place[self._stepper.model.outer.face_np]]
+        return np.ascontiguousarray(each.mean(2).swapaxes(0, 1).reshape(-1, 3 * (NMODE + 1)), np.float32)
+
+    def of_step(self, before: np.ndarray, result: SkinResult, dt: float) -> tuple | None:
+        """`drive`, `gain`, `slip` and `area` of `sensor.vibration.Vibration` at the end of a step.
+
+        A body's force acts on the samples that it touches, along itself; a height is a motion along it too,
+        and what it makes the tangent of the step. The speed of slip is that at which what holds the samples
+        in friction moves over the body, on average.
+
+        Args:
+          before: the skin's state. result: of the step. dt: its length [s].
+        """
+        if result.state is None:
+            return None
+        rows = self._stepper.contact_rows(result.state)
+        if not len(rows):
+            return None
+        drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
+        slip, area = np.zeros(self._ngroup), np.zeros(self._ngroup)
+        share, nsample = self._stepper.sample_area
+        sample, geom = rows[:, :2].T.astype(int)
+        group, face = self._group[geom], sample // nsample
+        way, known = self._moved(self._stepper.contact_rows(before), rows, sample)
+        for g in np.bincount(group).nonzero()[0]:
+            force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
+            size = math.sqrt(force @ force)
+            if size == 0:
+                continue
+            along, count = force / size, np.bincount(face[mine])
+            at = count.nonzero()[0]
+            count = count[at].astype(np.float32)
+            heard = (count @ self._faces.take(at, 0) / len(mine)).reshape(-1, 3) @ along
+            area[g] = count @ share[at]
+            drive += size * heard[:-1]
+            gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
+            also = known[mine]
+            mean = also @ way[mine] / max(also.sum(), 1.0)
+            slip[g] = math.sqrt(mean @ mean) / dt
+        return drive, gain, slip, area
+
+    @functools.cached_property
+    def _place(self):
+        share, nsample = self._stepper.sample_area
+        return np.full(len(share) * nsample, -1)
+
+    def _moved(self, old, new, sample):
+        """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were
+        contacts before: (k,) 1 or 0."""
+        if not len(old):
+            return np.zeros((len(new), 3)), np.zeros(len(new))
+        before = old[:, 0].astype(int)
+        self._place[before] = np.arange(len(old))
+        found = self._place[sample]
+        self._place[before] = -1
+        known = (found >= 0) & (old[found, 1] == new[:, 1])
+        return new[:, 2:] - old[found, 2:], known.astype(float)
