@@ -223,6 +223,7 @@ def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     from biotac_mj.learning.features import FilmFeatures, Pod
     from biotac_mj.learning.heads import LocalHead
     from biotac_mj.learning.weights import save_forward
+    from biotac_mj.sensor.acquisition import Acquisition
 
     skin = load_skin("coarse")
     torch.manual_seed(0)
@@ -232,7 +233,7 @@ def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     file = tmp_path / "w.safetensors"
     save_forward(file, [member], Pod(skin.nvert, 4), config, {"kind": "local", "window": True}, skin, about)
     readings = NetworkReadings(skin, weights=file, noise=False, sensor="2")
-    assert readings.nstate == 69 + 1 + 2 * 19 * FilmFeatures.count
+    assert readings.nstate == Acquisition.nstate + 1 + 2 * 19 * FilmFeatures.count
     state = np.zeros(readings.nstate)
     readings.reset(state)
     moved = skin.vert + dent(skin, [-9e-3, -7e-3, 0], 0.3e-3, 2e-3, 0)
