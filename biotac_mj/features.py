@@ -154,7 +154,14 @@ _READINGS = (
     ("PAC", "22 values a frame", "attach, condensed, batch; `generate` keeps the latest of them"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
     ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
-    ("status (tier, steps lost)", "yes", "attach, condensed, batch; `converged` in generate"),
+    ("status (tier, steps lost, rounds, share of the way, push withheld)", "yes",
+     "attach, condensed, batch; `converged` in generate"),
+    ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
+     "attach, condensed, batch"),
+    ("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
+     "attach, condensed; batch, generate, tasks, diagnose leave it out: TDC and TAC rest"),
+    ("vibration: PAC by texture, slip and taps", "`textures=`",
+     "attach, condensed; batch has PAC's coloured noise alone, generate, tasks and diagnose leave it out"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
      "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
      "materials, contact laws and fill"),

@@ -5,6 +5,8 @@ Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
+from ..coupling.coupled import DEEPER, TELEPORT
+from ..coupling.world import CLOSER, LEAST_STEP, TOLERANCE
 from ..skin.contact.faces import Geoms
 from ..skin.contact.shapes import distance_bound
 from ..skin.newton.worlds import CONVERGED
@@ -37,16 +39,14 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _MAX_ROUNDS = 6
-_TOLERANCE = wp.constant(wp.float64(2e-6))  # [m] how near to where the bodies go a skin must have been solved
-_DEEPER = wp.constant(wp.float64(5e-4))  # [m] beyond the last known pose, a skin is not solved in one round
-_CLOSER = wp.constant(wp.float64(0.7))  # a round that leaves more of the distance than this was too bold
-_LEAST_STEP = wp.constant(wp.float64(0.125))
+_TOLERANCE, _CLOSER, _LEAST_STEP, _DEEPER, _TELEPORT = (
+    wp.constant(wp.float64(x)) for x in (TOLERANCE, CLOSER, LEAST_STEP, DEEPER, TELEPORT)
+)
 _MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the last model must do
 _BISECTIONS = 12
 _TRIALS = 4
 _CAUTION = wp.constant(wp.float64(0.9))
 SHARES = 8  # of a way that crosses the skin are looked at
-_TELEPORT = wp.constant(wp.float64(1e-3))  # [m] a body moved further than this from outside was put there
 
 
 @wp.struct

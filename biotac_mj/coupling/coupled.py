@@ -8,13 +8,13 @@ from .instance import LEVER, Instance
 from .stepper import SkinResult
 from .structs import DataView
 
-__all__ = ["Coupled"]
+__all__ = ["DEEPER", "TELEPORT", "Coupled"]
 
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
-_DEEPER = 5e-4
+DEEPER = 5e-4
 _MOST_ITERATIONS = 40  # of the skin's solver in a step, after which the model that came closest must do
-_TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
+TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
 
 
 class Coupled:
@@ -90,9 +90,9 @@ class Coupled:
             self.correction = np.zeros_like(self.wrench0)
 
     def _within_reach(self, pose):
-        """The pose, or the part of the way to it that is no more than `_DEEPER` into the skin than is
+        """The pose, or the part of the way to it that is no more than `DEEPER` into the skin than is
         known."""
-        start, room = self.sound, _DEEPER
+        start, room = self.sound, DEEPER
         if start is None:
             start = self.here if self.asked is None else self.asked
             clear = self.instance.clear_share(*start, *pose)
@@ -160,7 +160,7 @@ class Coupled:
         if ends is None:
             return most
         jump = displacement(*self.here, *ends)
-        if _size(jump) > _TELEPORT:
+        if _size(jump) > TELEPORT:
             return most
         last = self.instance.last_model()[0]
         return min(store - min((w * jump).sum() for w in (wrench, last)), most)

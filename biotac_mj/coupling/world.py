@@ -18,7 +18,7 @@ from .instance import LEVER, Instance
 from .integrator import FixedPoint, Integrator
 from .structs import DataView, ModelView
 
-__all__ = ["World"]
+__all__ = ["CLOSER", "LEAST_STEP", "TOLERANCE", "World"]
 
 MAX_ROUNDS = 16
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
@@ -28,8 +28,8 @@ MAX_CORRECTIONS = 12
 CORRECTED = 1e-6
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
-_CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
-_LEAST_STEP = 0.125
+CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
+LEAST_STEP = 0.125
 _TRIALS = 4  # to find how much of a skin's push it can pay for
 
 
@@ -115,7 +115,7 @@ class World:
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break
-            share = max(0.5 * share, _LEAST_STEP) if off > _CLOSER * last else min(1.0, 2 * share)
+            share = max(0.5 * share, LEAST_STEP) if off > CLOSER * last else min(1.0, 2 * share)
             last = off
             for skin in going:
                 skin.go(share)
