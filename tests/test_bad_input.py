@@ -708,6 +708,8 @@ def numbers():
                 yield Row(f"{verb} --{name}={value}{out}", said)
     for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
+    for timestep in ("1001", "1e30"):
+        yield Row(f"press --timestep {timestep}", "1 s at most")
     yield Row("press --location 1 2 3 4", "location")
     yield Row("press --skin coarse --location 40", "no skin at x = 40 mm")
     yield Row("press --skin coarse --direction 0 -1 0", "leaves the skin")

@@ -14,6 +14,7 @@ from .indenter import Indenter, add_indenter
 __all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
 _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
+_LONGEST_STEP = 1.0  # [s]
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
 _PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
@@ -77,6 +78,10 @@ class PressOptions:
                     f"{name} is {getattr(self, name):g} m: the finger ends before {most:g} m; choose less"
                 )
         rests = self.hold * (2 if self.slide else 1)
+        if self.timestep > _LONGEST_STEP:
+            raise ValueError(
+                f"timestep is {self.timestep:g} s: {_LONGEST_STEP:g} s at most, a longer one is no press"
+            )
         steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
         if steps > _MOST_STEPS:
             raise ValueError(
