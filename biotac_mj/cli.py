@@ -60,6 +60,7 @@ def parser() -> argparse.ArgumentParser:
     _add_diagnose(verbs)
     _add_generate(verbs)
     _add_data(verbs)
+    _add_recordings(verbs)
     _add_learning(verbs)
     return top
 
@@ -628,32 +629,26 @@ def _diagnose(args):
 
 
 def _add_data(verbs):
+    from .recordings.verbs import add_load_arguments
+
     verb = _verb(
         verbs,
         "import-data",
         _import_data,
-        "Read recordings of real sensors into a set: NVIDIA's HDF5, Ruppel's CSV, plain text.",
+        "Read recordings of real sensors, whatever `biotac import` reads, into a set.",
     )
-    verb.add_argument("files", nargs="+", metavar="FILE", help="of one format")
-    verb.add_argument(
-        "--format",
-        choices=("nvidia", "ruppel", "text"),
-        help="(default: by the ending: .hdf5, .csv, others text)",
-    )
-    verb.add_argument("--force", metavar="FILE", help="text: forces beside it, 3 columns [N]")
-    verb.add_argument(
-        "--rate", type=real(1e-3, 1e6), metavar="HZ", help="nvidia, text: of the samples (default: 100)"
-    )
+    verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
+    verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
     verb.add_argument(
         "--block",
         type=real(1e-3, 1e9),
         metavar="S",
-        help="text: cut the log into interactions of this length",
+        help="cut into interactions of this length (they end at gaps of half a second in any case)",
     )
-    verb.add_argument("--object", metavar="NAME", help="ruppel, text: what touched")
     verb.add_argument(
-        "--objects", nargs="+", metavar="NAME", help="nvidia: names of indenter types 0, 1, ..."
+        "--objects", nargs="+", metavar="NAME", help="NVIDIA's files: names of indenter types 0, 1, ..."
     )
+    add_load_arguments(verb)
     verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
     verb = _verb(
@@ -667,6 +662,12 @@ def _add_data(verbs):
     )
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_recordings(verbs):
+    from .recordings.verbs import add_verbs
+
+    add_verbs(verbs, _verb)
 
 
 def _import_data(args):

@@ -9,13 +9,13 @@ import numpy as np
 from learning_set import make_set
 
 from biotac_mj.calibration import plan_shear, write_indentation
-from biotac_mj.data.importers import RUPPEL_COLUMNS
 from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.importing import write_obj
 from biotac_mj.learning.weights import shipped
 from biotac_mj.press.record import write_skin
+from biotac_mj.recordings.text import RUPPEL as RUPPEL_COLUMNS
 from biotac_mj.sensor.channels import REST_COUNTS
 
 ROWS = 420  # of recordings: few are too few

@@ -8,8 +8,15 @@ import pytest
 
 from biotac_mj import cli
 from biotac_mj.data import TactileSet, split_by_interaction
-from biotac_mj.data.importers import RUPPEL_COLUMNS, import_recordings, read_nvidia, read_ruppel, read_text
+from biotac_mj.data.importers import import_recordings, interactions
+from biotac_mj.recordings import Recording, load
+from biotac_mj.recordings.text import RUPPEL as RUPPEL_COLUMNS
 from biotac_mj.sensor.channels import CHANNELS
+
+
+def read(path, block=None, **options):
+    """Interactions of a file."""
+    return [one for recording in load(path, **options) for one in interactions(recording, block)]
 
 
 def nvidia(path, lengths=(6, 4, 5, 7), seed=0, flat=False, **changes):
@@ -39,7 +46,7 @@ def nvidia(path, lengths=(6, 4, 5, 7), seed=0, flat=False, **changes):
 @pytest.mark.parametrize("flat", [True, False])
 def test_nvidia(tmp_path, flat):
     data = nvidia(tmp_path / "biotac1.hdf5", flat=flat)
-    ones = read_nvidia(tmp_path / "biotac1.hdf5")
+    ones = read(tmp_path / "biotac1.hdf5")
     assert [len(one.time) for one in ones] == [6, 4, 5, 7]
     assert [one.object for one in ones] == ["indenter_0", "indenter_0", "indenter_2", "indenter_5"]
     np.testing.assert_allclose(
@@ -53,9 +60,13 @@ def test_nvidia(tmp_path, flat):
         np.isnan(one.measured_wrench[:, 3:]).all() and np.isnan(one.measured_counts[:, 19:]).all()
         for one in ones
     )
-    assert ones[2].parameters["rows"] == [10, 15] and ones[0].kind == "recorded" and ones[0].labelled
+    assert (
+        ones[2].parameters["notes"] == ["rows 10 to 14 of biotac1.hdf5"]
+        and ones[0].kind == "recorded"
+        and ones[0].labelled
+    )
     names = [f"thing{k}" for k in range(6)]
-    assert read_nvidia(tmp_path / "biotac1.hdf5", objects=names)[3].object == "thing5"
+    assert read(tmp_path / "biotac1.hdf5", objects=names)[3].object == "thing5"
 
 
 def test_nvidia_trajectories_end_at_half_a_millimetre(tmp_path):
@@ -67,7 +78,7 @@ def test_nvidia_trajectories_end_at_half_a_millimetre(tmp_path):
         force_vec=np.zeros((6, 3)),
         indenter_type=None,
     )
-    assert [len(one.time) for one in read_nvidia(tmp_path / "b.hdf5")] == [4, 2]
+    assert [len(one.time) for one in read(tmp_path / "b.hdf5")] == [4, 2]
 
 
 def test_nvidia_set_splits_by_trajectory(tmp_path):
@@ -96,18 +107,18 @@ def test_nvidia_set_splits_by_trajectory(tmp_path):
 def test_bad_nvidia_files_are_named(tmp_path, changes, text):
     nvidia(tmp_path / "b.hdf5", **changes)
     with pytest.raises(ValueError, match=text):
-        read_nvidia(tmp_path / "b.hdf5")
+        read(tmp_path / "b.hdf5")
 
 
 def test_missing_and_foreign_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no recording of NVIDIA.s at .*a.hdf5"):
-        read_nvidia(tmp_path / "a.hdf5")
+    with pytest.raises(FileNotFoundError, match="a.hdf5: no such file"):
+        read(tmp_path / "a.hdf5")
     (tmp_path / "a.hdf5").write_text("no")
-    with pytest.raises(ValueError, match="is no recording of NVIDIA.s"):
-        read_nvidia(tmp_path / "a.hdf5")
+    with pytest.raises(ValueError, match="a.hdf5 is no .hdf5 file, whatever its name says"):
+        read(tmp_path / "a.hdf5")
     nvidia(tmp_path / "b.hdf5")
     with pytest.raises(ValueError, match="has indenter type 2, but 2 object names were given"):
-        read_nvidia(tmp_path / "b.hdf5", objects=["a", "b"])
+        read(tmp_path / "b.hdf5", objects=["a", "b"])
 
 
 def ruppel(path, header=True, order=None, n=30):
@@ -136,8 +147,8 @@ def ruppel(path, header=True, order=None, n=30):
 @pytest.mark.parametrize("header, order", [(True, None), (False, None), (True, list(range(31))[::-1])])
 def test_ruppel(tmp_path, header, order):
     value = ruppel(tmp_path / "data.csv", header, order)
-    ones = read_ruppel(tmp_path / "data.csv")
-    assert [len(one.time) for one in ones] == [12, 18] and ones[0].object == "sphere_4mm"
+    ones = read(tmp_path / "data.csv")
+    assert [len(one.time) for one in ones] == [12, 18]
     counts = np.concatenate([one.measured_counts for one in ones])
     np.testing.assert_allclose(counts[:, :19], value[:, 12:])
     for name, column in (("pac", 8), ("pdc", 9), ("tac", 10), ("tdc", 11)):
@@ -152,17 +163,17 @@ def test_ruppel(tmp_path, header, order):
 def test_bad_csv_is_named(tmp_path):
     path = tmp_path / "data.csv"
     path.write_text("time,px,py\n0,1,2\n")
-    with pytest.raises(ValueError, match="has no column pz, fx"):
-        read_ruppel(path)
+    with pytest.raises(ValueError, match="data.csv has no rows, or no channel"):
+        read(path)
     path.write_text("")
-    with pytest.raises(ValueError, match="is empty: it needs 31 columns"):
-        read_ruppel(path)
+    with pytest.raises(ValueError, match="data.csv is empty"):
+        read(path)
     ruppel(path)
     lines = path.read_text().splitlines()
     lines[4] = lines[4].replace(lines[4].split(",")[9], "many", 1)
     path.write_text("\n".join(lines))
-    with pytest.raises(ValueError, match="line 5 of .*: pdc is 'many', not a finite number"):
-        read_ruppel(path)
+    with pytest.raises(ValueError, match="data.csv, line 5: pdc is 'many', not a finite number"):
+        read(path)
 
 
 def test_text_with_forces(tmp_path):
@@ -170,20 +181,18 @@ def test_text_with_forces(tmp_path):
     counts, force = rng.integers(1500, 3500, (50, 19)), rng.normal(size=(50, 3)).round(6)
     np.savetxt(tmp_path / "e.txt", counts, fmt="%d", newline=" \n")
     np.savetxt(tmp_path / "f.txt", force, fmt="%.6f", delimiter=",")
-    (one,) = read_text(tmp_path / "e.txt", tmp_path / "f.txt", rate=100.0)
+    (one,) = read(tmp_path / "e.txt", force=tmp_path / "f.txt", rate=100.0)
     np.testing.assert_array_equal(one.measured_counts[:, :19], counts)
     np.testing.assert_allclose(one.measured_wrench[:, :3], force, rtol=1e-6)
     assert one.time[-1] == pytest.approx(0.49)
-    blocks = read_text(tmp_path / "e.txt", tmp_path / "f.txt", block=0.2)
+    blocks = read(tmp_path / "e.txt", block=0.2, force=tmp_path / "f.txt")
     assert [len(b.time) for b in blocks] == [20, 20, 10] and blocks[1].time[0] == pytest.approx(0.2)
     (tmp_path / "g.txt").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match="e.txt has 50 rows and .*g.txt has 1"):
-        read_text(tmp_path / "e.txt", tmp_path / "g.txt")
+    with pytest.raises(ValueError, match="e.txt has 50 rows and g.txt has 1"):
+        read(tmp_path / "e.txt", force=tmp_path / "g.txt")
     (tmp_path / "g.txt").write_text("1 2 3 4\n")
     with pytest.raises(ValueError, match=r"g.txt, line 1: 4 columns, 19 are needed \(e1..e19\)"):
-        read_text(tmp_path / "g.txt")
-    with pytest.raises(ValueError, match="rate is 0 Hz"):
-        read_text(tmp_path / "e.txt", rate=0)
+        read(tmp_path / "g.txt")
 
 
 def test_the_command(tmp_path, capsys):
@@ -195,8 +204,27 @@ def test_the_command(tmp_path, capsys):
     )
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
     assert "holds a set already" in capsys.readouterr().err
-    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--force", "x", "--out", out + "2"]) == 2
-    assert "an option does not go with this format" in capsys.readouterr().err
+
+
+def test_what_was_not_recorded_stays_away(tmp_path):
+    """Tared electrodes are put on an assumed rest, which is said; a pose with a hole is none."""
+    time = np.concatenate([np.arange(5), 100 + np.arange(5)]) / 100
+    pos = np.zeros((10, 3))
+    pos[7] = np.nan
+    one = Recording(
+        time,
+        np.full((10, 19), -50.0),
+        tdc=np.ones(10),
+        object_pos=pos,
+        units={"electrodes": "tared counts", "tdc": "tared counts"},
+    )
+    first, second = interactions(one)
+    assert first.indenter_pos is not None and second.indenter_pos is None and first.measured_wrench is None
+    assert (
+        2000 < first.measured_counts[0, :19].mean() < 3500
+        and "an assumption" in first.parameters["notes"][-1]
+    )
+    assert np.isnan(first.measured_counts[:, 19:]).all()
 
 
 def test_real_flat_press_in_place(shared, tmp_path):
@@ -205,9 +233,9 @@ def test_real_flat_press_in_place(shared, tmp_path):
         import_recordings(
             [folder / "SynImpF1.txt"],
             tmp_path / "set",
+            block=10.0,
             force=folder / "ForceData.txt",
             rate=100.0,
-            block=10.0,
         )
         == 23
     )

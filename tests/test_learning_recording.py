@@ -10,7 +10,7 @@ import pytest
 from biotac_mj.cli import main
 from biotac_mj.learning.force import causal_average, fit_force, ridge, shared_gain, walk_forward
 from biotac_mj.learning.real import evaluate_recording
-from biotac_mj.learning.recording import load_recording
+from biotac_mj.recordings import load_one
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 
 PRESS = pathlib.Path(__file__).parents[1] / "../shared/data/epfl_flat_press"
@@ -26,6 +26,12 @@ def synthetic_log(n=3000, drift=-0.2, seed=0):
     log_z = log_impedance(REST_COUNTS["1"]) + force @ (0.05 * rng.normal(size=(3, 19)))
     log_z += (drift * (1 - np.exp(-np.arange(n) / n)))[:, None]
     return np.rint(np.clip(counts_from_log_impedance(log_z) + rng.normal(size=(n, 19)), 0, 4095)), force
+
+
+def evaluated(electrodes, force, out, **settings):
+    """What is said of these files."""
+    recording, _ = load_one(electrodes, force=force)
+    return evaluate_recording(recording, out, progress=False, **settings)
 
 
 def write(folder, counts, force=None, delimiter=" "):
@@ -85,7 +91,7 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     counts, force = synthetic_log()
     counts[:, 5] = 4095  # a dead channel
     e, f = write(tmp_path, counts, force, ",")
-    result = evaluate_recording(e, f, tmp_path / "r.json", network=False, progress=False)
+    result = evaluated(e, f, tmp_path / "r.json", network=False)
     assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 2100
     assert (tmp_path / "r.png").stat().st_size > 20_000
     # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less
@@ -93,8 +99,8 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     assert result["reconstruction"]["models"]["pca8"]["test"]["rms"] < 1.2
     assert result["force_regression"]["models"]["drift_aware"]["rmse"][0] < 0.2
     assert any("e6 reads 0 or 4095 in 100.0 %" in note for note in result["notes"])
-    result = evaluate_recording(e, None, tmp_path / "r2.json", network=False, progress=False)
-    assert "force_regression" not in result and any("no force file" in note for note in result["notes"])
+    result = evaluated(e, None, tmp_path / "r2.json", network=False)
+    assert "force_regression" not in result and any("no force:" in note for note in result["notes"])
 
 
 def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
@@ -136,10 +142,10 @@ def test_bad_files_are_named(tmp_path, capsys):
         bad = tmp_path / "bad.txt"
         bad.write_text("\n".join(rows))
         with pytest.raises(ValueError, match=text):
-            load_recording(bad, force_file)
+            evaluated(bad, force_file, tmp_path / "never.json", network=False)
 
     refused(
-        r"line 3: 18 columns, 19 are needed \(e1..e19\)",
+        "line 3: 18 columns, 19 are needed as in line 1",
         lambda r: [*r[:2], " ".join(r[2].split()[:18]), *r[3:]],
     )
     refused(
@@ -154,11 +160,11 @@ def test_bad_files_are_named(tmp_path, capsys):
     refused("has 100 rows: at least 400", lambda r: r[:100])
     refused("is empty", lambda r: ["# nothing"])
     refused("no channel changes", lambda r: [r[0]] * 600)
-    refused("600 rows|has 599 rows and the force file 600", lambda r: r[:-1], f)
+    refused("bad.txt has 599 rows and f.txt has 600", lambda r: r[:-1], f)
     with pytest.raises(FileNotFoundError, match="no such file"):
-        load_recording(tmp_path / "none.txt")
+        evaluated(tmp_path / "none.txt", None, tmp_path / "never.json")
     with pytest.raises(ValueError, match="fraction 0.99"):
-        evaluate_recording(e, None, tmp_path / "x.json", fraction=0.99)
+        evaluated(e, None, tmp_path / "x.json", fraction=0.99)
     assert main(["evaluate"]) == 2 and "nothing to evaluate" in capsys.readouterr().err
     assert main(["evaluate", str(tmp_path)]) == 2 and "run `biotac train SET" in capsys.readouterr().err
 
@@ -166,9 +172,7 @@ def test_bad_files_are_named(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(not PRESS.is_dir(), reason="real recording ../shared/data/epfl_flat_press is not here")
 def test_real_press_beats_the_bars(tmp_path):
-    result = evaluate_recording(
-        PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json", progress=False
-    )
+    result = evaluated(PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json")
     models = result["reconstruction"]["models"]
     assert (
         models["electrode_vae"]["test"]["rms"] < 14.1

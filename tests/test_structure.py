@@ -25,11 +25,13 @@ LAYERS = {
     "batch": "coupling skin sensor geometry learning.serve",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "data": "geometry skin sensor fields files reading versions press.approach press.indenter press.path",
+    "recordings": "arguments sensor geometry files reading",
+    "data": "recordings geometry skin sensor fields files reading versions press.approach press.indenter "
+    "press.path",
     "tasks": "coupling plugin sensor geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
-    "learning": "arguments data sensor geometry fields files reading",
-    "discrepancy": "effects data skin sensor geometry fields files reading",
+    "learning": "arguments recordings data sensor geometry fields files reading",
+    "discrepancy": "effects recordings data skin sensor geometry fields files reading",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

@@ -18,6 +18,7 @@ TYPED = (
     "tasks",
     "learning",
     "data",
+    "recordings",
     "sensor",
     "discrepancy",
     "skin",

@@ -51,20 +51,17 @@ def import_verb(args: argparse.Namespace) -> None:
     from .importers import import_recordings
     from .store import TactileSet
 
-    given = {
-        "force": args.force,
-        "rate": args.rate,
-        "block": args.block,
-        "object": args.object,
-        "objects": args.objects,
-    }
-    options = {name: value for name, value in given.items() if value is not None}
-    try:
-        count = import_recordings(args.files, args.out, args.format, args.seed, **options)
-    except TypeError as error:
-        raise ValueError(
-            f"an option does not go with this format ({error}): see `biotac import-data --help`"
-        ) from error
+    count = import_recordings(
+        args.files,
+        args.out,
+        args.seed,
+        args.block,
+        force=args.force,
+        rate=args.rate,
+        scale=args.scale,
+        object_name=args.object,
+        objects=args.objects,
+    )
     with TactileSet(args.out) as data:
         objects = ", ".join(sorted(set(data.object.tolist())))
         print(f"{count} interactions, {data.nstep} time steps, objects {objects}; in {args.out}")

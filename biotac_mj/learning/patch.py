@@ -8,10 +8,9 @@ import typing
 import numpy as np
 import torch
 
-from ..data.columns import read_columns
 from ..files import replacing
 from ..geometry import load_skin
-from ..sensor.channels import ELECTRODES
+from ..recordings import load_one
 from .inverse import PATCH, contact_centre, log_change_of
 from .weights import load_inverse, shipped
 
@@ -57,7 +56,7 @@ def contact_patch(
     """Estimates every row of a recording, draws one; writes contact.png and contact.json into `out`.
 
     Args:
-      source: text of 19 columns, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor
+      source: a recording, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor
         at rest.
       row: which row is drawn and returned.
 
@@ -65,7 +64,7 @@ def contact_patch(
       FileNotFoundError: no such file.
       ValueError: a bad table, or a tare or row that the recording does not have.
     """
-    counts = read_columns(source, ELECTRODES)
+    counts, _ = load_one(source)[0].counts()
     if not 1 <= tare < len(counts):
         raise ValueError(
             f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at"

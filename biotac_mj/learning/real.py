@@ -1,4 +1,4 @@
-"""`biotac evaluate --electrodes`: reconstruction and force on a real recording, first 70 % of the time
+"""`biotac evaluate` of a recording: reconstruction and force on a real recording, first 70 % of the time
 against the last 30 %."""
 
 import json
@@ -8,9 +8,9 @@ import time
 import numpy as np
 
 from ..files import replacing
+from ..recordings.recording import Recording
 from ..sensor.channels import FULL_SCALE
 from .force import fit_force, ridge
-from .recording import load_recording
 
 __all__ = ["evaluate_recording"]
 
@@ -18,11 +18,11 @@ _BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # steps: at least, at most
 _KL = 1e-4
 # of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
 _GAIN = 0.05
+_SHORTEST = 400  # rows: fewer leave too little for a time split with walk-forward choices
 
 
 def evaluate_recording(
-    electrodes: pathlib.Path | str,
-    force: pathlib.Path | str | None = None,
+    recording: Recording,
     out: pathlib.Path | str = "out/evaluate/recording.json",
     fraction: float = 0.7,
     seed: int = 0,
@@ -32,25 +32,29 @@ def evaluate_recording(
     """Evaluates one recording; writes `out` (JSON, described in docs/learning.md) and a plot beside it.
 
     Args:
-      electrodes, force: files, see `load_recording`; without force only the reconstruction is judged.
+      recording: without force only the reconstruction is judged.
       fraction: of the rows, in time, that train; everything is fitted on them alone.
       seed: of the networks.
       network: False leaves the networks out (seconds, for tests): PCA and ridge only.
 
     Returns:
       what is written.
+
+    Raises:
+      ValueError: electrodes that cannot be made raw counts, too few rows, or rows that never change.
     """
     from tqdm import tqdm
 
     begun = time.time()
-    recording = load_recording(electrodes, force)
+    recording, counts, notes = _usable(recording)
     if not 0.2 <= fraction <= 0.95:
         raise ValueError(f"fraction {fraction} leaves too little on one side: take 0.2 to 0.95, as 0.7")
-    n = len(recording.counts)
+    n = len(counts)
     ntrain = int(fraction * n)
-    notes = [
+    saturated = ((counts <= 0) | (counts >= FULL_SCALE)).mean(0)
+    notes += [
         f"e{i + 1} reads 0 or 4095 in {100 * share:.1f} % of the rows: its impedance is not known there"
-        for i, share in enumerate(recording.saturated)
+        for i, share in enumerate(saturated)
         if share > 0.001
     ]
     with tqdm(
@@ -59,32 +63,52 @@ def evaluate_recording(
         desc="evaluate",
         leave=False,
     ) as bar:
-        reconstruction, traces = _reconstruction(recording.counts, ntrain, seed, network, bar)
+        reconstruction, traces = _reconstruction(counts, ntrain, seed, network, bar)
         result = {
             "schema": "biotac_mj.learning.recording/1",
-            "electrodes": str(electrodes),
-            "force": None if force is None else str(force),
+            "recording": recording.name,
+            "source": recording.source,
             "rows": n,
             "train_rows": ntrain,
             "seed": seed,
             "notes": notes,
-            "saturated": recording.saturated.tolist(),
+            "saturated": saturated.tolist(),
             "reconstruction": reconstruction,
         }
         predicted = None
         if recording.force is not None:
-            result["force_regression"], predicted = _force(recording, ntrain, seed, network, bar)
+            result["force_regression"], predicted = _force(
+                counts, recording.force, ntrain, seed, network, bar
+            )
         else:
-            result["notes"].append("no force file: the force regression was left out")
+            result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
     out = pathlib.Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     picture = out.with_suffix(".png")
-    _plot(recording, ntrain, traces, predicted, result, picture)
+    _plot(counts, recording.force, ntrain, traces, predicted, result, picture)
     result["plot"] = str(picture)
     with replacing(out) as temporary:
         pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
     return result
+
+
+def _usable(recording):
+    """(recording, (n, 19) counts, notes): rows that have what is judged."""
+    notes = []
+    if recording.force is not None:
+        there = np.isfinite(recording.force).all(1)
+        if not there.all():
+            notes.append(f"{(~there).sum()} rows without force were left out")
+            recording = recording.rows(there)
+    counts, assumed = recording.counts()
+    if not np.ptp(counts, axis=0).any():
+        raise ValueError(f"{recording.name}: no channel changes: this is not a recording of a touch")
+    if len(counts) < _SHORTEST:
+        raise ValueError(
+            f"{recording.name} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time"
+        )
+    return recording, counts, notes + assumed
 
 
 def _rms(error):
@@ -155,8 +179,7 @@ def _vae(counts, mean, ntrain, linear, seed):
         return net(x)[0].numpy() * size + mean
 
 
-def _force(recording, ntrain, seed, network, bar):
-    counts, force = recording.counts, recording.force
+def _force(counts, force, ntrain, seed, network, bar):
     model = fit_force(counts, force, ntrain, seed, network, bar.update)
     w, b = ridge(counts[:ntrain], force[:ntrain], 1e-4)
     rows = {
@@ -188,13 +211,12 @@ def _force(recording, ntrain, seed, network, bar):
     }, rows["drift_aware"]
 
 
-def _plot(recording, ntrain, reconstructed, predicted, result, path):
+def _plot(counts, force, ntrain, reconstructed, predicted, result, path):
     import matplotlib
 
     matplotlib.use("Agg", force=False)
     from matplotlib.figure import Figure
 
-    counts = recording.counts
     strong = np.argsort(counts.std(0))[::-1][:2]
     rows = 2 + (3 if predicted is not None else 0)
     figure = Figure(figsize=(11, 2.1 * rows), layout="constrained")
@@ -212,7 +234,7 @@ def _plot(recording, ntrain, reconstructed, predicted, result, path):
     if predicted is not None:
         error = result["force_regression"]["models"]["drift_aware"]["rmse"]
         for axis, k in zip(axes[2:], range(3)):
-            axis.plot(t, recording.force[:, k], lw=0.8, color="0.6", label="measured")
+            axis.plot(t, force[:, k], lw=0.8, color="0.6", label="measured")
             axis.plot(
                 t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, RMSE {error[k]:.3f} N unseen"
             )

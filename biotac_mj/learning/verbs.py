@@ -2,6 +2,7 @@
 beside it."""
 
 import argparse
+import os
 from collections.abc import Callable
 
 from ..arguments import SEED, device, output_file, output_folder, real, whole
@@ -105,17 +106,17 @@ def _add_evaluate(verbs, verb):
         "Judge learned models: trained ones on a data set, "
         "or electrode code and force regression on a recording of a real sensor.",
     )
-    v.add_argument("folder", nargs="?", metavar="DIR", help="what `biotac train` wrote")
+    v.add_argument(
+        "folder", nargs="?", metavar="DIR", help="what `biotac train` wrote; or a recording, as --electrodes"
+    )
     v.add_argument(
         "--electrodes",
         metavar="FILE",
-        help="a recording: text, 19 columns of raw counts e1..e19; reconstruction is judged",
+        help="a recording of any kind that `biotac import` reads; reconstruction is judged, force too if "
+        "it has one",
     )
-    v.add_argument(
-        "--force",
-        metavar="FILE",
-        help="beside it: text, 3 columns of force [N]; force from electrodes is judged too",
-    )
+    v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
+    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
     v.add_argument(
         "--new-sensor",
         metavar="SET",
@@ -146,8 +147,11 @@ def _add_evaluate(verbs, verb):
 def _evaluate(args):
     if sum(map(bool, (args.electrodes, args.new_sensor, args.folder))) > 1:
         raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
-    if args.force and not args.electrodes:
-        raise ValueError("--force goes with --electrodes: give both, or neither")
+    if args.folder and os.path.isfile(args.folder) and not args.electrodes:
+        args.folder, args.electrodes = None, args.folder
+    for name in ("force", "sensor"):
+        if getattr(args, name) and not args.electrodes:
+            raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
     if args.ship and not args.folder:
@@ -198,7 +202,7 @@ def _add_contact_patch(verbs, verb):
     v.add_argument(
         "source",
         metavar="FILE",
-        help="text of 19 columns of raw counts e1..e19, or readings.csv of `biotac press`",
+        help="a recording of any kind that `biotac import` reads, or readings.csv of `biotac press`",
     )
     v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
     v.add_argument("--row", type=int, default=-1, help="which row to draw")
@@ -230,11 +234,12 @@ def _contact_patch(args):
 
 
 def _evaluate_recording(args):
+    from ..recordings import load_one
     from .real import evaluate_recording
 
+    recording, notes = load_one(args.electrodes, args.sensor, force=args.force)
     result = evaluate_recording(
-        args.electrodes,
-        args.force,
+        recording,
         args.json,
         args.fraction,
         args.seed,
@@ -257,6 +262,6 @@ def _evaluate_recording(args):
         print(f"  {'':<28}{'Fx':>10}{'Fy':>10}{'Fz':>10}")
         for name, row in result["force_regression"]["models"].items():
             print(f"  {name:<28}" + "".join(f"{e:>10.3f}" for e in row["rmse"]))
-    for note in result["notes"]:
+    for note in [*notes, *result["notes"]]:
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from biotac_mj.data.columns import read_columns
+from biotac_mj.recordings.columns import read_columns
 
 NAMES = ("Fx", "Fy", "Fz")
 ROWS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -4.5]])
@@ -23,6 +23,9 @@ def lines(delimiter=" ", end="\n", rows=ROWS):
         "\ufeff" + lines(", "),
         "# force plate\n% N\n\n" + lines() + "\n",
         "Fx,Fy,Fz\n" + lines(","),
+        "# Fx Fy Fz\n" + lines(),
+        lines(";").replace(".", ","),
+        lines(",", ",\n"),
         "force_x force_y force_z\n" + lines(),
         "'fx' 'fy' 'fz'\n" + lines(),
         "time,fz,fx,note,fy\n" + lines(",", rows=np.c_[[0, 1], ROWS[:, 2], ROWS[:, 0], [7, 7], ROWS[:, 1]]),
@@ -54,7 +57,7 @@ def test_one_column(tmp_path):
             "nan nan nan\n1 2 3\n",
             r"line 1: Fx is 'nan', not a finite number \(3 such cells\): a gap cannot be guessed",
         ),
-        ("1,5;2,5;3,5\n", "line 1: 6 columns"),
+        ("1,5,2,5,3,5\n", "line 1: 6 columns"),
     ],
 )
 def test_bad_tables_are_named(tmp_path, text, message):

@@ -1,0 +1,153 @@
+"""Files of any kind as recordings: each is recognised by what it holds."""
+
+import pathlib
+from collections.abc import Sequence
+
+import h5py
+
+from ..reading import reading
+from .bags import is_bag, read_bag
+from .btd import is_btd, read_btd
+from .columns import open_bytes
+from .matlab import read_matlab, read_matlab_hdf5
+from .nvidia import read_nvidia
+from .parts import Part, join
+from .published import companions, object_of, rate_of
+from .recording import Recording, read
+from .text import read_text
+
+__all__ = ["load", "load_one"]
+
+_HDF5, _MAT = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file"
+
+
+def load(
+    paths: Sequence[pathlib.Path | str] | pathlib.Path | str,
+    *,
+    force: pathlib.Path | str | None = None,
+    tdc: pathlib.Path | str | None = None,
+    rate: float | None = None,
+    scale: float | None = None,
+    object_name: str | None = None,
+    objects: list[str] | None = None,
+) -> list[Recording]:
+    """Recordings of files: our own HDF5, text and CSV, MATLAB, .btd, bags of ROS, NVIDIA's HDF5, gzipped
+    or not.
+
+    Files without electrodes (forces, poses) are put on the rows of those that have them: by their clocks,
+    or row by
+    row. Files that published sets keep beside one are read with it (`published`).
+
+    Args:
+      paths: files, or folders of ROS 2 bags.
+      force, tdc: text files that must be forces [N], or raw counts of the thermistor, row by row.
+      rate: [Hz] of rows without times (None: guessed, `Recording.rate_source` says how).
+      scale: counts for one unit of the channels, 4095 where they are normalised.
+      object_name: what touched. objects: names of NVIDIA's indenter types.
+
+    Raises:
+      FileNotFoundError, ValueError: no such file, or one that cannot be read; the text names file, place
+      and remedy.
+    """
+    paths = [pathlib.Path(p) for p in ([paths] if isinstance(paths, str | pathlib.Path) else paths)]
+    if len(set(paths)) < len(paths):
+        raise ValueError("a file is given twice: give each once")
+    if not paths:
+        raise ValueError("no file was given: give the sensor's own, others beside it")
+    roles = {pathlib.Path(p): role for p, role in ((force, "force"), (tdc, "tdc")) if p is not None}
+    done, groups, shared = [], [], []
+    for path in [*paths, *roles]:
+        role = roles.get(path, "electrodes" if len(paths) == 1 else None)
+        found = _read(path, role, rate, objects)
+        if found and isinstance(found[0], Recording):
+            done += found
+        elif any(part.has_channels for part in found) and path not in roles:
+            beside = [one for one in companions(path) if one not in paths]
+            groups.append([*found, *(part for one in beside for part in _read(one, None, rate, None))])
+        else:
+            shared += found
+    if not groups and (shared or not done):
+        groups.append([])
+    for group in _together(groups):
+        done += join([*group, *shared], rate, object_name, scale)
+    return done
+
+
+def _together(groups):
+    """Groups of parts, those without times and of one length as one: sensors that were logged row by row."""
+    out = {}
+    for k, group in enumerate(groups):
+        rows = {len(part) for part in group}
+        loose = len(rows) == 1 and all(part.time is None and part.rate is None for part in group)
+        kept = out.setdefault(("rows", *rows) if loose else ("clock", k), [])
+        kept += [part for part in group if part.source not in {one.source for one in kept}]
+    return list(out.values())
+
+
+def load_one(
+    path: pathlib.Path | str, sensor: str | None = None, **options: object
+) -> tuple[Recording, list[str]]:
+    """One recording of a file, and a note where it holds others.
+
+    Args:
+      sensor: its name, or how that ends; None: the first. options: of `load`.
+
+    Raises:
+      FileNotFoundError, ValueError: see `load`; or no recording of that name.
+    """
+    found = load(path, **options)
+    names = [one.name for one in found]
+    if sensor is None:
+        others = f"{len(found)} recordings are in {path}, this is {names[0]}: --sensor takes another of "
+        return found[0], [others + ", ".join(names[:6])] if len(found) > 1 else []
+    chosen = [one for one in found if one.name == sensor] or [
+        one for one in found if one.name.endswith(sensor)
+    ]
+    if len(chosen) != 1:
+        raise ValueError(
+            f"{path} has {len(chosen)} recordings called {sensor!r}: choose one of {', '.join(names[:12])}"
+        )
+    return chosen[0], []
+
+
+def _read(path, role, rate, objects) -> list[Part] | list[Recording]:
+    if is_bag(path):
+        return _named(path, read_bag(path))
+    if path.is_dir():
+        raise FileNotFoundError(f"{path}: no such file: it is a folder, and no ROS 2 bag (no metadata.yaml)")
+    if path.is_file():
+        with open(path, "rb") as file:
+            head = file.read(520)
+        if _HDF5 in (head[:8], head[512:]):
+            return _read_hdf5(path, rate, objects)
+    content = open_bytes(path)
+    if content.startswith(_MAT):
+        return _named(path, read_matlab(path, content))
+    if is_btd(content):
+        return _named(path, read_btd(path, content))
+    if path.suffix in (".h5", ".hdf5", ".mat", ".bag", ".mcap", ".db3"):
+        raise ValueError(
+            f"{path} is no {path.suffix} file, whatever its name says: was it cut off? Copy it again"
+        )
+    return _named(path, read_text(path, content, role))
+
+
+def _read_hdf5(path, rate, objects):
+    with reading(path, "recording", "copy it again"), h5py.File(path) as file:
+        names, schema = set(file), str(file.attrs.get("schema", ""))
+    if schema.startswith("biotac_mj.data"):
+        raise ValueError(
+            f"{path} is a shard of a data set, no recording: `biotac train` and `export-data` take it"
+        )
+    if "electrode_vals" in names or "contact_loc" in names or "force_vec" in names:
+        return read_nvidia(path, rate, objects)
+    if schema or path.suffix != ".mat":
+        return read(path)
+    return _named(path, read_matlab_hdf5(path))
+
+
+def _named(path, parts):
+    for part in parts:
+        part.object = part.object or object_of(path)
+        part.rate = part.rate or rate_of(path)
+    return parts

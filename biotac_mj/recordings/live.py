@@ -1,0 +1,154 @@
+"""Recording while the sensor runs: topics of ROS 1 or 2, or lines from a serial port."""
+
+import importlib
+import pathlib
+import time as clock
+from collections.abc import Iterable
+
+from ..sensor.channels import ELECTRODES
+from .columns import parse_table
+from .messages import Topic
+from .parts import join, make_parts
+from .recording import Recording
+
+__all__ = ["parts_of_lines", "record_serial", "record_topics"]
+
+
+def record_topics(topics: list[str], seconds: float, object_name: str | None = None) -> list[Recording]:
+    """Recordings of running topics.
+
+    Raises:
+      ValueError: neither ROS 1 nor ROS 2 is here, a topic that nobody publishes, or no message came.
+    """
+    listen = _ros2 if _is_here("rclpy") else _ros1 if _is_here("rospy") else None
+    if listen is None:
+        raise ValueError(
+            "--topic needs ROS' Python library, rclpy or rospy: source your ROS installation's setup.bash "
+            "first, or "
+            "record a bag and give it to `biotac import`"
+        )
+    found = {name: Topic(name) for name in topics}
+    listen(found, seconds)
+    silent = [name for name, topic in found.items() if not len(topic)]
+    if silent:
+        raise ValueError(
+            f"nothing of a BioTac came on {', '.join(silent)} in {seconds:g} s: is it published?"
+        )
+    return join([part for topic in found.values() for part in topic.parts()], object_name=object_name)
+
+
+def _is_here(module):
+    return importlib.util.find_spec(module) is not None
+
+
+def _ros2(topics, seconds):
+    import rclpy
+    from rclpy.qos import qos_profile_sensor_data
+    from rosidl_runtime_py.utilities import get_message
+
+    rclpy.init()
+    node = rclpy.create_node("biotac_record")
+    try:
+        waiting, end = dict(topics), clock.monotonic() + seconds
+        while clock.monotonic() < end:
+            kinds = dict(node.get_topic_names_and_types()) if waiting else {}
+            for name in [name for name in waiting if name in kinds]:
+                topic = waiting.pop(name)
+                node.create_subscription(
+                    get_message(kinds[name][0]),
+                    name,
+                    lambda message, topic=topic: topic.add(message, clock.time()),
+                    qos_profile_sensor_data,
+                )
+            rclpy.spin_once(node, timeout_sec=0.05)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def _ros1(topics, seconds):
+    import rospy
+
+    rospy.init_node("biotac_record", anonymous=True, disable_signals=True)
+    held = [
+        rospy.Subscriber(name, rospy.AnyMsg, _Typed(topic).add, queue_size=1000)
+        for name, topic in topics.items()
+    ]
+    clock.sleep(seconds)
+    for one in held:
+        one.unregister()
+
+
+class _Typed:
+    """Messages of ROS 1 come as bytes with the name of their type."""
+
+    def __init__(self, topic):
+        self.topic = topic
+
+    def add(self, raw):
+        import roslib.message
+
+        kind = roslib.message.get_message_class(raw._connection_header["type"])
+        self.topic.add(kind().deserialize(raw._buff), clock.time())
+
+
+def record_serial(
+    port: str, baud: int, seconds: float, columns: list[str] | None = None, object_name: str | None = None
+) -> list[Recording]:
+    """A recording of lines that a port sends, each a row of numbers.
+
+    Args:
+      columns: their names (`names`); None: the first line names them, or they are e1..e19. Without a
+      column of
+        times, rows have the time at which they came.
+
+    Raises:
+      ValueError: pyserial is not installed, the port cannot be opened, or no whole line came.
+    """
+    if not _is_here("serial"):
+        raise ValueError("--serial needs pyserial: pip install 'biotac-mj[serial]'")
+    import serial
+
+    lines, times = [], []
+    try:
+        with serial.Serial(port, baud, timeout=0.2) as device:
+            device.readline()  # the first is cut off, as a rule
+            end = clock.monotonic() + seconds
+            while clock.monotonic() < end:
+                line = device.readline()
+                if line.endswith(b"\n"):
+                    lines.append(line)
+                    times.append(clock.time())
+    except (serial.SerialException, OSError) as error:
+        raise ValueError(
+            f"{port} cannot be read ({error}): is it plugged in, and have you the right to it?"
+        ) from None
+    if not lines:
+        raise ValueError(
+            f"no line came from {port} in {seconds:g} s: is --baud {baud} right, is the sensor on?"
+        )
+    return join(parts_of_lines(port, lines, times, columns), object_name=object_name)
+
+
+def parts_of_lines(
+    port: str, lines: Iterable[bytes], times: Iterable[float], columns: list[str] | None
+) -> list:
+    """Parts of lines that came at these times [s]; see `record_serial`.
+
+    Raises:
+      ValueError: lines that are no rows of numbers, or of another length.
+    """
+    source = pathlib.Path(pathlib.Path(port).name)
+    text = b"".join(lines) if columns is None else " ".join(columns).encode() + b"\n" + b"".join(lines)
+    table = parse_table(source, text)
+    names = table.names or list(ELECTRODES)
+    if table.width != len(names):
+        raise ValueError(
+            f"{port} sends {table.width} numbers a line, {len(names)} were expected "
+            f"({names[0]}..{names[-1]}): name them "
+            "with --columns"
+        )
+    value = table.numbers(list(range(len(names))), names)
+    skipped = len(list(lines)) - len(value)  # header
+    found = {"time": list(times)[skipped:]} | dict(zip(names, value.T))
+    return make_parts(source.name, found)

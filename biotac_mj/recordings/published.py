@@ -1,0 +1,40 @@
+"""Published sets: which files belong together, and what their names say."""
+
+import pathlib
+import re
+
+__all__ = ["companions", "object_of", "rate_of"]
+
+# A file's name -> names of those that were logged with it.
+_TOGETHER = (
+    (re.compile(r"(.+)_bio(\.csv(?:\.gz)?)"), (r"\1_cp\2", r"\1_cw\2")),  # slides over materials
+    (re.compile(r"sense_R_[LR]F(\.txt(?:\.gz)?)"), (r"position\1", r"orientation\1")),  # scraping
+)
+_HOLD = re.compile(r"(.+)_\d+_HOLD\.mat")  # PHAC-2's holds: object_number_trial_HOLD.mat
+_SLIDE = re.compile(r"(mat\d+)_\d+_bio\.csv(?:\.gz)?")
+
+
+def companions(path: pathlib.Path) -> list[pathlib.Path]:
+    """Files beside one that belong to it."""
+    for pattern, others in _TOGETHER:
+        found = pattern.fullmatch(path.name)
+        if found:
+            beside = [path.parent / found.expand(other) for other in others]
+            return [one for one in beside if one.is_file()]
+    return []
+
+
+def object_of(path: pathlib.Path) -> str:
+    """What was touched, as the file's name says it; "" if it does not."""
+    if found := _HOLD.fullmatch(path.name):
+        return found[1]
+    if found := _SLIDE.fullmatch(path.name):
+        table = path.parent / "MATERIALS.txt"
+        lines = table.read_text(errors="replace").splitlines() if table.is_file() else []
+        return next((line for line in lines if line.split()[:1] == [found[1]]), found[1])
+    return ""
+
+
+def rate_of(path: pathlib.Path) -> float | None:
+    """Rows per second [Hz] where a set without times was published with its rate."""
+    return 100.0 if _HOLD.fullmatch(path.name) else None

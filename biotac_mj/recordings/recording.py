@@ -1,0 +1,297 @@
+"""One recording of one sensor, and the file that keeps recordings."""
+
+import collections
+import dataclasses
+import json
+import pathlib
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..files import hdf5
+from ..reading import Array, Unfit, check_arrays, reading
+from ..sensor.channels import (
+    FULL_SCALE,
+    NELECTRODE,
+    NPAC,
+    REST_COUNTS,
+    check_counts,
+    check_force,
+    log_impedance,
+)
+
+__all__ = ["BUS_RATE", "FIELDS", "SCHEMA", "UNITS", "Field", "Recording", "read", "write"]
+
+SCHEMA = "biotac_mj.recording/1"
+# [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
+BUS_RATE = 100.0
+UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normalised")
+_REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
+_REMEDY = "give a file that `biotac import` wrote"
+
+
+class Field(typing.NamedTuple):
+    """width: numbers of a row, 0 for a plain number. units: that it may have, the usual one first."""
+
+    width: int
+    units: tuple[str, ...]
+    meaning: str
+
+
+FIELDS = {
+    "electrodes": Field(NELECTRODE, UNITS, "e1..e19"),
+    "pdc": Field(0, UNITS, "pressure of the liquid"),
+    "pac": Field(NPAC, UNITS, "its vibration in the frame before the row, the latest sample last"),
+    "tdc": Field(0, UNITS, "temperature"),
+    "tac": Field(0, UNITS, "its change"),
+    "force": Field(3, ("N",), "Fx Fy Fz, in the frame that `frame` names"),
+    "torque": Field(3, ("N m",), "Tx Ty Tz"),
+    "contact_pos": Field(3, ("m",), "where the object touches"),
+    "object_pos": Field(3, ("m",), "the object's place"),
+    "object_quat": Field(4, ("w x y z",), "its attitude"),
+    "sensor_pos": Field(3, ("m",), "the sensor's place"),
+    "sensor_quat": Field(4, ("w x y z",), "its attitude"),
+}
+CHANNELS = tuple(name for name, field in FIELDS.items() if field.units is UNITS)
+_WORDS = ("object", "source", "frame", "rate_source")
+
+
+@dataclasses.dataclass
+class Recording:
+    """n rows of one sensor in order of time. What was not recorded is None; NaN: not in this row.
+
+    Attributes:
+      time: (n,) increasing [s].
+      electrodes (n, 19), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`, raw counts if it says
+      nothing.
+      force, torque: (n, 3) [N], [N m].
+      contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
+      name: of the recording, unique in its file. object: what touched, "" where nobody said.
+      source: files that it comes from. frame: of forces and poses. rate_source: where the rate comes from.
+      notes: what the importer did to the data.
+      units: field -> one of UNITS.
+
+    Raises:
+      ValueError: shapes, units or values that cannot be; the text names them.
+    """
+
+    time: np.ndarray
+    electrodes: np.ndarray | None = None
+    pdc: np.ndarray | None = None
+    pac: np.ndarray | None = None
+    tdc: np.ndarray | None = None
+    tac: np.ndarray | None = None
+    force: np.ndarray | None = None
+    torque: np.ndarray | None = None
+    contact_pos: np.ndarray | None = None
+    object_pos: np.ndarray | None = None
+    object_quat: np.ndarray | None = None
+    sensor_pos: np.ndarray | None = None
+    sensor_quat: np.ndarray | None = None
+    name: str = "recording"
+    object: str = ""
+    source: str = ""
+    frame: str = "the file's"
+    rate_source: str = "the file's times"
+    notes: tuple[str, ...] = ()
+    units: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        where = self.name
+        self.time = np.asarray(self.time, float)
+        if self.time.ndim != 1 or not len(self.time):
+            raise ValueError(f"{where}: time has shape {self.time.shape}: (n,) is needed, n at least 1")
+        if not np.isfinite(self.time).all() or (np.diff(self.time) <= 0).any():
+            raise ValueError(f"{where}: time does not increase: sort the rows and drop repeated ones")
+        for name in self.fields:
+            self._check_field(name)
+        if not any(getattr(self, name) is not None for name in CHANNELS):
+            raise ValueError(f"{where} has no channel of a sensor: one of {', '.join(CHANNELS)} is needed")
+        for name in ("object_quat", "sensor_quat"):
+            value = getattr(self, name)
+            if value is not None and (np.abs(np.linalg.norm(value, axis=1) - 1) > 0.01).any():
+                raise ValueError(f"{where}: {name} has rows that are no unit quaternions w x y z: scale them")
+        if self.force is not None:
+            check_force(self.force, where)
+        if self.electrodes is not None and self.unit("electrodes") == "counts":
+            check_counts(self.electrodes[np.isfinite(self.electrodes).all(1)], where)
+
+    def _check_field(self, name):
+        value, (width, units, _) = np.asarray(getattr(self, name), float), FIELDS[name]
+        setattr(self, name, value)
+        shape = (len(self.time), width) if width else (len(self.time),)
+        if value.shape != shape:
+            raise ValueError(f"{self.name}: {name} has shape {value.shape}, {shape} is needed, row by row")
+        if np.isinf(value).any() or not np.isfinite(value).any():
+            raise ValueError(f"{self.name}: {name} has infinite numbers, or none at all: leave it out")
+        if self.unit(name) not in units:
+            raise ValueError(
+                f"{self.name}: {name} is in {self.unit(name)!r}: one of {', '.join(units)} is needed"
+            )
+        if name.endswith("_pos") and np.nanmax(np.abs(value)) > _REACH:
+            raise ValueError(f"{self.name}: {name} reaches {np.nanmax(np.abs(value)):.3g}: metres are needed")
+
+    def __len__(self):
+        return len(self.time)
+
+    @property
+    def fields(self) -> list[str]:
+        """Names of what was recorded."""
+        return [name for name in FIELDS if getattr(self, name) is not None]
+
+    def unit(self, name: str) -> str:
+        """Of a field."""
+        return self.units.get(name, FIELDS[name].units[0])
+
+    @property
+    def rate(self) -> float:
+        """Rows per second [Hz]; gaps do not count."""
+        return float(1 / np.median(np.diff(self.time))) if len(self) > 1 else BUS_RATE
+
+    @property
+    def repeated(self) -> np.ndarray:
+        """(n,) bool, rows that only hold the electrodes of the one before (`held_rows`)."""
+        if self.electrodes is None:
+            return np.zeros(len(self), bool)
+        return held_rows(self.electrodes)
+
+    @property
+    def rest_correlation(self) -> float:
+        """Correlation of the median ln Z with the mean pattern of the published sensors: real ones reach 0.9,
+        a shuffled file does not. NaN without raw counts."""
+        if self.electrodes is None or self.unit("electrodes") != "counts":
+            return float("nan")
+        here = np.nanmedian(log_impedance(self.electrodes), axis=0)
+        return (
+            float(np.corrcoef(here, log_impedance(_published_rest()))[0, 1]) if np.ptp(here) > 1e-9 else 0.0
+        )
+
+    def counts(self) -> tuple[np.ndarray, list[str]]:
+        """(n, 19) electrodes as raw counts, and what had to be assumed for it.
+
+        Tared ones are put on the mean rest of the published sensors.
+
+        Raises:
+          ValueError: there are none, they have gaps, or they are volts or normalised.
+        """
+        if self.electrodes is None:
+            raise ValueError(f"{self.name} has no electrodes: give a recording that has them")
+        bad = ~np.isfinite(self.electrodes).all(1)
+        if bad.any():
+            raise ValueError(
+                f"{self.name} lacks electrodes in {bad.sum()} rows, the first is row {np.argmax(bad)}: a gap "
+                "cannot be guessed; cut the recording there or log it again"
+            )
+        unit = self.unit("electrodes")
+        if unit == "counts":
+            return self.electrodes, []
+        if not unit.startswith("tared"):
+            raise ValueError(
+                f"{self.name}: the electrodes look like {unit} values; raw counts 0..4095 are needed: import "
+                "them again with --scale, counts for one of their units"
+            )
+        counts = np.clip(_published_rest() + self.electrodes, 0, FULL_SCALE)
+        return counts, [
+            f"electrodes are {unit}: put on the mean rest of the published sensors, an assumption"
+        ]
+
+    def rows(self, which: slice | np.ndarray) -> "Recording":
+        """Some of the rows."""
+        taken = {}
+        for name in ("time", *self.fields):
+            value = getattr(self, name)[which]
+            taken[name] = value if name == "time" or np.isfinite(value).any() else None
+        return dataclasses.replace(self, **taken)
+
+
+def held_rows(value: np.ndarray) -> np.ndarray:
+    """(n,) bool: rows of (n, 19) equal to the one before in 15 or more electrodes, where that is no chance.
+
+    Four electrodes may differ: something may have been added to single channels after the row was held.
+    """
+    if len(value) < 2:
+        return np.zeros(len(value), bool)
+    equal = np.diff(value, axis=0) == 0
+    same = np.concatenate([[False], equal.sum(1) >= 15])
+    single = equal.mean(0)
+    chance = np.prod(
+        np.sort(np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1))[::-1][:15]
+    )
+    return same if same.mean() > 20 * chance else np.zeros(len(same), bool)
+
+
+def _published_rest():
+    return np.mean(list(REST_COUNTS.values()), axis=0)
+
+
+def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
+    """Recordings as one HDF5 file, written whole or not at all (`files.hdf5`); docs/data.md has its layout.
+
+    Raises:
+      ValueError: none, or two of one name. OSError: it cannot be written.
+    """
+    twice = [name for name, n in collections.Counter(r.name for r in recordings).items() if n > 1]
+    if not recordings or twice:
+        raise ValueError(
+            f"recordings need names of their own, {', '.join(twice) or 'none was given'}: rename"
+        )
+    with hdf5(path) as file:
+        file.attrs["schema"] = SCHEMA
+        for one in recordings:
+            group = file.create_group(one.name.replace("/", "_"))
+            for word in _WORDS:
+                group.attrs[word] = getattr(one, word)
+            group.attrs["notes"] = json.dumps(one.notes)
+            for name in ("time", *one.fields):
+                value = getattr(one, name)
+                stored = group.create_dataset(name, data=value, compression="gzip", shuffle=True)
+                stored.attrs["unit"] = "s" if name == "time" else one.unit(name)
+
+
+def read(path: pathlib.Path | str) -> list[Recording]:
+    """The recordings of a file that `write` made.
+
+    Raises:
+      FileNotFoundError, ValueError: no such file, another schema, a missing or unknown name, a wrong
+      shape, type,
+        unit or value; the text names it.
+    """
+    import h5py
+
+    with reading(path, "recording", _REMEDY), h5py.File(path) as file:
+        schema = file.attrs.get("schema")
+        if schema != SCHEMA:
+            raise Unfit(
+                f"{path} has schema {schema!r}: this version reads {SCHEMA}; import the recording again"
+            )
+        groups = {name: group for name, group in file.items() if isinstance(group, h5py.Group)}
+        if not groups or len(groups) < len(file):
+            raise Unfit(f"{path} has no recordings, or arrays outside of them: {_REMEDY}")
+        return [_read_group(path, name, group) for name, group in groups.items()]
+
+
+def _read_group(path, name, group):
+    where = f"{name} of {path}"
+    unknown = sorted(set(group) - {"time", *FIELDS})
+    if unknown:
+        raise Unfit(f"{where} has {', '.join(unknown)}: only time, {', '.join(FIELDS)} are known; {_REMEDY}")
+    missing = [word for word in (*_WORDS, "notes") if word not in group.attrs]
+    if missing:
+        raise Unfit(f"{where} has no attribute {', '.join(missing)}: {_REMEDY}")
+    wanted = {"time": Array(("n",))}
+    for field in (key for key in FIELDS if key in group):
+        width = FIELDS[field].width
+        wanted[field] = Array(("n", width) if width else ("n",), "number")
+    check_arrays(where, group, wanted, _REMEDY)  # before anything is read
+    found = {field: group[field][()] for field in wanted}
+    check_arrays(where, found, wanted, _REMEDY)
+    notes = json.loads(group.attrs["notes"])
+    if not isinstance(notes, list):
+        raise Unfit(f"attribute notes of {where} is no list: {_REMEDY}")
+    words = {word: str(group.attrs[word]) for word in _WORDS}
+    units = {field: str(group[field].attrs.get("unit")) for field in wanted if field != "time"}
+    try:
+        return Recording(**found, name=name, **words, notes=tuple(map(str, notes)), units=units)
+    except ValueError as error:
+        raise Unfit(f"{path}: {error}") from None

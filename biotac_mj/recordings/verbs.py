@@ -1,0 +1,111 @@
+"""The verbs `biotac import`, `biotac show` and `biotac record`: their arguments here, their work beside
+it."""
+
+import argparse
+from collections.abc import Callable
+
+from ..arguments import output_file, real, whole
+
+__all__ = ["add_load_arguments", "add_verbs", "load_given"]
+
+
+def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
+    """Adds the three to argparse's subparsers; verb(verbs, name, run, text) makes one."""
+    v = verb(
+        verbs,
+        "import",
+        _import,
+        "Read recordings of real BioTacs (text, CSV, MATLAB, .btd, ROS bags, HDF5) into one file; "
+        "says what it found: clock gaps, dropped and held rows, units, rate.",
+    )
+    v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of forces and poses beside it")
+    add_load_arguments(v)
+    v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+    v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
+    v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac import` wrote or reads")
+    v.add_argument(
+        "--sensor", metavar="NAME", help="which recording, where there are several (default: the first)"
+    )
+    add_load_arguments(v)
+    v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
+    v = verb(
+        verbs, "record", _record, "Record a running sensor: a topic of ROS, or lines from a serial port."
+    )
+    source = v.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--topic", nargs="+", metavar="NAME", help="of ROS 1 or 2, those of poses and forces too"
+    )
+    source.add_argument("--serial", metavar="PORT", help="as /dev/ttyUSB0, each line a row of numbers")
+    v.add_argument("--baud", type=whole(50, 10**8), default=115200, help="of --serial")
+    v.add_argument(
+        "--columns",
+        nargs="+",
+        metavar="NAME",
+        help="of --serial's lines, as time e1 ... e19 pdc (default: a header line, or e1..e19)",
+    )
+    v.add_argument("--seconds", type=real(0.01, 1e6), default=10.0, help="how long")
+    v.add_argument("--object", metavar="NAME", help="what touches")
+    v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+
+
+def add_load_arguments(verb: argparse.ArgumentParser) -> None:
+    """What a file does not say itself."""
+    verb.add_argument(
+        "--rate", type=real(0.5, 1e4), metavar="HZ", help="of rows without times (default: guessed)"
+    )
+    verb.add_argument(
+        "--scale",
+        type=real(1e-9, 1e9),
+        help="counts for one unit of the channels: 4095 where they are normalised",
+    )
+    verb.add_argument("--object", metavar="NAME", help="what touched (default: what the files say)")
+
+
+def load_given(args: argparse.Namespace) -> list:
+    """Recordings of a command's files."""
+    from .importers import load
+
+    return load(args.files, rate=args.rate, scale=args.scale, object_name=args.object)
+
+
+def _import(args):
+    from .findings import findings
+    from .recording import write
+
+    recordings = load_given(args)
+    write(args.out, recordings)
+    for one in recordings:
+        print(f"{one.name}: " + "\n  ".join([*findings(one), *one.notes]))
+    print(f"written: {args.out}; see it with `biotac show {args.out}`")
+
+
+def _show(args):
+    from .findings import findings
+    from .picture import draw
+
+    found = load_given(args)
+    names = [one.name for one in found]
+    chosen = [one for one in found if args.sensor is None or one.name.endswith(args.sensor)]
+    if not chosen:
+        raise ValueError(f"no recording is called {args.sensor!r}: choose one of {', '.join(names[:12])}")
+    one = chosen[0]
+    draw(one, args.out)
+    print(f"{one.name}: " + "\n  ".join([*findings(one), *one.notes]))
+    if len(found) > 1:
+        print(f"{len(found)} recordings are there: --sensor takes one of {', '.join(names[:12])}")
+    print(f"written: {args.out}")
+
+
+def _record(args):
+    from .findings import findings
+    from .live import record_serial, record_topics
+    from .recording import write
+
+    if args.topic:
+        recordings = record_topics(args.topic, args.seconds, args.object)
+    else:
+        recordings = record_serial(args.serial, args.baud, args.seconds, args.columns, args.object)
+    write(args.out, recordings)
+    for one in recordings:
+        print(f"{one.name}: " + "\n  ".join(findings(one)))
+    print(f"written: {args.out}; see it with `biotac show {args.out}`")
