@@ -1,7 +1,7 @@
 # make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1")
 # make test        style and the quick tests;  make test-all: the slow ones too
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
-# make assets      make the meshes in assets/ again (needs the extra "mesh")
+# make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
 # make clean       remove results and the environment
 
 PYTHON ?= python3
