@@ -1,5 +1,5 @@
-"""Makes everything in biotac_mj/assets/: the parametric BioTac's skins in three resolutions with a card each, its
-rigid parts and the indenters.
+"""Makes everything in biotac_mj/assets/: the parametric BioTac's skins in three resolutions with a card
+each, its rigid parts and the indenters.
 
     pip install -e ".[mesh]"
     python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
