@@ -5,7 +5,7 @@ _HOME = {
     "SCHEMA": ".recording",
     "Recording": ".recording",
     "draw": ".picture",
-    "findings": ".findings",
+    "findings": ".inspection",
     "load": ".importers",
     "load_one": ".importers",
     "read": ".recording",

@@ -6,12 +6,12 @@ from ..reading import reading
 from .messages import Topic
 from .parts import Part
 
-__all__ = ["is_bag", "read_bag"]
+__all__ = ["DEFINITIONS", "is_bag", "read_bag"]
 
 _MARKS = (b"#ROSBAG V", b"\x89MCAP", b"SQLite format 3")
 _REMEDY = "give a .bag of ROS 1, the folder of a ROS 2 bag, or its .mcap or .db3 file; copy a cut one again"
 # biotac_sensors' messages, for ROS 2 bags that do not carry their definitions
-_DEFINITIONS = {
+DEFINITIONS = {
     "biotac_sensors/msg/BioTacData": "string bt_serial\nuint16 bt_position\nuint16 tdc_data\nuint16 "
     "tac_data\n"
     "uint16 pdc_data\nuint16[22] pac_data\nuint16[19] electrode_data\n",
@@ -48,7 +48,7 @@ def read_bag(path: pathlib.Path) -> list[Part]:
     except ImportError:
         raise ValueError(f"{path} is a bag of ROS: reading it needs pip install 'biotac-mj[ros]'") from None
     types = get_typestore(Stores.LATEST)
-    for name, text in _DEFINITIONS.items():
+    for name, text in DEFINITIONS.items():
         types.register(get_types_from_msg(text, name))
     topics, seen = {}, []
     with reading(path / "metadata.yaml" if path.is_dir() else path, "bag of ROS", _REMEDY):

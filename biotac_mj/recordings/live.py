@@ -139,9 +139,8 @@ def parts_of_lines(
       ValueError: lines that are no rows of numbers, or of another length.
     """
     source = pathlib.Path(pathlib.Path(port).name)
-    text = b"".join(lines) if columns is None else " ".join(columns).encode() + b"\n" + b"".join(lines)
-    table = parse_table(source, text)
-    names = table.names or list(ELECTRODES)
+    table = parse_table(source, b"".join(lines))
+    names = columns or table.names or list(ELECTRODES)
     if table.width != len(names):
         raise ValueError(
             f"{port} sends {table.width} numbers a line, {len(names)} were expected "

@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from ..sensor.channels import ELECTRODES, NELECTRODE
-from .columns import Table, parse_table
+from .columns import parse_table
 from .names import is_time, place_of
 from .parts import Part, make_parts
 
@@ -114,12 +114,12 @@ def _role(path, n, width):
     )
 
 
-def _wrong_width(table: Table, names):
-    return (
-        f"{table.path}, line {table.lines[0]}: {table.width} columns, {len(names)} are needed "
-        f"({_range(names)}); "
-        "or name all columns in a header"
-    )
+def _wrong_width(table, names):
+    where = f"{table.path}, line {table.lines[0]}"
+    said = f"{where}: {table.width} columns, {len(names)} are needed ({_range(names)})"
+    if table.names:
+        return f"{said}; nothing in its header is known of a BioTac ({', '.join(table.names[:8])})"
+    return f"{said}; or name all columns in a header"
 
 
 def _range(names):

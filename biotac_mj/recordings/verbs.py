@@ -69,7 +69,7 @@ def load_given(args: argparse.Namespace) -> list:
 
 
 def _import(args):
-    from .findings import findings
+    from .inspection import findings
     from .recording import write
 
     recordings = load_given(args)
@@ -80,7 +80,7 @@ def _import(args):
 
 
 def _show(args):
-    from .findings import findings
+    from .inspection import findings
     from .picture import draw
 
     found = load_given(args)
@@ -97,7 +97,7 @@ def _show(args):
 
 
 def _record(args):
-    from .findings import findings
+    from .inspection import findings
     from .live import record_serial, record_topics
     from .recording import write
 

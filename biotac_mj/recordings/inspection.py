@@ -40,7 +40,8 @@ def _gaps(recording):
     worst = int(np.argmax(step))
     lost = np.rint(step[gap] / usual - 1).sum()
     return [
-        f"clock: {gap.sum()} gap{'s' * (gap.sum() > 1)}, the longest {step[worst]:.3g} s after row {worst}; "
+        f"clock: {gap.sum()} gap{'s' * int(gap.sum() > 1)}, the longest {step[worst]:.3g} s after row "
+        f"{worst}; "
         f"about {lost:.0f} rows were dropped ({lost / (lost + len(recording)):.1%})"
     ]
 

@@ -1,0 +1,466 @@
+"""Recordings: the file, importers on synthetic logs of every form, what they find, and the real sets where
+they
+are."""
+
+import dataclasses
+import sys
+import types
+
+import h5py
+import numpy as np
+import pytest
+from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
+
+from biotac_mj import cli
+from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
+from biotac_mj.recordings.live import parts_of_lines
+from biotac_mj.recordings.messages import Topic
+from biotac_mj.recordings.names import is_time, place_of
+from biotac_mj.recordings.parts import guess_unit, join
+from biotac_mj.recordings.picture import pac_spectrum
+from biotac_mj.sensor.channels import REST_COUNTS
+
+ONE = synthetic()
+BUS = ("electrodes", "pdc", "pac", "tdc", "tac")
+
+
+def agree(found, wanted, fields, atol=1e-6):
+    for name in fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=atol, err_msg=name)
+
+
+def test_what_is_written_is_read(tmp_path):
+    other = Recording(
+        np.arange(3.0), np.full((3, 19), -5.0), name="tared", units={"electrodes": "tared counts"}
+    )
+    write(tmp_path / "r.h5", [ONE, other])
+    one, two = read(tmp_path / "r.h5")
+    assert (
+        one.fields == ONE.fields and two.fields == ["electrodes"] and two.unit("electrodes") == "tared counts"
+    )
+    agree(one, ONE, ("time", *ONE.fields), 0)
+    assert [getattr(one, w) for w in ("name", "object", "source", "frame")] == [
+        "synthetic",
+        "ball",
+        "synthetic",
+        "the file's",
+    ]
+    with h5py.File(tmp_path / "r.h5") as file:  # absent, not zero
+        assert set(file["tared"]) == {"time", "electrodes"}
+        assert file["synthetic/force"].attrs["unit"] == "N"
+    (again, _) = load_one(tmp_path / "r.h5", "tared")
+    assert again.name == "tared"
+    with pytest.raises(ValueError, match="names of their own, synthetic"):
+        write(tmp_path / "s.h5", [ONE, ONE])
+    assert not (tmp_path / "s.h5").exists()
+
+
+def test_nothing_is_left_where_writing_fails(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "os.replace", lambda *a: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
+    with pytest.raises(OSError, match="No space"):
+        write(tmp_path / "r.h5", [ONE])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_text_either_way_round(tmp_path, turned):
+    value = ONE.electrodes.T if turned else ONE.electrodes
+    np.savetxt(tmp_path / "e.txt", value, "%d")
+    np.savetxt(tmp_path / "f.txt.gz", ONE.force)
+    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt.gz"], rate=50)
+    agree(one, ONE, ("electrodes", "force"))
+    assert one.rate == pytest.approx(50) and one.fields == ["electrodes", "force"]
+    assert any("19 x 420, time along its rows: turned" in note for note in one.notes) == turned
+
+
+def test_a_clock_before_the_electrodes(tmp_path):
+    np.savetxt(tmp_path / "e.txt", np.c_[ONE.time, ONE.electrodes], "%.4f")
+    (one,) = load(tmp_path / "e.txt")
+    agree(one, ONE, ("time", "electrodes"))
+
+
+@pytest.mark.parametrize(
+    "base, prefix, time",
+    [
+        (1, "", "time"),
+        (0, "field.bt_data0.", "timestamp"),
+        (1, "ele_", "%time"),
+        (1, "", "time_ms"),
+        (1, "", "t_ns"),
+    ],
+)
+def test_named_columns(tmp_path, base, prefix, time):
+    factor = 1e3 if time.endswith("ms") else 1e9 if time.endswith("ns") else 1.0
+    rename = {f"ele_e{i}": f"ele_{i}" for i in range(1, 20)}
+    rename |= {f"ele_{c}": c for c in ("pdc", "tac", "tdc", *(f"pac{i}" for i in range(1, 23)))}
+    write_csv(
+        tmp_path / "r.csv", dataclasses.replace(ONE, time=ONE.time * factor), base, prefix, time, rename
+    )
+    (one,) = load(tmp_path / "r.csv")
+    agree(one, ONE, ONE.fields, 1e-5)
+    np.testing.assert_allclose(one.time, ONE.time, rtol=1e-6)
+
+
+def test_names_in_the_wild():
+    wanted = {
+        "F0Electrodes": ("f0", "electrodes", None),
+        "field.bt_data1.electrode_data17": ("field_bt_data1", "electrodes", 17),
+        "ele3": ("", "electrodes", 3),
+        "pac22": ("", "pac", 22),
+        "F1pdc": ("f1", "pdc", None),
+        "Fx": ("", "force", 0),
+        "wrench.force.z": ("", "force", 2),
+        "posy": ("", "sensor_pos", 1),
+        "ow": ("", "sensor_quat", 0),
+        "px": ("", "contact_pos", 0),
+        "object/pose/position/x": ("", "object_pos", 0),
+        "tool_qw": ("", "object_quat", 0),
+    }
+    for name, place in wanted.items():
+        assert place_of(name) == place, name
+    for name in (
+        "JPos",
+        "time1",
+        "tare1",
+        "x",
+        "field.bt_time.electrode_ns_offset3",
+        "bt_position",
+        "tip_x_m",
+        "depth",
+    ):
+        assert place_of(name) is None, name
+    assert is_time("%time") and is_time("time [ms]") and not is_time("times_seven")
+
+
+def test_empty_cells_of_a_force_are_gaps_and_of_electrodes_are_refused(tmp_path):
+    write_csv(tmp_path / "r.csv", ONE)
+    lines = (tmp_path / "r.csv").read_text().splitlines()
+    k = lines[0].split(",").index("Fx")
+    words = lines[8].split(",")
+    words[k] = ""
+    (tmp_path / "r.csv").write_text("\n".join([*lines[:8], ",".join(words), *lines[9:]]))
+    (one,) = load(tmp_path / "r.csv")
+    assert np.isnan(one.force[7, 0]) and np.isfinite(one.force).sum() == 3 * len(ONE) - 1
+    assert any("force: not there in 0.1%" in line for line in findings(one))
+
+
+def test_poses_on_another_clock_are_interpolated_and_holes_stay(tmp_path):
+    write_csv(tmp_path / "a_bio.csv", ONE)
+    time = np.arange(4.5, 8.0, 1 / 150)
+    time = time[(time < 6.0) | (time > 7.0)]
+    turn = np.column_stack(
+        [time, np.sin(time), 0 * time, 0 * time, 0 * time, 0 * time, np.sin(time / 2), np.cos(time / 2)]
+    )
+    turn[::2, 4:] *= -1  # the same attitude
+    np.savetxt(
+        tmp_path / "a_cp.csv", turn, "%.9f", ",", header="timestamp,posx,posy,posz,ox,oy,oz,ow", comments=""
+    )
+    (one,) = load(tmp_path / "a_bio.csv")  # the other is found beside it
+    there = np.isfinite(one.sensor_pos).all(1)
+    want = (one.time < 6.0) | ((one.time > 7.0) & (one.time <= time[-1]))
+    assert (there == want).mean() > 0.99 and not there[(one.time > 6.02) & (one.time < 6.98)].any()
+    np.testing.assert_allclose(one.sensor_pos[there, 0], np.sin(one.time[there]), atol=1e-4)
+    attitude = np.abs(one.sensor_quat[there, 0])
+    np.testing.assert_allclose(attitude, np.abs(np.cos(one.time[there] / 2)), atol=1e-4)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_native_log(tmp_path, packed):
+    short = ONE.rows(slice(0, 40))
+    write_btd(tmp_path / "t.btd", short, packed=packed, sensors=2)
+    one, two = load(tmp_path / "t.btd")
+    agree(one, short, ("time", *BUS), 1e-5)
+    agree(two, short, BUS)
+    assert any("SYNTHETIC01" in note for note in one.notes) and one.name == "t_bt1"
+
+
+def test_lost_frames_of_a_native_log_are_counted(tmp_path):
+    keep = np.ones(40, bool)
+    keep[[7, 8, 30]] = False
+    write_btd(tmp_path / "t.btd", ONE.rows(slice(0, 40)))
+    head, *body = (tmp_path / "t.btd").read_text().split("Begin File\n")
+    lines = [line for line in body[0].splitlines() if keep[int(line.split()[2])]]
+    (tmp_path / "t.btd").write_text(
+        head + "Begin File\n" + "\n".join(lines[:-3]) + "\n"
+    )  # and the last is not whole
+    (one,) = load(tmp_path / "t.btd")
+    assert len(one) == 36 and any("own numbers lack 3 of 39" in note for note in one.notes)
+    assert any(
+        "2 gaps, the longest 0.03 s after row 6; about 3 rows were dropped" in f for f in findings(one)
+    )
+
+
+def test_matlab(tmp_path):
+    write_mat(tmp_path / "steel_01_02_HOLD.mat", ONE)
+    one, two = load(tmp_path / "steel_01_02_HOLD.mat")
+    agree(one, ONE, BUS)
+    np.testing.assert_array_equal(two.electrodes, ONE.electrodes + 5)
+    assert (one.name, two.name, one.object) == ("steel_01_02_HOLD_f0", "steel_01_02_HOLD_f1", "steel_01")
+    assert one.rate == pytest.approx(100) and any("left out JPos" in note for note in one.notes)
+
+
+def test_matlab_structs_and_73(tmp_path):
+    import scipy.io
+
+    inside = {
+        "biotac": {"electrodes": ONE.electrodes, "time": ONE.time, "force": ONE.force},
+        "object": "cork",
+    }
+    scipy.io.savemat(tmp_path / "a.mat", {"log": inside["biotac"], "object": "cork"})
+    (one,) = load(tmp_path / "a.mat")
+    agree(one, ONE, ("electrodes", "force"))
+    assert one.object == "cork"
+    with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        file["log/electrodes"], file["log/force"], file["log/pdc"] = (
+            ONE.electrodes.T,
+            ONE.force.T,
+            ONE.pdc[:, None],
+        )
+    with open(tmp_path / "b.mat", "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file")
+    (one,) = load(tmp_path / "b.mat")
+    agree(one, ONE, ("electrodes", "force", "pdc"))
+
+
+@pytest.mark.parametrize("ros", [1, "SQLITE3", "MCAP"])
+def test_bags(tmp_path, ros):
+    pytest.importorskip("rosbags", reason="needs rosbags: pip install 'biotac-mj[ros]'")
+    path = write_bag(tmp_path, ONE, ros)
+    (one,) = load(path)
+    agree(one, ONE, ("time", *BUS, "force", "torque"))
+
+
+def test_a_bag_without_its_library_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(
+        ValueError, match=r"a.bag is a bag of ROS: reading it needs pip install 'biotac-mj\[ros\]'"
+    ):
+        load(tmp_path / "a.bag")
+
+
+def message(**fields):
+    """One of ROS 2's Python classes, as rosidl makes them."""
+    made = type("Message", (), {"__slots__": [f"_{name}" for name in fields], **fields})()
+    return made
+
+
+def test_messages_of_any_package():
+    topic = Topic("/rh/tactile")
+    for k in range(30):
+        stamp = types.SimpleNamespace(sec=7, nanosec=10_000_000 * k)
+        header = message(stamp=stamp)
+        fingers = [
+            message(
+                pac0=2000 + k, pac1=2001 + k, pdc=1500, tac=2040, tdc=2000, electrodes=[3000 + f + k] * 19
+            )
+            for f in range(2)
+        ]
+        assert topic.add(message(header=header, tactiles=fingers), 0.0)
+    assert not topic.add(message(data="hello"), 0.0)
+    one, two = join(topic.parts())
+    assert (
+        (two.electrodes - one.electrodes == 1).all() and one.time[0] == 7 and one.rate == pytest.approx(100)
+    )
+    assert np.isnan(one.pac[:, :20]).all() and (one.pac[:, 21] == 2001 + np.arange(30)).all()
+    assert any("PAC has 2 of 22" in note for note in one.notes)
+
+
+def test_lines_of_a_serial_port():
+    times = 100 + 0.01 * np.arange(20)
+    lines = [(",".join(f"{v:.0f}" for v in row) + "\r\n").encode() for row in ONE.electrodes[:20]]
+    (one,) = join(parts_of_lines("/dev/ttyUSB0", lines, times, None))
+    np.testing.assert_array_equal(one.electrodes, ONE.electrodes[:20])
+    np.testing.assert_allclose(one.time, times)
+    header = [b",".join(b"e%d" % k for k in range(19, 0, -1)) + b"\n"]
+    (one,) = join(parts_of_lines("p", header + lines, np.r_[0, times], None))
+    np.testing.assert_array_equal(one.electrodes, ONE.electrodes[:20, ::-1])
+    np.testing.assert_allclose(one.time, times)
+    with pytest.raises(ValueError, match="sends 19 numbers a line, 2 were expected"):
+        parts_of_lines("p", lines, times, ["pdc", "tdc"])
+
+
+def test_recording_from_a_port(tmp_path, monkeypatch, capsys):
+    """A stand-in for pyserial: it sends a line each time it is asked."""
+
+    class Port:
+        def __init__(self, *given, **named):
+            self.sent = 0
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *error: None  # noqa: E731
+
+        def readline(self):
+            import time
+
+            time.sleep(0.002)
+            self.sent += 1
+            return b"3000 " * 18 + b"%d\n" % (3000 + self.sent)
+
+    stand_in = types.ModuleType("serial")
+    stand_in.Serial, stand_in.SerialException = Port, OSError
+    stand_in.__spec__ = types.SimpleNamespace()
+    monkeypatch.setitem(sys.modules, "serial", stand_in)
+    out = tmp_path / "r.h5"
+    assert (
+        cli.main(["record", "--serial", "/dev/x", "--seconds", "0.2", "--object", "air", "--out", str(out)])
+        == 0
+    )
+    (one,) = read(out)
+    assert (
+        (np.diff(one.electrodes[:, 18]) == 1).all() and one.electrodes[0, 18] == 3002 and one.object == "air"
+    )
+    assert "electrodes that never change: e1, e2" in capsys.readouterr().out
+
+
+def test_recording_without_libraries_says_what_to_install(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("biotac_mj.recordings.live._is_here", lambda name: False)
+    for words, said in (("--topic /biotac_pub", "rclpy or rospy"), ("--serial /dev/x", "biotac-mj[serial]")):
+        assert cli.main(["record", *words.split(), "--out", str(tmp_path / "r.h5")]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1
+
+
+def test_units():
+    tared = ONE.electrodes - REST_COUNTS["1"]
+    for value, unit in (
+        (ONE.electrodes, "counts"),
+        (np.rint(tared), "tared counts"),
+        (np.abs(np.rint(tared)), "tared counts without sign"),
+        (ONE.electrodes / 4095, "normalised"),
+        (ONE.electrodes / 4095 * 3.3, "volts"),
+        (2 * ONE.electrodes / 4095 - 1, "normalised"),
+        (np.zeros((9, 19)), "tared counts without sign"),
+    ):
+        assert guess_unit(value) == unit
+
+
+def test_scaled_and_tared_counts(tmp_path):
+    np.savetxt(tmp_path / "e.txt", ONE.electrodes / 4095, "%.6f")
+    (one,) = load(tmp_path / "e.txt")
+    with pytest.raises(
+        ValueError, match="normalised values; raw counts 0..4095 are needed: import them again with"
+    ):
+        one.counts()
+    (one,) = load(tmp_path / "e.txt", scale=4095)
+    np.testing.assert_allclose(one.counts()[0], ONE.electrodes, atol=0.01)
+    tared = Recording(
+        ONE.time, np.rint(ONE.electrodes - REST_COUNTS["1"]), units={"electrodes": "tared counts"}
+    )
+    counts, notes = tared.counts()
+    mean = np.mean(list(REST_COUNTS.values()), axis=0)
+    np.testing.assert_allclose(counts, ONE.electrodes - REST_COUNTS["1"] + mean, atol=0.51)
+    assert "an assumption" in notes[0]
+
+
+def test_held_and_dropped_rows_are_found():
+    rng = np.random.default_rng(1)
+    value = np.repeat(ONE.electrodes, 3, axis=0)
+    held = Recording(np.arange(len(value)) / 300, value)
+    assert held.repeated.mean() == pytest.approx(2 / 3, abs=0.01)
+    assert any("values are held, new ones come at 100 Hz" in line for line in findings(held))
+    keep = np.sort(rng.choice(len(ONE), len(ONE) - 20, replace=False))
+    keep = np.union1d(keep, [0, len(ONE) - 1])
+    said = findings(ONE.rows(keep))[1]
+    assert f"about {len(ONE) - len(keep)} rows were dropped" in said
+    assert findings(ONE)[1] == "clock: no gap" and not ONE.repeated.any()
+
+
+def test_a_rate_is_guessed_from_held_rows(tmp_path):
+    keep = np.sort(np.r_[np.arange(420), np.arange(0, 420, 5)])  # a logger at 120 Hz on a bus of 100
+    np.savetxt(tmp_path / "e.txt", ONE.electrodes[keep], "%d")
+    (one,) = load(tmp_path / "e.txt")
+    assert one.rate == pytest.approx(120, rel=0.01) and "a logger faster than the bus" in one.rate_source
+
+
+def test_a_clock_with_faults(tmp_path):
+    time = ONE.time.copy()
+    time[100] = time[99]  # repeated
+    time[200:] -= 6.0  # a new start
+    write_csv(tmp_path / "r.csv", dataclasses.replace(ONE, time=np.arange(420.0)))
+    lines = (tmp_path / "r.csv").read_text().splitlines()
+    rows = [f"{t:.4f}" + line[line.index(",") :] for t, line in zip(time, lines[1:])]
+    (tmp_path / "r.csv").write_text("\n".join([lines[0], *rows]))
+    (one,) = load(tmp_path / "r.csv")
+    assert len(one) == 419 and (np.diff(one.time) > 0).all()
+    assert "1 rows whose time does not increase were left out" in one.notes
+    assert any("starts anew in row 200" in note for note in one.notes)
+    np.testing.assert_array_equal(one.electrodes, np.delete(ONE.electrodes, 100, 0))
+
+
+def test_saturated_and_dead_electrodes_are_named():
+    value = ONE.electrodes.copy()
+    value[:, 4] = 4095
+    value[:21, 7] = 0
+    said = findings(dataclasses.replace(ONE, electrodes=value))
+    assert "electrodes that never change: e5" in said
+    assert "saturated (0 or 4095 counts): e5 100.0%, e8 5.0%" in said
+
+
+def test_spectrum_has_the_line_and_the_power():
+    frequency, power, frames = pac_spectrum(ONE)
+    assert frequency[np.argmax(power)] == pytest.approx(300, abs=13) and frames == len(ONE)
+    assert np.trapezoid(power, frequency) == pytest.approx(40**2 / 2 + 3**2, rel=0.05)
+    assert pac_spectrum(dataclasses.replace(ONE, pac=None)) is None
+
+
+def test_commands(tmp_path, capsys):
+    write_csv(tmp_path / "r.csv", ONE)
+    rec, png = str(tmp_path / "rec.h5"), tmp_path / "show.png"
+    assert cli.main(["import", str(tmp_path / "r.csv"), "--object", "ring", "--out", rec]) == 0
+    said = capsys.readouterr().out
+    assert "420 rows, 4.19 s, 100 Hz" in said and "units: counts: electrodes, pdc, pac, tdc, tac" in said
+    (one,) = read(rec)
+    agree(one, ONE, ONE.fields, 1e-5)
+    assert one.object == "ring"
+    assert cli.main(["show", rec, "--out", str(png)]) == 0
+    assert "object ring" in capsys.readouterr().out
+    import matplotlib.image
+
+    drawn = matplotlib.image.imread(png)
+    assert drawn.shape[0] > 1000 and drawn[..., :3].std() > 0.05
+    assert cli.main(["show", rec, "--sensor", "jelly", "--out", str(png)]) == 2
+    assert "no recording is called 'jelly': choose one of r" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "gone", [(), ("electrodes",), ("pac", "tdc"), ("pdc", "tac", "force", "torque", "object_pos")]
+)
+def test_a_picture_of_whatever_there_is(tmp_path, gone):
+    from biotac_mj.recordings import draw
+
+    one = dataclasses.replace(ONE, **dict.fromkeys(gone))
+    draw(one, tmp_path / "a.png")
+    draw(one.rows(slice(0, 1)), tmp_path / "b.png")
+    assert (tmp_path / "a.png").stat().st_size > 10_000 < 2 * (tmp_path / "b.png").stat().st_size
+
+
+# what is known of the real sets: files, recordings, rows, rate, unit, fields beside the electrodes
+REAL = {
+    "epfl_flat_press/SynImpF1.txt epfl_flat_press/ForceData.txt": (1, 22508, 116.3, "counts", "force"),
+    "epfl_f2/SynImpF2.txt.gz epfl_f2/ForceData.txt.gz": (1, 23671, 116.9, "counts", "force"),
+    "phac_hold/steel_vase_702_03_HOLD.mat": (2, 1000, 100, "counts", "pdc pac tdc tac"),
+    "btd/btsp_touch.btd.gz": (1, 2124, 100, "counts", "pdc pac tdc tac"),
+    "slides_20/mat12_1_bio.csv.gz": (
+        1, None, 100, "tared counts without sign", "pdc pac tdc tac force torque sensor_pos sensor_quat"),
+    "scraping/sense_R_LF.txt.gz scraping/sense_R_RF.txt.gz": (
+        2, 1122, 302.4, "tared counts", "sensor_pos sensor_quat"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("files", REAL)
+def test_real_sets(shared, files):
+    many, rows, rate, unit, fields = REAL[files]
+    found = load([shared / "data" / name for name in files.split()])
+    assert len(found) == many
+    for one in found:
+        assert rows in (None, len(one)) and one.rate == pytest.approx(rate, rel=1e-3)
+        assert one.unit("electrodes") == unit and one.fields == [
+            "electrodes",
+            *(f for f in FIELDS if f in fields.split()),
+        ]
+    counts = found[0].counts()[0]
+    assert counts.shape == (len(found[0]), 19) and 0 <= counts.min() and counts.max() <= 4095
