@@ -170,8 +170,8 @@ def native():
     )
     yield Row(REC, "these look like mN", "rec.h5", put("synthetic/force", lambda v: 1e3 * v))
     yield Row(REC, "rec.h5 is no recording (", "rec.h5", cut)
-    yield Row("evaluate rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5",
-              put("synthetic/electrodes", lambda v: np.where(np.arange(len(v))[:, None] == 7, np.nan, v)))  # fmt: skip
+    hole = put("synthetic/electrodes", lambda v: np.where(np.arange(len(v))[:, None] == 7, np.nan, v))
+    yield Row("evaluate rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5", hole)
     yield Row(
         "evaluate rec.h5 --sensor jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
     )
@@ -212,8 +212,10 @@ def tables():
     yield Row("import nowhere --out out.h5", "nowhere: no such file")
     yield Row("import folder --out out.h5", "folder: no such file: it is a folder, and no ROS 2 bag")
     yield Row("import e.txt e.txt --out out.h5", "given twice")
-    yield Row("import f.txt f.txt.gz --out out.h5", "no electrodes: give the sensor's own file too", "f.txt.gz",
-              lambda p: p.write_bytes(gzip.compress((p.parent / "f.txt").read_bytes())))  # fmt: skip
+    copied = lambda p: p.write_bytes(gzip.compress((p.parent / "f.txt").read_bytes()))  # noqa: E731
+    yield Row(
+        "import f.txt f.txt.gz --out out.h5", "no electrodes: give the sensor's own", "f.txt.gz", copied
+    )
     yield Row("import e.txt --out folder", "folder is a folder")
     yield Row("import e.txt --out e.txt/a.h5", "e.txt is a file")
     yield Row("import --out out.h5", "the following arguments are required: FILE")
