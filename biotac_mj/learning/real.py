@@ -65,7 +65,7 @@ def evaluate_recording(
     ) as bar:
         reconstruction, traces = _reconstruction(counts, ntrain, seed, network, bar)
         result = {
-            "schema": "biotac_mj.learning.recording/1",
+            "schema": "biotac_mj.learning.recording/2",
             "recording": recording.name,
             "source": recording.source,
             "rows": n,
