@@ -12,7 +12,7 @@ from .columns import open_bytes
 from .matlab import read_matlab, read_matlab_hdf5
 from .nvidia import read_nvidia
 from .parts import Part, join
-from .published import companions, object_of, rate_of
+from .published import companions, is_beside_the_point, object_of, rate_of
 from .recording import Recording, read
 from .text import read_text
 
@@ -56,20 +56,24 @@ def load(
         raise ValueError("no file was given: give the sensor's own, others beside it")
     roles = {pathlib.Path(p): role for p, role in ((force, "force"), (tdc, "tdc")) if p is not None}
     done, groups, shared = [], [], []
-    for path in [*paths, *roles]:
+    unread = [path for path in paths if len(paths) > 1 and is_beside_the_point(path)]
+    read_with = {other for path in paths for other in companions(path)}
+    for path in [*(path for path in paths if path not in {*unread, *read_with}), *roles]:
         role = roles.get(path, "electrodes" if len(paths) == 1 else None)
         found = _read(path, role, rate, objects)
         if found and isinstance(found[0], Recording):
             done += found
         elif any(part.has_channels for part in found) and path not in roles:
-            beside = [one for one in companions(path) if one not in paths]
-            groups.append([*found, *(part for one in beside for part in _read(one, None, rate, None))])
+            beside = [part for one in companions(path) for part in _read(one, None, rate, None)]
+            groups.append([*found, *beside])
         else:
             shared += found
     if not groups and (shared or not done):
         groups.append([])
     for group in _together(groups):
         done += join([*group, *shared], rate, object_name, scale)
+    for one in done:
+        one.notes = (*one.notes, *(f"{path.name}: left out" for path in unread))
     return done
 
 

@@ -3,7 +3,7 @@
 import pathlib
 import re
 
-__all__ = ["companions", "object_of", "rate_of"]
+__all__ = ["companions", "is_beside_the_point", "object_of", "rate_of"]
 
 # A file's name -> names of those that were logged with it.
 _TOGETHER = (
@@ -12,6 +12,13 @@ _TOGETHER = (
 )
 _HOLD = re.compile(r"(.+)_\d+_HOLD\.mat")  # PHAC-2's holds: object_number_trial_HOLD.mat
 _SLIDE = re.compile(r"(mat\d+)_\d+_bio\.csv(?:\.gz)?")
+# velocities that are not a number, and joint angles
+_NOT_READ = re.compile(r".+_cv\.csv(?:\.gz)?|sense_proprio\.txt(?:\.gz)?")
+
+
+def is_beside_the_point(path: pathlib.Path) -> bool:
+    """Whether a file of a set says nothing that a recording has a place for."""
+    return _NOT_READ.fullmatch(path.name) is not None
 
 
 def companions(path: pathlib.Path) -> list[pathlib.Path]:
