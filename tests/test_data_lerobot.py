@@ -142,6 +142,27 @@ def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
     assert "is there already" in capsys.readouterr().err
 
 
+def test_a_recording_is_exported_with_what_it_has(tmp_path):
+    """A synthetic log with a clock that shakes, a force without torque and no pose."""
+    rng = np.random.default_rng(0)
+    time = 0.01 * np.arange(50) + rng.uniform(-1e-3, 1e-3, 50)
+    counts, force = rng.integers(2000, 3000, (50, 19)), rng.normal(size=(50, 3))
+    log = tmp_path / "log.csv"
+    head = ",".join(["time", *(f"e{i + 1}" for i in range(19)), "pdc", "Fx", "Fy", "Fz"])
+    np.savetxt(log, np.c_[time, counts, counts[:, 0], force], "%.9g", ",", header=head, comments="")
+    assert cli.main(["import-data", str(log), "--out", str(tmp_path / "set")]) == 0
+    assert cli.main(["export-data", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / "o")]) == 0
+    table = parquet.read_table(tmp_path / "o/data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(table["observation.tactile.electrodes"].to_pylist(), counts)
+    np.testing.assert_allclose(table["observation.force"].to_pylist(), force, rtol=1e-5)
+    np.testing.assert_array_equal(table["observation.tactile.pdc"].to_pylist(), counts[:, 0])
+    info = json.loads((tmp_path / "o/meta/info.json").read_text())
+    features = {name for name in info["features"] if name.startswith(("observation", "action"))}
+    assert features == {"observation.force", "observation.tactile.electrodes", "observation.tactile.pdc"}
+    assert info["fps"] == pytest.approx(100, rel=0.01) and set(info["features"]) == set(table.column_names)
+    assert json.loads((tmp_path / "o/source.json").read_text())["synthetic"] is False
+
+
 def test_what_cannot_be_exported_is_named(tmp_path):
     one = Interaction("a", "x", "recorded", "test", 0, {}, np.arange(3.0), measured_counts=np.zeros((3, 23)))
     write_shard(shard_path(tmp_path / "s", 0), [one])

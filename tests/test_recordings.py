@@ -161,7 +161,7 @@ def test_poses_on_another_clock_are_interpolated_and_holes_stay(tmp_path):
     (given,) = load(sorted(tmp_path.glob("a_*.csv")))
     (one,) = load(tmp_path / "a_bio.csv")  # the other is found beside it
     agree(one, given, one.fields)
-    assert given.notes[-1] == "a_cv.csv: left out"
+    assert given.notes[-1] == "left out a_cv.csv"
     there = np.isfinite(one.sensor_pos).all(1)
     want = (one.time < 6.0) | ((one.time > 7.0) & (one.time <= time[-1]))
     assert (there == want).mean() > 0.99 and not there[(one.time > 6.02) & (one.time < 6.98)].any()

@@ -12,6 +12,7 @@ import tqdm
 
 from ..files import replacing
 from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE
+from .schema import COLUMNS
 
 __all__ = ["VERSION", "export_lerobot"]
 
@@ -56,13 +57,14 @@ def export_lerobot(
         )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
-    for name in (counts, "indenter_pos", "indenter_quat", "wrench"):
+    recorded = bool((data.kind == "recorded").all())
+    for name in (counts,) if recorded else (counts, "indenter_pos", "indenter_quat", "wrench"):
         data[name]  # says what is missing
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
     if not len(chosen):
         raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
     with replacing(out, folder=True) as building:
-        _Export(data, building, counts, chosen).write(progress)
+        _Export(data, building, counts, chosen, recorded).write(progress)
     return out
 
 
@@ -76,12 +78,13 @@ def _pyarrow():
 
 
 class _Export:
-    def __init__(self, data, folder, counts, chosen):
+    def __init__(self, data, folder, counts, chosen, recorded):
         self.data, self.folder, self.counts, self.chosen = data, folder, counts, chosen
+        self.recorded = recorded
         self.fps = self._rate()
         self.features = {
             "observation.state": _feature(_POSE),
-            "observation.force": _feature(_WRENCH),
+            "observation.force": _feature(self._axes()),
             "observation.tactile.electrodes": _feature(ELECTRODES),
             **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[NELECTRODE:]},
             "action": _feature(_POSE),
@@ -95,11 +98,24 @@ class _Export:
         tasks = [f"{kind} with {name}" for kind, name in zip(data.kind[chosen], data.object[chosen])]
         self.tasks = sorted(set(tasks))
         self.task = [self.tasks.index(task) for task in tasks]
+        if recorded:  # nobody simulated it: what was not measured in all of its rows is no feature
+            episodes = [self._episode(number, int(i), 0) for number, i in enumerate(chosen)]
+            for name in list(self.features):
+                if not all(np.isfinite(one[name]).all() for one in episodes):
+                    del self.features[name], self.all_features[name]
+
+    def _axes(self):
+        """Names of the force's numbers: a recording without torques has three."""
+        if not self.recorded or "measured_wrench" not in self.data.columns:
+            return _WRENCH
+        return _WRENCH if np.isfinite(self.data["measured_wrench"][:][:, 3:]).any() else _WRENCH[:3]
 
     def _rate(self):
         steps = [np.diff(self.data["time"][self.data.start[i] : self.data.stop[i]]) for i in self.chosen[:50]]
         step = np.concatenate(steps)
-        if not len(step) or np.ptp(step) > 1e-4:
+        # a real clock shakes; half a step off, a row was dropped
+        shaken = 0.5 * np.median(step) if self.recorded and len(step) else 1e-4
+        if not len(step) or np.ptp(step) > shaken:
             raise ValueError(
                 "the time steps of the set are not even: LeRobot's layout has one frame rate; "
                 "resample the recordings first"
@@ -143,13 +159,13 @@ class _Export:
         data = self.data
         rows = slice(data.start[i], data.stop[i])
         n = int(data.stop[i] - data.start[i])
-        pose = np.concatenate([data["indenter_pos"][rows], data["indenter_quat"][rows]], axis=1).astype(
-            np.float32
-        )
+        pose = np.concatenate([self._column(f"indenter_{name}", rows) for name in ("pos", "quat")], axis=1)
+        pose = pose.astype(np.float32)
+        wrench = "measured_wrench" if self.recorded else "wrench"
         counts = data[self.counts][rows].astype(np.float32)
         out = {
             "observation.state": pose,
-            "observation.force": data["wrench"][rows].astype(np.float32),
+            "observation.force": self._column(wrench, rows)[:, : len(self._axes())].astype(np.float32),
             "observation.tactile.electrodes": counts[:, :NELECTRODE],
             **{
                 f"observation.tactile.{name}": counts[:, NELECTRODE + k]
@@ -162,7 +178,13 @@ class _Export:
             "index": first + np.arange(n),
             "task_index": np.full(n, self.task[number]),
         }
-        return out
+        return {name: out[name] for name in self.all_features}
+
+    def _column(self, name, rows):
+        """Rows of a column; NaN where the set has none."""
+        if name in self.data.columns:
+            return self.data[name][rows]
+        return np.full((rows.stop - rows.start, *COLUMNS[name][0]), np.nan)
 
     def _row(self, number, n, first, file_index, statistics):
         row = {

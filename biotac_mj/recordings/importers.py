@@ -72,8 +72,10 @@ def load(
         groups.append([])
     for group in _together(groups):
         done += join([*group, *shared], rate, object_name, scale)
-    for one in done:
-        one.notes = (*one.notes, *(f"{path.name}: left out" for path in unread))
+    if unread:
+        names = ", ".join(path.name for path in unread[:4]) + (" ..." if len(unread) > 4 else "")
+        for one in done:
+            one.notes = (*one.notes, f"left out {names}")
     return done
 
 
