@@ -273,6 +273,20 @@ def test_messages_of_any_package():
     assert any("PAC has 2 of 22" in note for note in one.notes)
 
 
+def test_two_poses_of_one_body_are_said():
+    """Two topics without a word that tells them apart."""
+    topics = Topic("/biotac"), Topic("/robot/pose"), Topic("/finger/pose")
+    for k in range(20):
+        topics[0].add(message(electrodes=[3000 + k] * 19), 0.01 * k)
+        for axis, topic in enumerate(topics[1:]):
+            position = message(x=1.0 + axis, y=0.0, z=0.0)
+            turn = message(x=0.0, y=0.0, z=0.0, w=1.0)
+            topic.add(message(pose=message(position=position, orientation=turn)), 0.01 * k)
+    (one,) = join([part for topic in topics for part in topic.parts()])
+    assert (one.sensor_pos == [1, 0, 0]).all() and (one.sensor_quat == [1, 0, 0, 0]).all()
+    assert "finger_pose: left out sensor_pos, sensor_quat, which stands elsewhere too" in one.notes
+
+
 def test_lines_of_a_serial_port():
     times = 100 + 0.01 * np.arange(20)
     lines = [(",".join(f"{v:.0f}" for v in row) + "\r\n").encode() for row in ONE.electrodes[:20]]
@@ -320,6 +334,57 @@ def test_recording_from_a_port(tmp_path, monkeypatch, capsys):
     assert "electrodes that never change: e1, e2" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("ros", ["rclpy", "rospy"])
+def test_recording_from_topics(tmp_path, monkeypatch, ros):
+    """Stand-ins for ROS' libraries: a hand that sends as often as it is asked, or asks to be called back."""
+    sent = []
+
+    def hand():
+        sent.append(3000 + len(sent))
+        stamp = types.SimpleNamespace(
+            secs=5, nsecs=10_000_000 * len(sent), sec=5, nanosec=10_000_000 * len(sent)
+        )
+        data = [message(pdc_data=1500, electrode_data=np.full(19, sent[-1]))]
+        return message(header=message(stamp=stamp), bt_data=data)
+
+    def module(name, **names):
+        made = types.ModuleType(name)
+        vars(made).update(names, __spec__=types.SimpleNamespace())
+        monkeypatch.setitem(sys.modules, name, made)
+        if "." in name:
+            setattr(sys.modules[name.rpartition(".")[0]], name.rpartition(".")[2], made)
+
+    called = []
+    if ros == "rclpy":
+        node = types.SimpleNamespace(
+            get_topic_names_and_types=lambda: [("/hand", ["biotac_sensors/msg/BioTacHand"])],
+            create_subscription=lambda kind, name, back, qos: called.append(back),
+            destroy_node=lambda: None,
+        )
+        spin = lambda node, timeout_sec: called and called[0](hand())  # noqa: E731
+        module("rclpy", init=lambda: 0, create_node=lambda name: node, spin_once=spin, shutdown=lambda: 0)
+        module("rclpy.qos", qos_profile_sensor_data=None)
+        module("rosidl_runtime_py")
+        module("rosidl_runtime_py.utilities", get_message=lambda name: name)
+    else:
+
+        def subscriber(name, kind, back, queue_size):
+            for _ in range(30):
+                back(
+                    types.SimpleNamespace(_buff=b"", _connection_header={"type": "biotac_sensors/BioTacHand"})
+                )
+            return types.SimpleNamespace(unregister=lambda: None)
+
+        kind = type("Hand", (), {"deserialize": lambda self, raw: hand()})
+        module("rospy", init_node=lambda *a, **k: 0, Subscriber=subscriber, AnyMsg=object)
+        module("roslib")
+        module("roslib.message", get_message_class=lambda name: kind)
+    out = tmp_path / "r.h5"
+    assert cli.main(["record", "--topic", "/hand", "--seconds", "0.05", "--out", str(out)]) == 0
+    (one,) = read(out)
+    assert len(sent) >= 10 and one.electrodes[:, 0].tolist() == sent and one.rate == pytest.approx(100)
+
+
 def test_recording_without_libraries_says_what_to_install(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("biotac_mj.recordings.live._is_here", lambda name: False)
     for words, said in (("--topic /biotac_pub", "rclpy or rospy"), ("--serial /dev/x", "biotac-mj[serial]")):
@@ -340,6 +405,11 @@ def test_units():
         (np.zeros((9, 19)), "tared counts without sign"),
     ):
         assert guess_unit(value) == unit
+
+
+def test_rest_like_published_sensors():
+    assert ONE.rest_correlation > 0.95
+    assert dataclasses.replace(ONE, electrodes=ONE.electrodes[:, ::-1]).rest_correlation < 0.8
 
 
 def test_scaled_and_tared_counts(tmp_path):

@@ -24,6 +24,7 @@ def lines(delimiter=" ", end="\n", rows=ROWS):
         "# force plate\n% N\n\n" + lines() + "\n",
         "Fx,Fy,Fz\n" + lines(","),
         "# Fx Fy Fz\n" + lines(),
+        "0,1,2\n" + lines(","),
         lines(";").replace(".", ","),
         lines(",", ",\n"),
         "force_x force_y force_z\n" + lines(),

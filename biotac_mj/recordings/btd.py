@@ -48,8 +48,7 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
     if table.ndim != 2 or not len(table) or table.shape[1] < 6 or table.shape[1] % 2:
         raise ValueError(
             f"{path} has no samples, or lines that are not time, batch, frame, channel and two numbers "
-            f"for each "
-            "sensor: was it cut off? Export it again, or remove the last line"
+            "for each sensor: was it cut off? Export it again, or remove the last line"
         )
     if not np.isfinite(table).all():
         raise ValueError(f"{path} has samples that are not finite: copy it again")
@@ -92,6 +91,6 @@ def _frames(path, table):
     if not good.any():
         raise ValueError(
             f"{path} has no whole frame: 22 samples of PAC and one of each other channel in 44 lines are "
-            f"needed"
+            "needed"
         )
     return first[good], channel[good], lines[good]

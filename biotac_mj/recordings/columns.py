@@ -122,6 +122,8 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         names = [_name(word) for word in split.pop(0)[1]]
         if not split:
             raise ValueError(f"{path} is empty: it has a header and no rows; one for each sample is needed")
+    elif [word for word in split[0][1] if word] in _numberings(len(split[0][1])) and len(split) > 1:
+        split.pop(0)  # a table that was saved with the numbers of its columns as their names
     width = len(split[0][1])
     if names and width > len(names) and all(row[len(names) :] == [""] for _, row in split):
         width = len(names)  # a separator at the end of every row
@@ -169,10 +171,16 @@ def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
     if table.width != len(names):
         raise ValueError(
             f"{path}, line {table.lines[0]}: {table.width} columns, {len(names)} are needed ({range_}); "
-            f"leave "
-            "out times and other channels, or name all columns in a header"
+            "leave out times and other channels, or name all columns in a header"
         )
     return table.numbers(list(range(len(names))), list(names))
+
+
+def _numberings(width):
+    """What a row that counts the columns looks like; three at least, counts of electrodes do not."""
+    return [
+        [str(k + base) for k in range(width - less)] for base in (0, 1) for less in (0, 1) if width - less > 2
+    ]
 
 
 def _words(line, mark):

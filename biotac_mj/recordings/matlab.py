@@ -6,7 +6,6 @@ import pathlib
 import numpy as np
 
 from ..reading import reading
-from .names import is_time, place_of
 from .parts import Part, make_parts
 
 __all__ = ["read_matlab", "read_matlab_hdf5"]
@@ -64,12 +63,7 @@ def _walk(value, name, columns, words, depth):
 
 
 def _parts(path, columns, words):
-    ours = {name: value for name, value in columns.items() if place_of(name) or is_time(name)}
-    left = [name for name in columns if name not in ours]
-    notes = (
-        [f"{path.name}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}"] if left else []
-    )
-    parts = make_parts(path.name, ours or columns, notes)
+    parts = make_parts(path.name, columns)
     for part in parts:
         part.object = words.get("object", "")
     return parts

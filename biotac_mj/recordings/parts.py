@@ -24,7 +24,7 @@ _EPOCH = 1e11  # a clock beyond this counts parts of seconds since 1970 (1e11 s 
 _SLOWEST, _FASTEST = 0.5, 1e4
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Part:
     """Columns of one file or topic that belong together, row by row.
 
@@ -55,7 +55,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
     """Named columns, one part a sensor; what no name explains is left out, and the notes say so.
 
     Args:
-      source: for texts. columns: name -> (n,), or (n, k) and (k, n) for whole fields.
+      source: for texts. columns: name -> (n,), or (n, k), (k, n) for whole fields; of other names, anything.
 
     Raises:
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
@@ -73,8 +73,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         names = ", ".join(list(columns)[:8])
         raise ValueError(
             f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
-            f"e1..e19, "
-            "pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/data.md has all names"
+            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/data.md has all names"
         )
     if left:
         notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")
@@ -192,7 +191,7 @@ def join(
     if not sensors:
         raise ValueError(
             f"{', '.join(dict.fromkeys(p.source for p in parts))}: no electrodes: give the sensor's own "
-            f"file too"
+            "file too"
         )
     names = {part.sensor for part in sensors}
     common = os.path.commonprefix(sorted(names)).rpartition("_")[0] if len(names) > 1 else ""
@@ -227,7 +226,10 @@ def _recording(name, part, others, rows_clock, object_name, scale):
     for other in others:
         placed, more = _placed(part, other, time, keep)
         notes += [n for n in (*other.notes, *more) if n not in notes]
-        fields |= {key: value for key, value in placed.items() if key not in fields}
+        twice = [key for key in placed if key in fields]
+        if twice:
+            notes.append(f"{other.source}: left out {', '.join(twice)}, which stands elsewhere too")
+        fields |= {key: value for key, value in placed.items() if key not in twice}
         sources += [other.source]
     there = [key for key in CHANNELS if key in fields]
     if scale is not None:
@@ -312,8 +314,7 @@ def _clock(name, time):
     if not _SLOWEST <= 1 / usual <= _FASTEST:
         raise ValueError(
             f"{name}: {1 / usual:.3g} rows per second are no log of a BioTac: is the time in seconds? "
-            f"Name the "
-            "column time_ms, time_us or time_ns"
+            "Name the column time_ms, time_us or time_ns"
         )
     return time[keep], rows[keep], notes
 
@@ -324,8 +325,7 @@ def _placed(part, other, time, keep):
         if len(other) != len(part):
             raise ValueError(
                 f"{part.source} has {len(part)} rows and {other.source} has {len(other)}: they must be "
-                f"logged row "
-                "by row together; cut both to the time they share (a clock gap cannot be guessed)"
+                "logged row by row together; cut both to the time they share (a clock gap cannot be guessed)"
             )
         return {k: v[keep] for k, v in other.fields.items()}, []
     if part.time is other.time:

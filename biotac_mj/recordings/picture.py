@@ -90,7 +90,7 @@ def _change(recording, name):
     if recording.unit(name).startswith("tared"):
         return value, f"[{_short(recording, name)}]"
     rest = np.nanmedian(value[: max(5, int(_REST * len(value)))], axis=0)
-    return value - rest, f"change\n[{_short(recording, name)}]"
+    return value - rest, f"since the start\n[{_short(recording, name)}]"
 
 
 def _map(axis, time, recording):

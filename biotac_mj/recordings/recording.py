@@ -57,7 +57,7 @@ CHANNELS = tuple(name for name, field in FIELDS.items() if field.units is UNITS)
 _WORDS = ("object", "source", "frame", "rate_source")
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Recording:
     """n rows of one sensor in order of time. What was not recorded is None; NaN: not in this row.
 

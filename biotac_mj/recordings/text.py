@@ -48,21 +48,13 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
 def _named(table, role):
     """A table with a header. Cells of forces and poses may be empty: not measured in this row."""
-    columns, ours = {}, []
+    columns = {}
     for k, name in enumerate(table.names):
         place = place_of(name)
-        if place is None and not is_time(name):
-            continue
-        ours.append(name)
+        known = place is not None or is_time(name)
         gaps = place is not None and place.field != "electrodes"
-        columns[name] = table.numbers([k], [name], gaps)[:, 0]
-    left = [name for name in table.names if name not in ours]
-    notes = (
-        [f"{table.path.name}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}"]
-        if left
-        else []
-    )
-    parts = make_parts(table.path.name, columns, notes)
+        columns[name] = table.numbers([k], [name], gaps)[:, 0] if known else ()
+    parts = make_parts(table.path.name, columns)
     if role and not any(role in part.fields for part in parts):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
     return parts
