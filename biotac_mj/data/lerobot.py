@@ -12,7 +12,6 @@ import tqdm
 
 from ..files import replacing
 from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE
-from .schema import COLUMNS
 
 __all__ = ["VERSION", "export_lerobot"]
 
@@ -159,13 +158,14 @@ class _Export:
         data = self.data
         rows = slice(data.start[i], data.stop[i])
         n = int(data.stop[i] - data.start[i])
-        pose = np.concatenate([self._column(f"indenter_{name}", rows) for name in ("pos", "quat")], axis=1)
+        parts = [self._column(f"indenter_{name}", rows, k) for name, k in (("pos", 3), ("quat", 4))]
+        pose = np.concatenate(parts, axis=1)
         pose = pose.astype(np.float32)
         wrench = "measured_wrench" if self.recorded else "wrench"
         counts = data[self.counts][rows].astype(np.float32)
         out = {
             "observation.state": pose,
-            "observation.force": self._column(wrench, rows)[:, : len(self._axes())].astype(np.float32),
+            "observation.force": self._column(wrench, rows, 6)[:, : len(self._axes())].astype(np.float32),
             "observation.tactile.electrodes": counts[:, :NELECTRODE],
             **{
                 f"observation.tactile.{name}": counts[:, NELECTRODE + k]
@@ -180,11 +180,11 @@ class _Export:
         }
         return {name: out[name] for name in self.all_features}
 
-    def _column(self, name, rows):
-        """Rows of a column; NaN where the set has none."""
+    def _column(self, name, rows, width):
+        """(n, width) of a column; NaN where the set has none."""
         if name in self.data.columns:
             return self.data[name][rows]
-        return np.full((rows.stop - rows.start, *COLUMNS[name][0]), np.nan)
+        return np.full((rows.stop - rows.start, width), np.nan)
 
     def _row(self, number, n, first, file_index, statistics):
         row = {
