@@ -3,12 +3,12 @@
 python benchmarks/sensor_presets.py RECORDING [--force F.txt] [--rate HZ] [--json OUT]
 
 RECORDING is a text of 19 columns of raw counts (`--force`: three of force [N] beside it, where it was
-loaded), a native log `*.btd[.gz]`, or a folder of `*_HOLD.mat` (two sensors of a gripper, of which the motor's
-effort says how hard). Numbers are what one reads at no load and at the recording's beginning:
+loaded), a native log `*.btd[.gz]`, or a folder of `*_HOLD.mat` (two sensors of a gripper, whose effort
+says how hard). Numbers are what one reads at no load and at the recording's beginning:
 
   rest      ln Z of each electrode as a + b . (force, normal force^2) + warm-up, at no force and time 0,
-            from the 8 % of the rows under least force; a log's is the median of its first seconds, a gripper's
-            that of its softest holds. `loaded` says that it was never untouched.
+            from the 8 % of the rows under least force; a log's is the median of its first seconds, of a
+            gripper that of its softest holds. `loaded` says that it was never untouched.
   warm_up   [C] that the change of ln Z that all electrodes share stands for, at 7.1 % per degree, when it is
             over, and warm_time [s] of its exponential.
   noise     RMS from second differences, which drift and slow loads hardly change; that of rounding is taken

@@ -171,7 +171,7 @@ NNUMBER = _ENDS[-1]
 
 # MEASURED by benchmarks/sensor_presets.py: single numbers, rest counts, noise; the published rest counts are
 # "1" to "3". epfl_f1 was never untouched: its rest is extrapolated from light presses, and lies within 0.05
-# in ln Z, RMS, of the published "1". epfl_f2 hung untouched beside it. phac_*: two sensors of a gripper (PHAC-2)
+# in ln Z, RMS, of the published "1". epfl_f2 hung untouched beside it. phac_*: two of a gripper (PHAC-2)
 # in the holds of a soft sponge; what PAC feels of the gripper is in its noise. btd_sp: a BioTac SP, a log.
 _TABLE = """
 epfl_f1 warm_up 5.92 warm_time 210
