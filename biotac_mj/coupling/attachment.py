@@ -14,11 +14,10 @@ from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
-from ..sensor.materials import read_thermal
+from ..sensor.materials import check_choices, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
-from .readings import check_choices
 from .stepper import check_names, make_readings
 
 if typing.TYPE_CHECKING:

@@ -1,9 +1,9 @@
 """The sensor as the coupling sees it: counts of every channel from the deformed skin."""
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
@@ -21,7 +21,7 @@ from .fem import FemStepper, rest_geometry
 from .stepper import Geom, SkinResult
 from .vibration import Shaking
 
-__all__ = ["SensorReadings", "check_choices", "materials_of", "textures_of"]
+__all__ = ["SensorReadings", "materials_of", "textures_of"]
 
 
 class SensorReadings:
@@ -102,20 +102,18 @@ class SensorReadings:
         return self._physics.readings(state)
 
 
-def materials_of(geoms: list[Geom], wanted: dict, seed: int = 0) -> list[Material]:
+def materials_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Material]:
     """Of each body, of names as `Config.thermal` has them; of a list one is drawn by the seed."""
-    return _by_body(geoms, wanted, read_thermal, "plastic", np.random.default_rng([seed, 0x4EA7]))
+    return _by_body(geoms, wanted, read_thermal, "plastic", _rng(seed, 0x4EA7))
 
 
-def textures_of(geoms: list[Geom], wanted: dict, seed: int = 0) -> list[Texture]:
+def textures_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Texture]:
     """Likewise, of names as `Config.textures` has them."""
-    return _by_body(geoms, wanted, read_texture, "smooth", np.random.default_rng([seed, 0x7E47]))
+    return _by_body(geoms, wanted, read_texture, "smooth", _rng(seed, 0x7E47))
 
 
-def check_choices(value: object, read: Callable) -> None:
-    """Raises ValueError for what of a value, or of one of a list of choices, `read` cannot read."""
-    for one in value if isinstance(value, (list, tuple)) and value else [value]:
-        read(one)
+def _rng(seed, what):
+    return np.random.default_rng([*np.atleast_1d(seed).tolist(), what])
 
 
 def _by_body(geoms, wanted, read, else_, rng):

@@ -321,6 +321,7 @@ def reset_states(
     # In, out:
     drawn: wp.array(dtype=int),
     # Out:
+    row_out: wp.array(dtype=int),
     time_out: wp.array(dtype=real),
     temperature_out: wp.array(dtype=real),
     state_out: wp.array2d(dtype=real),
@@ -335,6 +336,7 @@ def reset_states(
         drawn[w] = drawn[w] + 1
     for i in range(state_out.shape[1]):
         state_out[w, i] = rest[row, i]
+    row_out[w] = row
     time_out[w] = real(0.0)
     temperature_out[w] = rest[row, _GIVEN_TEMPERATURE]
 
@@ -597,7 +599,8 @@ class BatchAcquisition:
       seed: of world 0; world w has seed + w. Or (nworld,) of them, 0 .. 2**64 - 1.
       noise: False leaves quantisation only.
       film_every_step: see `Acquisition.needs_impedance`.
-      temperature: of the core at rest [C]; None: each sensor's own.
+      temperature: of the core at rest [C]; None: each sensor's own. liquid: how much warmer the liquid is
+        then than at the impedances [C]. One, or one for each sensor.
       sensor: Sensor of all worlds, or a list: one for each world, or (`redraw`) those that every reset of a
         world draws from, by seed and number of the reset.
       heat: see `Acquisition`.
@@ -609,6 +612,7 @@ class BatchAcquisition:
       temperature: (nworld,) wp.array float64, of the core at the end of the next step [C].
       liquid: (nworld,) wp.array float64, how much warmer the liquid is than at the impedances [C].
       due: (nworld,) wp.array int, written by `find_due`.
+      row: (nworld,) wp.array int, which sensor of the list each world has.
 
     Raises:
       ValueError: a seed out of range or another number of seeds or sensors than worlds.
@@ -621,7 +625,8 @@ class BatchAcquisition:
         seed: ArrayLike = 0,
         noise: bool = True,
         film_every_step: bool = False,
-        temperature: float | None = None,
+        temperature: ArrayLike | None = None,
+        liquid: ArrayLike = 0.0,
         sensor: Sensor | list[Sensor] = SENSORS["1"],
         redraw: bool = False,
         heat: bool = False,
@@ -632,12 +637,16 @@ class BatchAcquisition:
             raise ValueError(
                 f"{len(sensors)} sensors for {nworld} worlds: pass one for each, or a single one"
             )
-        states = {}
-        for one in dict.fromkeys(sensors):
-            states[one] = np.zeros(NSTATE)
-            Acquisition(sensor=one, film_rest=rest, heat=heat).reset(
-                states[one], rest, temperature=temperature
-            )
+        rows, states = np.zeros((len(sensors), NSTATE)), {}
+        warm = [None if temperature is None else float(t) for t in np.broadcast_to(temperature, len(sensors))]
+        for row, *one in zip(
+            rows, sensors, warm, np.broadcast_to(liquid, len(sensors)).tolist(), strict=True
+        ):
+            if tuple(one) not in states:
+                single = Acquisition(sensor=one[0], film_rest=rest, heat=heat)
+                single.reset(row, rest, temperature=one[1], liquid=one[2])
+                states[tuple(one)] = row
+            row[:] = states[tuple(one)]
         seeds = [int(seed) + w for w in range(nworld)] if np.ndim(seed) == 0 else [int(s) for s in seed]
         if len(seeds) != nworld:
             raise ValueError(
@@ -650,8 +659,8 @@ class BatchAcquisition:
         self._noise, self._every, self._redraw = int(bool(noise)), int(bool(film_every_step)), int(redraw)
         with wp.ScopedDevice(self.device):
             self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
-            self._rest = wp.array(np.array([states[one] for one in sensors]), dtype=real)
-            self._drawn = wp.zeros(nworld, dtype=int)
+            self._rest = wp.array(rows, dtype=real)
+            self._drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.state = wp.zeros((nworld, NSTATE), dtype=real)
             self.time, self.temperature, self.liquid = (wp.zeros(nworld, dtype=real) for _ in range(3))
             self.due = wp.zeros(nworld, dtype=int)
@@ -661,7 +670,7 @@ class BatchAcquisition:
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
         inputs = [mask, self._rest, self._redraw, self.seed, self._drawn]
-        outputs = [self.time, self.temperature, self.state]
+        outputs = [self.row, self.time, self.temperature, self.state]
         wp.launch(reset_states, self.nworld, inputs, outputs, device=self.device)
 
     def find_due(self, dt: float) -> wp.array:

@@ -410,6 +410,12 @@ class Heat:
             step_heat, nworld, inputs, [self.state, self._scratch], device=self.device, record_cmd=True
         )
 
+    def read_from(self, area: wp.array, force: wp.array) -> None:
+        """From now on `area` and `force` are these (nworld, ngroup) arrays of the device."""
+        self.area, self.force = area, force
+        self._step.set_param_at_index(2, area)
+        self._step.set_param_at_index(3, force)
+
     def set_bodies(self, bodies: list[list[Material]]) -> None:
         """Gives every world bodies of its own: (nworld, ngroup) materials."""
         state = self.state.numpy()

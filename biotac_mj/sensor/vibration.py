@@ -291,6 +291,13 @@ class Vibration:
         bodies[:, _TEXTURE : _TEXTURE + 3] = np.array(made, float).reshape(-1, 3)
         return state
 
+    def read_from(
+        self, time: wp.array, drive: wp.array, gain: wp.array, slip: wp.array, area: wp.array
+    ) -> None:
+        """From now on `time`, `drive`, `gain`, `slip` and `area` are these arrays of the device."""
+        self.time, self.drive, self.gain, self.slip, self.area = time, drive, gain, slip, area
+        self._dt = None
+
     def prepare(self, dt: float) -> None:
         """Makes room for steps of dt [s]."""
         if dt != self._dt:

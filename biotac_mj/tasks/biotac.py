@@ -12,7 +12,7 @@ from dm_control.composer.observation import observable
 from .. import plugin
 from ..effects.sensors import take_sensor
 from ..sensor.channels import FULL_SCALE
-from ..sensor.materials import read_thermal
+from ..sensor.materials import check_choices, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 
@@ -96,7 +96,6 @@ class BioTac(composer.Entity):
             given.
         """
         from ..coupling import attach
-        from ..coupling.readings import check_choices
 
         for key in ("site", "body", "pos", "quat", "prefix"):
             if key in settings:
