@@ -98,6 +98,50 @@ def _add_skin(verb, seed="of the sensor's noise"):
     _add_options(verb)
 
 
+def _add_sensor(verb, touched):
+    verb.add_argument(
+        "--sensor",
+        type=_choice,
+        default="1",
+        metavar="NAME",
+        help="which sensor: 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, or JSON",
+    )
+    verb.add_argument(
+        "--randomise",
+        nargs="+",
+        default=(),
+        metavar="EFFECT",
+        help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
+    )
+    for name, example in (("thermal", "steel"), ("texture", "cork")):
+        verb.add_argument(
+            f"--{name}",
+            nargs="+",
+            type=_choice,
+            metavar="MATERIAL",
+            help=f"of what {touched}, as in {example}, or JSON; of several one is drawn (default: left out)",
+        )
+
+
+def _choice(text):
+    """A name, or JSON of a dict."""
+    import json
+
+    if not text.startswith("{"):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON ({error})") from error
+
+
+def _of_sensor(args):
+    """Settings of a press or a set from the arguments of `_add_sensor`."""
+    one = {name: getattr(args, name) for name in ("thermal", "texture")}
+    one = {name: v[0] if v and len(v) == 1 else v for name, v in one.items()}  # of several one is drawn
+    return {"sensor": args.sensor, "randomise": args.randomise, **one}
+
+
 def _add_options(verb, name="--options", of="the skin"):
     verb.add_argument(
         name,
@@ -164,6 +208,7 @@ def _add_press(verbs):
         help="friction between skin and indenter (default: the material's)",
     )
     _add_skin(verb)
+    _add_sensor(verb, "the indenter is")
     files = output_folder("readings.csv", "skin.h5", "press.png")
     verb.add_argument("--out", type=files, default="out/press", metavar="DIR", help="folder of the results")
     verb.add_argument(
@@ -205,6 +250,7 @@ def _press(args):
         seed=args.seed,
         device=args.device,
         options=args.options,
+        **_of_sensor(args),
     )
     _check_device(args)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
@@ -548,6 +594,7 @@ def _add_generate(verbs):
         '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
     )
     _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
+    _add_sensor(verb, "the objects are")
     verb.add_argument(
         "--out",
         type=output_folder("generate.json"),

@@ -30,6 +30,9 @@ def generate_verb(args: argparse.Namespace) -> None:
         device=args.device,
         options=args.options,
         vary=args.vary,
+        sensor=args.sensor,
+        randomise=tuple(args.randomise),
+        **{name: _one_or_many(getattr(args, name)) for name in ("thermal", "texture")},
     )
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
@@ -44,6 +47,10 @@ def generate_verb(args: argparse.Namespace) -> None:
         f"{report.device}"
     )
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
+
+
+def _one_or_many(values):
+    return values[0] if values and len(values) == 1 else values
 
 
 def import_verb(args: argparse.Namespace) -> None:

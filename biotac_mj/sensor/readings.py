@@ -88,11 +88,13 @@ class PhysicsReadings:
         sensor: Sensor | None = None,
         bodies: list[Material] | None = None,
         textures: list[Texture] | None = None,
+        impedance: np.ndarray | None = None,
     ) -> None:
-        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state
-        (nstate,); from now on those of `sensor`, which what is of `bodies` with `textures` may touch, by
-        default those of the settings."""
-        impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
+        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (19,)
+        [ohm], by default at rest, into state (nstate,); from now on those of `sensor`, which what is of
+        `bodies` with `textures` may touch, by default those of the settings."""
+        if impedance is None:
+            impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
         own = acquisition.sensor
         temperature, liquid = own.temperature if self._temperature is None else self._temperature, 0.0
@@ -112,11 +114,12 @@ class PhysicsReadings:
         state: np.ndarray,
         time: float,
         dt: float,
-        vert_xpos: np.ndarray,
+        vert_xpos: np.ndarray | None,
         pressure: float,
         area: np.ndarray | None = None,
         force: np.ndarray | None = None,
         shaking: tuple | None = None,
+        impedance: np.ndarray | None = None,
     ) -> None:
         """Samples the step (time, time + dt].
 
@@ -128,20 +131,19 @@ class PhysicsReadings:
           area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
             touches.
           shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
+          impedance: (19,) of the film at the end of the step [ohm], which is not solved then.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
-        impedance, counts, temperature, liquid = None, self._counts(state), None, 0.0
+        counts, temperature, liquid = self._counts(state), None, 0.0
         heat = self._advance_heat(state, dt, area, force)
         if heat is not None:
             temperature, liquid = heat[THERMISTOR], heat[ABOVE]
-        if self.acquisition.needs_impedance(
-            counts, time, dt
-        ):  # a skin that nothing touches need not be solved again
-            impedance = (
-                self._rest if np.array_equal(vert_xpos, self._rest_vert) else self.film.impedance(vert_xpos)
-            )
+        if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
+            # a skin that nothing touches need not be solved again
+            still = np.array_equal(vert_xpos, self._rest_vert)
+            impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
         self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
         if heat is not None:

@@ -107,7 +107,9 @@ def feel_bodies(
             way = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2]) / wp.max(total[_KNOWN], real(1.0))
             area_out[w, g] = total[_AREA]
             force_out[w, g] = size
-            slip_out[w, g] = wp.length(way) / dt[w]
+            slip_out[w, g] = real(0.0)
+            if dt[w] > real(0.0):
+                slip_out[w, g] = wp.length(way) / dt[w]
         if gain_out.shape[2] > 0:
             gain = real(0.0)
             if total[_COUNT] > real(0.0) and size > real(0.0):
