@@ -1,27 +1,39 @@
 # make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1")
 # make test        style and the quick tests;  make test-all: the slow ones too
+# make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
-# make assets      make the meshes in assets/ again (needs the extra "mesh")
+# make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
 # make clean       remove results and the environment
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+NEWEST := $(VENV)-newest
+PIP := -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 ARGS ?=
+# a process for each core, each with whole files: what a file sets up is set up once
+PYTEST := pytest --numprocesses auto --dist loadfile
+ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling*.py impacts.py batch.py press.py scenes.py errors.py)
+test test-all test-newest: export OMP_NUM_THREADS := 1
 
-.PHONY: press test test-all benchmarks assets clean
+.PHONY: press test test-all test-newest benchmarks assets clean
 
 press: $(VENV)/.installed
 	$(BIN)/biotac press $(ARGS)
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m $(PYTEST) $(ARGS)
 
 test-all: $(VENV)/.installed-test
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
+	$(BIN)/python -m $(PYTEST) -m "slow or not slow" $(ARGS)
+
+# from the wheel, as a user has it
+test-newest: $(NEWEST)/.installed
+	rm -rf build
+	$(NEWEST)/bin/python $(PIP) --force-reinstall --no-deps .
+	$(NEWEST)/bin/$(PYTEST) --override-ini pythonpath= $(ARGS) $(wildcard $(ON_MUJOCO))
 
 benchmarks: $(VENV)/.installed-test
 	mkdir -p out/benchmarks
@@ -34,20 +46,25 @@ assets: $(VENV)/.installed-mesh
 	$(BIN)/python scripts/make_assets.py $(ARGS)
 
 clean:
-	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache $(VENV)
+	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache $(VENV) $(NEWEST)
 
 # Each stamp stands for one set of extras, installed once and again when the requirements change.
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) .
+	$(BIN)/python $(PIP) --editable .
 	touch $@
 
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) ".[control,batch,learning,data,lerobot,gymnasium,web,test]"
+	$(BIN)/python $(PIP) --editable ".[control,batch,learning,data,lerobot,gymnasium,web,test]"
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) ".[mesh]"
+	$(BIN)/python $(PIP) --editable ".[mesh]"
 	touch $@ $(VENV)/.installed
+
+$(NEWEST)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(NEWEST)
+	$(NEWEST)/bin/python $(PIP) ".[batch,data,web,test]"
+	touch $@

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 
 __all__ = ["importable", "run_with"]
 
-APART = ("plugin", "mjcf", "assets")  # packages that lie beside biotac_mj in a checkout
+APART = ("plugin", "mjcf", "assets")  # packages that lay beside biotac_mj in older checkouts
 
 
 @contextlib.contextmanager
 def importable(root: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A folder for PYTHONPATH: the root itself, or of a plain checkout one of symbolic links.
+    """A folder for PYTHONPATH: the root itself, or of an older checkout one of symbolic links.
 
     Raises:
       FileNotFoundError: there is no biotac_mj.

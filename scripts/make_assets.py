@@ -1,5 +1,5 @@
-"""Makes everything in assets/: the parametric BioTac's skins in three resolutions with a card each, its rigid
-parts and the indenters.
+"""Makes everything in biotac_mj/assets/: the parametric BioTac's skins in three resolutions with a card
+each, its rigid parts and the indenters.
 
     pip install -e ".[mesh]"
     python scripts/make_assets.py [--only coarse default fine rigid indenters] [--keep-tetrahedra]
@@ -25,7 +25,7 @@ from biotac_mj.geometry.parametric import biotac_bodies, clamp_plate, electrodes
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.geometry.tet_mesh import TetMesh
 
-ASSETS = pathlib.Path(__file__).parents[1] / "assets"
+ASSETS = pathlib.Path(__file__).parents[1] / "biotac_mj" / "assets"
 
 # edge of the ten-node tetrahedra [mm], spacing of the input surfaces [mm], fTetWild's envelope as a share of
 # the box's diagonal (32 mm)

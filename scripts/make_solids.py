@@ -22,7 +22,7 @@ from biotac_mj.geometry.parametric import biotac_bodies, electrodes
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
 
-ASSETS = pathlib.Path(__file__).parents[1] / "assets"
+ASSETS = pathlib.Path(__file__).parents[1] / "biotac_mj" / "assets"
 # [mm] boundary nodes nearer to the core's surface than this are bonded to it; the outer surface is 1.5 mm
 # away
 BONDED = 0.05

@@ -4,19 +4,14 @@ import ast
 import pathlib
 
 REPO = pathlib.Path(__file__).parents[1]
-AT_THE_TOP = ("plugin", "mjcf", "assets")  # folders of the repository that ship inside the package
 
 
 def modules() -> dict:
     """Name -> file of every module of biotac_mj."""
     out = {}
-    for folder in ("biotac_mj", *AT_THE_TOP):
-        for path in sorted((REPO / folder).rglob("*.py")):
-            parts = path.relative_to(REPO).with_suffix("").parts
-            if folder == "biotac_mj" and parts[1] in AT_THE_TOP:  # a link to the folder at the top
-                continue
-            parts = parts if folder == "biotac_mj" else ("biotac_mj", *parts)
-            out[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    for path in sorted((REPO / "biotac_mj").rglob("*.py")):
+        parts = path.relative_to(REPO).with_suffix("").parts
+        out[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return out
 
 

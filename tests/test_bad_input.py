@@ -430,12 +430,17 @@ def files_of_csv():
     yield Row("calibrate way.csv --quiet", "does not say what pressed")
     yield Row("calibrate --quiet", "give either a file")
     yield Row("calibrate way.csv --synthetic", "give either a file")
+    yield Row(
+        "calibrate --synthetic --fit nu:0.2:0.9", "bounds of 'nu:0.2:0.9': Poisson's ratio 0.9 is outside"
+    )
+    yield Row("calibrate --synthetic --fit mu:-1:1", "bounds of 'mu:-1:1': friction -1")
     yield Row(f"{CSV} --fit jelly", "cannot fit 'jelly'")
     yield Row(f"{CSV} --fit E:1", "bounds of 'E:1' are not two numbers")
     yield Row(f"{CSV} --fit E:nan:1", "are no interval")
     yield Row(f"{CSV} --direction 0 0 0", "is no direction")
     yield Row(f"{CSV.replace('sphere_7mm', 'cone')}", "unknown indenter 'cone'")
     yield Row("compare --data way.csv", "does not say what pressed")
+    yield Row("compare --reference-material foo", "unknown material 'foo'")
     yield Row("compare --data sphere_7mm=nowhere.csv", "no force-deflection data at nowhere.csv")
 
 
@@ -510,7 +515,8 @@ def settings():
         ('{"friction":NaN}', "friction is nan: pass a finite number"),
         ('{"friction":Infinity}', "friction is inf: pass a finite number"),
         ('{"friction":-1}', "friction -1 is negative"),
-        ('{"youngs_modulus":0}', "must be positive"),
+        ('{"youngs_modulus":0}', "must be from 100 to"),
+        ('{"youngs_modulus":1e-300}', "must be from 100 to"),
         ('{"poissons_ratio":0.5}', "Poisson's ratio 0.5 is outside"),
         ('{"law":"jelly"}', "unknown material law 'jelly'"),
         ('{"element":"cubic"}', "unknown element 'cubic'"),

@@ -118,7 +118,7 @@ class Batch(Skins):
     def aim(self, d: "mjw.Data") -> None:
         """Finds where the bodies go with d.qacc."""
         r = self._of_step
-        going = [self.dt**2, self._jacobian, d.qacc, r.here_pos, r.start_pos, r.start_mat]
+        going = [self.dt**2, self._jacobian, d.qacc, r.here_pos, r.start_pos, r.start_mat, r.drift]
         self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:

@@ -145,18 +145,24 @@ def follow(
     here: wp.array2d(dtype=vec3),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
+    drift: wp.array2d(dtype=vec6),
     # Out:
     moved_out: wp.array2d(dtype=vec6),
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
-    """Poses at the end of the step: those without acceleration, moved by h^2 J a."""
+    """Poses at the end of the step: those without acceleration, moved by h^2 J a.
+
+    Bodies turn by both at once: `geometry.rigid.displace` with its spin."""
     g, w = wp.tid()
     m = vec6()
     for i in range(jacobian.shape[2]):
         m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
     moved_out[g, w] = m
-    p, R = displace_from(here[g, w], pos[g, w], mat[g, w], m)
+    spin = wp.spatial_bottom(drift[g, w])
+    straight = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
+    p, R = displace_from(here[g, w], pos[g, w], rotation(-spin) * mat[g, w], straight)
+    p -= wp.cross(spin, here[g, w])
     pos_out[g, w] = p
     mat_out[g, w] = R
 

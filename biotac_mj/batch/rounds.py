@@ -135,7 +135,7 @@ def begin_rounds(r: Rounds):
     r.placed[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
-        if not size_of(jump) <= _TELEPORT:
+        if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.drift[g, w])):
             r.placed[w] = 1
     r.inside[w] = r.placed[w]
     r.settled[w] = 1

@@ -75,7 +75,7 @@ def parameter(text: str) -> Parameter:
     ratio and friction.
 
     Raises:
-      ValueError: unknown name, bounds that are no interval, or none where none are known.
+      ValueError: unknown name, bounds that are no interval or that cannot be, or none where none are known.
     """
     name, *bounds = text.split(":")
     name = _SHORT.get(name, name)
@@ -95,6 +95,14 @@ def parameter(text: str) -> Parameter:
         raise ValueError(
             f"bounds of {text!r} are no interval: write {name}:LOWER:UPPER with LOWER < UPPER, both finite"
         )
+    owner = (
+        Material() if name in _MATERIAL else SkinOptions(dynamics="implicit")
+    )  # whose damping may be fitted
+    for bound in (lower, upper):
+        try:
+            dataclasses.replace(owner, **{name: bound})
+        except ValueError as error:
+            raise ValueError(f"bounds of {text!r}: {error}") from None
     return Parameter(name, lower, upper, lower > 0 and upper > 10 * lower)
 
 

@@ -9,7 +9,7 @@ from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
 from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
 from .configurations import CONFIGURATIONS, configuration
-from .fit import Calibration, calibrate
+from .fit import Calibration, calibrate, parameter
 from .indentation import Indentation, plan_shear, read_indentation, write_indentation
 from .kept import Kept
 from .reference import STAND_IN, stand_in
@@ -38,6 +38,7 @@ def calibrate_verb(args: argparse.Namespace) -> None:
     """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be."""
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
+    parameters = [parameter(text) for text in args.fit]
     out = pathlib.Path(args.out)
     body = _body(args.configuration, args.skin, args.liquid, args.options)
     if args.synthetic:
@@ -66,7 +67,7 @@ def calibrate_verb(args: argparse.Namespace) -> None:
         body,
         read_material(args.material),
         data,
-        args.fit,
+        parameters,
         device=args.device,
         progress=not args.quiet,
         finer=finer,
@@ -94,6 +95,7 @@ def compare_verb(args: argparse.Namespace) -> None:
         for name in args.configurations
     ]
     given = args.material and read_material(args.material)
+    material(args.reference_material)
     out = pathlib.Path(args.out)
     settings = {
         k: v

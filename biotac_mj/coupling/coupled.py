@@ -14,7 +14,8 @@ __all__ = ["DEEPER", "TELEPORT", "Coupled"]
 # that lacks its force leads through the core
 DEEPER = 5e-4
 _MOST_ITERATIONS = 40  # of the skin's solver in a step, after which the model that came closest must do
-TELEPORT = 1e-3  # [m] a body that was moved further than this from outside was put there
+# [m] a body that was moved further than this, and than it goes by itself in a step, was put there
+TELEPORT = 1e-3
 
 
 class Coupled:
@@ -46,6 +47,7 @@ class Coupled:
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._iterations = 1.0, np.inf, True, 0
         self.here = instance.touching.predict(data, 0.0)
+        self.drift = self.horizon * (self.jacobian @ data.qvel)
 
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
@@ -59,7 +61,7 @@ class Coupled:
         solved [m]."""
         self.acceleration = acceleration
         self.moved = self.horizon**2 * (self.jacobian @ acceleration)
-        self.target = displace(*self.pose, self.moved, self.here[0])
+        self.target = displace(*self.pose, self.moved, self.here[0], self.drift[:, 3:])
         self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
         return self.off
 
@@ -149,8 +151,7 @@ class Coupled:
         return self._given() > max(self._store(), 0.0)
 
     def _given(self):
-        motion = self.horizon * (self.jacobian @ self.data.qvel) + self.moved
-        return float((self._acting() * motion).sum())
+        return float((self._acting() * (self.drift + self.moved)).sum())
 
     def _store(self):
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
@@ -160,7 +161,7 @@ class Coupled:
         if ends is None:
             return most
         jump = displacement(*self.here, *ends)
-        if _size(jump) > TELEPORT:
+        if _size(jump) > max(TELEPORT, _size(self.drift)):
             return most
         last = self.instance.last_model()[0]
         return min(store - min((w * jump).sum() for w in (wrench, last)), most)

@@ -82,7 +82,7 @@ def _c_type(node):
         return ctypes.c_int
     raise ValueError(
         f"biotac_mj does not know MuJoCo's type {node.name!r}: "
-        "this MuJoCo is newer than the plugin; install mujoco>=3.17,<4"
+        "this MuJoCo is newer than the plugin; install mujoco>=3.17,<5"
     )
 
 

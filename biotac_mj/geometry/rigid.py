@@ -94,10 +94,18 @@ def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.nd
 
 
 def displace(
-    pos: np.ndarray, mat: np.ndarray, motion: np.ndarray, here: np.ndarray | None = None
+    pos: np.ndarray,
+    mat: np.ndarray,
+    motion: np.ndarray,
+    here: np.ndarray | None = None,
+    spin: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses moved by (n, 6) small motions, the inverse of `displacement`: their own points go straight on, as
     MuJoCo moves bodies that spin; `here` (n, 3) are these points where the motions were measured, if not at
-    pos."""
+    pos. `spin` (n, 3) are rotation vectors that led to mat: bodies turn by both at once, which is not by one
+    after the other."""
     arm = pos if here is None else here
-    return pos + motion[:, :3] + cross(motion[:, 3:], arm), rotation(motion[:, 3:]) @ mat
+    turn = motion[:, 3:]
+    if spin is not None:
+        turn, mat = spin + turn, rotation(-spin) @ mat
+    return pos + motion[:, :3] + cross(motion[:, 3:], arm), rotation(turn) @ mat

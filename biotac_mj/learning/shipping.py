@@ -21,7 +21,8 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
     """Copies the weights of the trajectory split (all objects seen) and writes a card beside each.
 
     Args:
-      folder: of `biotac train`. result: of `report.evaluate_models`. target: folder, as assets/weights.
+      folder: of `biotac train`. result: of `report.evaluate_models`. target: folder, as
+        biotac_mj/assets/weights.
 
     Raises:
       FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: more than 16 MB.

@@ -358,11 +358,9 @@ class SkinStep:
         if m.material.law != "linear":  # small strain: its determinant means nothing
             self.k.elements.refuse_inverted(self._launcher, d.x, st.asked, st.failed)
         if d.core:
-            face, core = d.core.surface.face, m.core(d.nworld).struct
-            dim = (len(face), d.nworld)
-            self._launch(
-                limits.crushed_on_core, dim, [m.crushed_depth, face, core, d.x, st.asked], [st.failed]
-            )
+            surface, core = d.core.surface.start, m.core(d.nworld).struct
+            inputs = [m.crushed_depth, surface, core, d.x, st.asked]
+            self._launch(limits.crushed_on_core, d.x.shape, inputs, [st.failed])
 
     def _iterate(self):
         self._solve()

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..types import real, vec3
 from .faces import Geoms, Way
-from .shapes import distance, distance_bound
+from .shapes import distance, distance_bound, rough_bound
 
 __all__ = ["crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
 
@@ -36,26 +36,22 @@ def rest_gap(
 def crushed_on_core(
     # In:
     limit: real,
-    face: wp.array(dtype=wp.vec3i),
+    start: wp.array(dtype=int),
     core: Geoms,
     x: wp.array2d(dtype=vec3),
     asked: wp.array(dtype=int),
     # Out:
     failed_out: wp.array(dtype=int),
 ):
-    """Marks worlds with a corner of the inner surface deeper in the core than the limit: on its way
-    through."""
-    f, w = wp.tid()
-    if asked[w] == 0:
+    """Marks worlds with a node of the inner surface deeper in the core than the limit: on its way through."""
+    n, w = wp.tid()
+    if asked[w] == 0 or start[n] == start[n + 1]:
         return
-    R = wp.transpose(core.mat[0, w])
-    for c in range(3):
-        y = R * (x[face[f][c], w] - core.pos[0, w])
-        bound = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
-        if bound < -limit:  # too deep, perhaps
-            dn = distance(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
-            if dn[3] < -limit:
-                failed_out[w] = 1
+    y = wp.transpose(core.mat[0, w]) * (x[n, w] - core.pos[0, w])
+    if rough_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y) < -limit:
+        dn = distance(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
+        if dn[3] < -limit:
+            failed_out[w] = 1
 
 
 @wp.kernel

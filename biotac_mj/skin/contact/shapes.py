@@ -22,6 +22,7 @@ __all__ = [
     "distance_bound",
     "grid_value",
     "pack_grids",
+    "rough_bound",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -338,15 +339,21 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
 
 
 @wp.func
+def rough_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
+    """Lower bound of the distance [m] that asks no mesh: of one, by its grid alone."""
+    if kind == 7:
+        return grid_value(grids, grid, p) - _TRILINEAR * grids.spacing[grid]
+    return distance(kind, size, rounding, grids, grid, p)[3]
+
+
+@wp.func
 def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
     """Lower bound of the distance [m], cheap where that is far: what is surely not nearer needs no exact
     distance."""
+    bound = rough_bound(kind, size, rounding, grids, grid, p)
     if kind == 7:
         h = grids.spacing[grid]
-        d = grid_value(grids, grid, p)
-        bound = d - _TRILINEAR * h
         # a large mesh has large cells, and what is centimetres away is not near
-        if h > _COARSE and bound < _NEAR and d > -h:
+        if h > _COARSE and bound < _NEAR and bound > -(real(1.0) + _TRILINEAR) * h:
             bound = wp.max(bound, _to_triangles(grids, grid, p)[3])
-        return bound
-    return distance(kind, size, rounding, grids, grid, p)[3]
+    return bound

@@ -18,8 +18,9 @@ _ROWS, _COLUMNS = (
     32,
 )  # a block's threads as a grid: thread (r, c) holds the entries (r + 16 i, c + 32 j) in its registers
 
-# Gauss-Jordan exchange with row pivots, see `small.invert_serial`. NR x NC registers hold the
-# matrix.
+# Gauss-Jordan exchange with row pivots, see `small.invert_serial`. NR x NC registers hold the matrix. A
+# column is taken out of them (zero is left) when it is shared, and the pivot's row is made anew by the factor
+# -1: so one multiplication and addition serves all entries.
 _EXCHANGE = """
     const int NR = %(nr)d, NC = %(nc)d;
     const int t = threadIdx.x, r = t / %(columns)d, c = t %% %(columns)d;
@@ -41,7 +42,7 @@ _EXCHANGE = """
         }
     if (c == 0)
         #pragma unroll
-        for (int i = 0; i < NR; ++i) columns[0][r + %(rows)d * i] = a[i][0];
+        for (int i = 0; i < NR; ++i) { columns[0][r + %(rows)d * i] = a[i][0]; a[i][0] = 0.0f; }
     // of the rows c, c + 32, ...; every warp finds the pivots for itself, which saves a barrier
     unsigned taken = 0;
     for (int k = 0; k < n; ++k) {
@@ -49,8 +50,9 @@ _EXCHANGE = """
         __syncthreads();
         // bits of a number that is not negative are ordered as the number is
         unsigned best = 0, at = 0xffffffffu;
-        for (int m = 0; c + 32 * m < n; ++m) {
-            if (taken >> m & 1) continue;
+        #pragma unroll
+        for (int m = 0; m < NC; ++m) {
+            if (c + 32 * m >= n || (taken >> m & 1)) continue;
             const unsigned bits = __float_as_uint(fabsf(column[c + 32 * m]));
             if (at == 0xffffffffu || bits > best) { best = bits; at = c + 32 * m; }
         }
@@ -67,37 +69,41 @@ _EXCHANGE = """
 #endif
         if (p %% 32 == c) taken |= 1u << (p / 32);
         if (t == 0) pivot[p] = k;
-        const int pr = p %% %(rows)d, pi = p / %(rows)d;
-        const float d = 1.0f / column[p];
-        if (r == pr) {
+        if (r == p %% %(rows)d) {
+            const int pi = p / %(rows)d;
+            const float d = __frcp_rn(column[p]);
             #pragma unroll
             for (int i = 0; i < NR; ++i)
                 if (i == pi)
                     #pragma unroll
                     for (int j = 0; j < NC; ++j) {
-                        a[i][j] = (c + %(columns)d * j == k) ? d : a[i][j] * d;
-                        row[c + %(columns)d * j] = a[i][j];
+                        row[c + %(columns)d * j] = (c + %(columns)d * j == k) ? d : a[i][j] * d;
+                        a[i][j] = 0.0f;
                     }
         }
-        __syncthreads();
+        float f[NR];
         #pragma unroll
         for (int i = 0; i < NR; ++i) {
             const int ri = r + %(rows)d * i;
-            if (ri != p) {
-                const float f = column[ri];
-                #pragma unroll
-                for (int j = 0; j < NC; ++j) {
-                    const int cj = c + %(columns)d * j;
-                    a[i][j] = (cj == k) ? -f * d : a[i][j] - f * row[cj];
-                }
-            }
+            f[i] = (ri == p) ? -1.0f : column[ri];
         }
+        __syncthreads();
+        #pragma unroll
+        for (int j = 0; j < NC; ++j)
+            if (%(columns)d * j < n) {
+                const float along = row[c + %(columns)d * j];
+                #pragma unroll
+                for (int i = 0; i < NR; ++i) a[i][j] -= f[i] * along;
+            }
         if (c == (k + 1) %% %(columns)d)
             #pragma unroll
             for (int j = 0; j < NC; ++j)
                 if (j == (k + 1) / %(columns)d)
                     #pragma unroll
-                    for (int i = 0; i < NR; ++i) columns[(k + 1) & 1][r + %(rows)d * i] = a[i][j];
+                    for (int i = 0; i < NR; ++i) {
+                        columns[(k + 1) & 1][r + %(rows)d * i] = a[i][j];
+                        if (k + 1 < n) a[i][j] = 0.0f;
+                    }
     }
     __syncthreads();
     // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k

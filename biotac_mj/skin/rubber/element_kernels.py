@@ -200,7 +200,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             )
             if wp.static(len(beyond) > 0):
                 dP += thin(beyond_derivative(rubber, e, i, w, mu, lam, wide(F), wide(R), wide(dF)))
-            return dP + thin(squeezed_derivative(rubber.law, mu, wide(F), wide(dF)))
+            return dP + squeezed_derivative(rubber.law, m, F, dF)
         D = wide(dF)
         Q = wide(R)
         G = wide(F)
@@ -209,7 +209,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             total += pressure * dilatation_hessian(rubber.law, G, Q, D)
         if wp.static(len(beyond) > 0):
             total += beyond_derivative(rubber, e, i, w, mu, lam, G, Q, D)
-        return thin(total + squeezed_derivative(rubber.law, mu, G, D))
+        return thin(total) + squeezed_derivative(rubber.law, scalar(mu), F, dF)
 
     @wp.func
     def share(rubber: Rubber, mesh: Mesh, e: int, q: int, w: int):

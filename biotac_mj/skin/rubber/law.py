@@ -17,6 +17,8 @@ which is nothing above, with two derivatives, and grows without bound below. New
 that no rubber can have: from J = 0.02 down the parabolas of f and of J^(-2/3) go on, so that it finds back.
 """
 
+import typing
+
 import warp as wp
 
 from ..types import double, mat33, narrow, real, single, vec3, widen
@@ -141,23 +143,23 @@ def polar(F: mat33):
 
 
 @wp.func
-def cofactor(F: mat33):
-    """dJ / dF of the determinant J."""
-    a = vec3(F[0, 0], F[1, 0], F[2, 0])
-    b = vec3(F[0, 1], F[1, 1], F[2, 1])
-    c = vec3(F[0, 2], F[1, 2], F[2, 2])
+def cofactor(F: typing.Any):
+    """dJ / dF of the determinant J, in the precision of F."""
+    a = wp.vector(F[0, 0], F[1, 0], F[2, 0])
+    b = wp.vector(F[0, 1], F[1, 1], F[2, 1])
+    c = wp.vector(F[0, 2], F[1, 2], F[2, 2])
     return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
 
 
 @wp.func
-def cofactor_change(F: mat33, dF: mat33):
+def cofactor_change(F: typing.Any, dF: typing.Any):
     """Directional derivative of `cofactor`."""
-    a = vec3(F[0, 0], F[1, 0], F[2, 0])
-    b = vec3(F[0, 1], F[1, 1], F[2, 1])
-    c = vec3(F[0, 2], F[1, 2], F[2, 2])
-    da = vec3(dF[0, 0], dF[1, 0], dF[2, 0])
-    db = vec3(dF[0, 1], dF[1, 1], dF[2, 1])
-    dc = vec3(dF[0, 2], dF[1, 2], dF[2, 2])
+    a = wp.vector(F[0, 0], F[1, 0], F[2, 0])
+    b = wp.vector(F[0, 1], F[1, 1], F[2, 1])
+    c = wp.vector(F[0, 2], F[1, 2], F[2, 2])
+    da = wp.vector(dF[0, 0], dF[1, 0], dF[2, 0])
+    db = wp.vector(dF[0, 1], dF[1, 1], dF[2, 1])
+    dc = wp.vector(dF[0, 2], dF[1, 2], dF[2, 2])
     return wp.matrix_from_cols(
         wp.cross(db, c) + wp.cross(b, dc),
         wp.cross(dc, a) + wp.cross(c, da),
@@ -285,14 +287,17 @@ def dilatation_hessian(law: int, F: mat33, R: mat33, dF: mat33):
 
 
 @wp.func
-def squeeze(J: real):
-    """f and its two derivatives with t at t = J / J0."""
-    t = wp.max(J, _FLAT) / _SQUEEZED
-    over = J / _SQUEEZED - t  # as in `isochoric`
-    bend = real(2.0) / (t * t * t) - real(2.0)
-    slope = real(3.0) - real(2.0) * t - real(1.0) / (t * t)
-    value = real(1.0) / t - real(3.0) + (real(3.0) - t) * t
-    return vec3(value + (slope + real(0.5) * bend * over) * over, slope + bend * over, bend)
+def squeeze(J: typing.Any):
+    """f and its two derivatives with t at t = J / J0, in the precision of J."""
+    one = type(J)(1.0)
+    flat = type(J)(_FLAT)
+    room = type(J)(_SQUEEZED)
+    t = wp.max(J, flat) / room
+    over = J / room - t  # as in `isochoric`
+    bend = (one + one) / (t * t * t) - (one + one)
+    slope = one + one + one - (t + t) - one / (t * t)
+    value = one / t - (one + one + one) + ((one + one + one) - t) * t
+    return wp.vector(value + (slope + bend * over / (one + one)) * over, slope + bend * over, bend)
 
 
 @wp.func
@@ -314,11 +319,11 @@ def squeezed_stress(law: int, mu: real, F: mat33):
 
 
 @wp.func
-def squeezed_derivative(law: int, mu: real, F: mat33, dF: mat33):
-    """The same of its stress' directional derivative [Pa]."""
+def squeezed_derivative(law: int, mu: typing.Any, F: typing.Any, dF: typing.Any):
+    """The same of its stress' directional derivative [Pa], in the precision of F."""
     J = wp.determinant(F)
-    if law == 3 or J >= _SQUEEZED:
-        return mat33()
+    if law == 3 or J >= type(J)(_SQUEEZED):
+        return F - F
     f = squeeze(J)
     G = cofactor(F)
-    return mu * (f[2] / _SQUEEZED * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))
+    return mu * (f[2] / type(J)(_SQUEEZED) * wp.ddot(G, dF) * G + f[1] * cofactor_change(F, dF))

@@ -10,6 +10,8 @@ __all__ = ["ELEMENTS", "PRESETS", "Material", "material"]
 
 ELEMENTS = ("linear", "quadratic")
 
+_SOFTEST, _HARDEST = 1e2, 1e12  # [Pa]: softer than any gel, harder than any solid
+
 
 @dataclasses.dataclass(frozen=True)
 class Material:
@@ -17,7 +19,7 @@ class Material:
 
     Attributes:
       law: "corotational", "svk", "neo_hookean" or "linear".
-      youngs_modulus: E [Pa].
+      youngs_modulus: E [Pa], from 100 Pa to 1 TPa.
       poissons_ratio: nu, inside (-1, 0.5).
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
@@ -62,9 +64,10 @@ class Material:
         for name in ("youngs_modulus", "poissons_ratio", "friction", "density", "stiffening"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
-        if self.youngs_modulus <= 0 or self.density <= 0:
+        if not (_SOFTEST <= self.youngs_modulus <= _HARDEST and self.density > 0):
             raise ValueError(
-                f"Young's modulus {self.youngs_modulus} Pa and density {self.density} kg/m^3 must be positive"
+                f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} and "
+                f"density {self.density:g} kg/m^3 positive"
             )
         if not -1 < self.poissons_ratio < 0.5:
             raise ValueError(
