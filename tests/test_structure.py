@@ -19,7 +19,7 @@ LAYERS = {
     "calm": "",
     "features": "",
     "sensor": "fields geometry threads calm",
-    "effects": "skin sensor geometry",
+    "effects": "skin sensor geometry fields files reading",
     "coupling": "skin sensor effects geometry fields learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor effects geometry learning.serve",

@@ -4,6 +4,7 @@ into `mujoco_warp.step`."""
 import pathlib
 import typing
 import warnings
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
+from ..effects.amended import Model, amend
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.materials import check_choices, read_thermal
@@ -115,7 +117,7 @@ def attach(
     m: "mjw.Model",
     d: "mjw.Data",
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: str | dict | None = None,
     liquid: bool | None = None,
     friction: float | None = None,
@@ -127,6 +129,7 @@ def attach(
     readings: bool | dict = True,
     sensor: str | dict | list | None = None,
     randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,
     options: dict | None = None,
@@ -148,9 +151,9 @@ def attach(
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
         dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
         `SensorBioTac(...).batch()` gives.
-      sensor, randomise, thermal, textures: as for `biotac_mj.attach`. Where something is drawn, every reset
-        of a world draws again, by its seed. sensor, thermal and textures may be lists of one for each world,
-        which resets leave as they are.
+      sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is drawn,
+        every reset of a world draws again, by its seed. sensor, thermal and textures may be lists of one for
+        each world, which resets leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
         elements}, as for `biotac_mj.attach`, of all worlds.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
@@ -166,6 +169,9 @@ def attach(
         raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
+    skin, material, options, sensor, friction = _with_effects(
+        Model(skin, material, options, sensor, friction), effects
+    )
     settings = dict(
         material=material,
         liquid=liquid,
@@ -198,7 +204,7 @@ def make(
     nworld: int,
     device: str | None = None,
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: str | dict | None = None,
     liquid: bool | None = None,
     friction: float | None = None,
@@ -209,6 +215,7 @@ def make(
     readings: bool | dict = True,
     sensor: str | dict | list | None = None,
     randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,
     options: dict | None = None,
@@ -222,12 +229,15 @@ def make(
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
       prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, sensor, randomise,
-      thermal, textures, options, worlds: as for `attach`.
+      thermal, effects, textures, options, worlds: as for `attach`.
 
     Raises:
       ValueError: see `attach`.
     """
     device = str(wp.get_device(device))
+    skin, material, options, sensor, friction = _with_effects(
+        Model(skin, material, options, sensor, friction), effects
+    )
     settings = dict(
         material=material,
         liquid=liquid,
@@ -243,6 +253,17 @@ def make(
     skin = skin_of(textures is not None)
     senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
     return PoseBatch(mjm, touching, skin, senses)
+
+
+def _with_effects(model, effects):
+    """The model's parts, with the effects in them."""
+    if effects is not None:
+        for name, value in (("material", model.material), ("sensor", model.sensor)):
+            if isinstance(value, (list, tuple)):
+                raise ValueError(f"{name} of each world beside effects: give one of them, or neither")
+        model = amend(model, effects)
+    skin = "default" if model.skin is None else model.skin
+    return skin, model.material, model.options, model.sensor, model.friction
 
 
 def _skins(mjm, prefix, skin, nworld, device, settings):

@@ -6,6 +6,7 @@ import importlib.util
 import pathlib
 import typing
 import weakref
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -115,7 +116,7 @@ def attach(
     pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
     quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: "str | dict | Material | None" = None,
     liquid: bool | None = None,
     coupling: str = "two-way",
@@ -125,6 +126,7 @@ def attach(
     textures: dict | None = None,
     sensor: str | dict | None = None,
     randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -144,7 +146,7 @@ def attach(
       site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds, so that a model may hold several.
-      skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
+      skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
       material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
       liquid, friction: None takes the material's choice.
@@ -156,6 +158,9 @@ def attach(
         seed), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for options["readings"].
       randomise: names of effects that are drawn by the seed ("dead", "crosstalk", "relax"), or {name: size};
         see `effects.sensors.RANDOM`. Short for options["readings"].
+      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
+        (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,
+        or [(Effect, theta)]; see `effects.amended`.
       thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
         dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {} makes all of
         plastic at 23 C, None leaves heat out.
@@ -171,8 +176,15 @@ def attach(
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
     _check_place(spec, site, body, prefix, pos, quat)
-    text, geometry = skin_reference(skin)
     from ..skin.settings import plain
+
+    if effects is not None:
+        from ..effects.amended import Model, amend
+
+        amended = amend(Model(skin, material, options, sensor, friction), effects)
+        skin, material, options = amended.skin, amended.material, amended.options
+        sensor, friction = amended.sensor, amended.friction
+    text, geometry = skin_reference("default" if skin is None else skin)
 
     material, options = plain(material), plain({} if options is None else options, geometry)
     own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..sensor.channels import NELECTRODE, PDC_REST
-from ..sensor.presets import PER_DEGREE, Sensor, read_sensor
+from ..sensor.presets import Sensor, read_sensor
 from .effect import Effect, Run
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
 from .skin_and_setup import Relaxation
 
-__all__ = ["RANDOM", "draw_effects", "read_randomise", "take_sensor", "with_effects"]
+__all__ = ["RANDOM", "RUNNING", "draw_effects", "read_randomise", "take_sensor", "with_effects"]
 
 RANDOM = {
     effect.id: effect
@@ -63,7 +63,7 @@ def _relaxation(sensor, effect, theta):
 
 
 def _warm_up(sensor, effect, theta):
-    return {"warm_up": -theta["a"] / PER_DEGREE, "warm_time": theta["tau"]}
+    return {"warm_up": -theta["a"] / sensor.per_degree, "warm_time": theta["tau"]}
 
 
 def _loss(sensor, effect, theta):
@@ -71,14 +71,46 @@ def _loss(sensor, effect, theta):
 
 
 def _drift(sensor, effect, theta):
-    return {"drift": sensor.drift + theta["rate"]}
+    return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + theta["rate"])}
 
 
-_BECOMES = {"relax": _relaxation, "warmup": _warm_up, "fluidloss": _loss, "drift": _drift}
+def _thermal(sensor, effect, theta):
+    return {"per_degree": theta["alpha"]} if theta["alpha"] else {}
+
+
+def _asperities(sensor, effect, theta):
+    return {"power": sensor.power * float(np.exp(theta["log_p"]))}
+
+
+def _saturation(sensor, effect, theta):
+    return {"saturation": (theta["strength"], theta["knee"])}
+
+
+def _lowpass(sensor, effect, theta):
+    return {"lowpass": sensor.lowpass + theta["tau"]}
+
+
+def _latency(sensor, effect, theta):
+    return {"latency": sensor.latency + theta["delay"]}
+
+
+_BECOMES = {
+    "relax": _relaxation,
+    "thermal": _thermal,
+    "warmup": _warm_up,
+    "fluidloss": _loss,
+    "asper": _asperities,
+    "saturate": _saturation,
+    "lowpass": _lowpass,
+    "latency": _latency,
+    "drift": _drift,
+}
+# ids of effects that act in the sensor itself; what relaxes is the rubber, of which a sensor alone knows PDC
+RUNNING = {*RANDOM, *_BECOMES} - {"relax"}
 
 
 def with_effects(sensor: Sensor, effects: list[tuple[Effect, dict]]) -> Sensor:
-    """The sensor with effects [(Effect, theta)] of RANDOM."""
+    """The sensor with effects [(Effect, theta)], of RUNNING or "relax"."""
     for effect, theta in effects:
         sensor = dataclasses.replace(sensor, **_BECOMES.get(effect.id, _counted)(sensor, effect, theta))
     return sensor

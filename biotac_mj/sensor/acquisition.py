@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from biotac_mj.calm import calm_warp
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE, NPAC
-from biotac_mj.sensor.presets import NNUMBER, NUMBERS, PER_DEGREE, SENSORS, Sensor
+from biotac_mj.sensor.presets import MOST_LATENCY, NNUMBER, NUMBERS, SENSORS, Sensor
 
 calm_warp()
 
@@ -50,7 +50,8 @@ SLOTS_PER_FRAME = 44
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
 # temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; PAC's
 # last noise; counts; when the reset was [s], the pressure and temperature that the last step was given, what
-# of the pressure PDC still remembers [Pa]; the sensor's own numbers, so that a reset may change them.
+# of the pressure PDC still remembers [Pa]; what the electrodes were; the
+# sensor's own numbers, so that a reset may change them.
 PRESSURE = NELECTRODE
 TEMPERATURE, IMPEDANCE_TIME, FILTER = PRESSURE + 1, PRESSURE + 2, PRESSURE + 3
 _HISS = FILTER + 3
@@ -59,14 +60,17 @@ HELD_PDC, HELD_TAC, HELD_TDC = HELD + NELECTRODE, HELD + NELECTRODE + 1, HELD + 
 PAC = HELD_TDC + 1  # the frame's slots
 _BEGAN = PAC + NPAC
 _GIVEN_PRESSURE, _GIVEN_TEMPERATURE, _LAG = _BEGAN + 1, _BEGAN + 2, _BEGAN + 3
-OWN = _BEGAN + 4
+_PAST = _BEGAN + 4  # of each electrode what a low-pass remembers, then the last frames
+_FRAMES = round(MOST_LATENCY * SLOT_RATE / SLOTS_PER_FRAME) + 2
+OWN = _PAST + (1 + _FRAMES) * NELECTRODE
 NSTATE = OWN + NNUMBER
 (
-    _SCALE, _BASE, _NOISE, _MIXING, _MIXED, _PDC_REST, _PDC_GAIN, _PDC_NOISE, _PAC_REST, _PAC_NOISE,
-    _PAC_COLOUR, _TDC_NOISE, _TAC_REST, _TAC_NOISE, _WARM_UP, _WARM_TIME, _RELAX_SHARE, _RELAX_TIME, _LOSS,
-    _DRIFT,
+    _SCALE, _BASE, _NOISE, _WARM_SHARE, _DRIFT, _MIXING, _MIXED, _PDC_REST, _PDC_GAIN, _PDC_NOISE, _PAC_REST,
+    _PAC_NOISE, _PAC_COLOUR, _TDC_NOISE, _TAC_REST, _TAC_NOISE, _WARM_UP, _WARM_TIME, _RELAX_SHARE,
+    _RELAX_TIME, _LOSS, _PER_DEGREE, _POWER, _SATURATED, _KNEE, _LOWPASS, _LATENCY,
 ) = (OWN + at for at in NUMBERS.values())  # fmt: skip
 _MOST_LOSS = 0.8  # of the liquid
+_PERIOD = SLOTS_PER_FRAME / SLOT_RATE  # [s] of a frame
 
 # [rad/s], manual. TAC is what passes 0.25 Hz upwards of the temperature: its rate, below 0.25 Hz. The manual
 # has 0.45 Hz as well; of recorded TACs that leaves 9.0 counts RMS unexplained, 0.25 Hz 7.0
@@ -199,15 +203,48 @@ def _warmed(state: wp.array2d(dtype=real), w: int, time: real):
 
 
 @wp.func
-def _electrode(
-    state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, fresh: int, share: real,
-    factor: real,
+def _warm_impedance(
+    state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, liquid: real,
+    warmed: real, left: real,
 ):  # fmt: skip
+    """Of an electrode where the liquid is warmer, and less is left of it [ohm]."""
+    warmer = liquid + state[w, _WARM_SHARE + e] * warmed
+    return impedance[w, e] * state[w, _SCALE + e] * wp.exp(-state[w, _PER_DEGREE] * warmer) / left
+
+
+@wp.func
+def _electrode(state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, share: real):
     """Counts without noise of an electrode, at a share of the way to the new impedance."""
     z = state[w, e]
     if fresh == 1:
-        z += (impedance[w, e] * state[w, _SCALE + e] * factor - z) * share
+        z += (new - z) * share
+    power = state[w, _POWER]
+    if power != real(1.0):
+        rest = real(channels.DIVIDER) * (real(channels.FULL_SCALE) / state[w, _BASE + e] - real(1.0))
+        z = rest * wp.pow(z / rest, power)
     return _impedance_counts(z)
+
+
+@wp.func
+def _late(state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts: real):
+    """Counts of an electrode after its low-pass and its latency: a frame is linear to the next."""
+    past = _PAST + e
+    tau = state[w, _LOWPASS]
+    value = counts
+    if tau > real(0.0):
+        keep = wp.exp(real(-_PERIOD) / tau)
+        value = keep * state[w, past] + (real(1.0) - keep) * counts
+        state[w, past] = value
+    behind = state[w, _LATENCY] / real(_PERIOD)
+    if behind > real(0.0):
+        frame = wp.int32(slot / _FRAME) % _FRAMES + _FRAMES
+        state[w, past + (1 + frame % _FRAMES) * NELECTRODE] = value
+        whole = wp.int32(behind)
+        part = behind - real(whole)
+        newer = state[w, past + (1 + (frame - whole) % _FRAMES) * NELECTRODE]
+        older = state[w, past + (1 + (frame - whole - 1) % _FRAMES) * NELECTRODE]
+        value = newer + part * (older - newer)
+    return value
 
 
 @wp.kernel
@@ -244,7 +281,6 @@ def sample_slots(
     heating = (temperature[w] + warmed - warm) / dt
     age = wp.max(now + dt - state[w, _BEGAN], real(0.0))
     left = wp.max(real(1.0) - state[w, _LOSS] * age / real(3600.0), real(1.0 - _MOST_LOSS))
-    factor = wp.exp(real(-PER_DEGREE) * (liquid[w] + warmed)) / left
     low = state[w, FILTER]
     high = state[w, FILTER + 1]
     tac = state[w, FILTER + 2]
@@ -265,16 +301,21 @@ def sample_slots(
             address = HELD + channel
             if channel < NELECTRODE:
                 share = real(1.0) - (dt - since) / span
-                value = _electrode(state, impedance, w, channel, fresh, share, factor)
+                new = _warm_impedance(state, impedance, w, channel, liquid[w], warmed, left)
+                value = _electrode(state, w, channel, fresh, new, share)
+                base = state[w, _BASE + channel]
+                change = value - base
                 if state[w, _MIXED] != real(0.0):
                     change = real(0.0)
                     row = _MIXING + channel * NELECTRODE
                     for e in range(NELECTRODE):
                         if state[w, row + e] != real(0.0):
-                            other = _electrode(state, impedance, w, e, fresh, share, factor)
+                            new = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
+                            other = _electrode(state, w, e, fresh, new, share)
                             change += state[w, row + e] * (other - state[w, _BASE + e])
-                    value = state[w, _BASE + channel] + change
-                value += state[w, _DRIFT] * wp.max(now + since - state[w, _BEGAN], real(0.0))
+                over = wp.max(wp.abs(change) - state[w, _KNEE], real(0.0)) * state[w, _SATURATED]
+                value = _late(state, w, channel, slot, base + change - wp.sign(change) * over)
+                value += state[w, _DRIFT + channel] * wp.max(now + since - state[w, _BEGAN], real(0.0))
                 deviation = state[w, _NOISE + channel] * _electrode_noise(value)
             elif address == HELD_PDC:
                 change = _pressure_counts(fast) - real(channels.PDC_REST)
@@ -306,7 +347,7 @@ def sample_slots(
     state[w, _LAG] = lag
     if fresh == 1:
         for e in range(NELECTRODE):
-            state[w, e] = impedance[w, e] * state[w, _SCALE + e] * factor
+            state[w, e] = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
         state[w, IMPEDANCE_TIME] = now + dt
     time[w] = now + dt
 
@@ -407,16 +448,20 @@ class Acquisition:
         self._check_state(state)
         temperature = self.sensor.temperature if temperature is None else temperature
         state[OWN:], state[_BEGAN] = self._own, time
-        z = self._check_impedance(impedance) * state[_SCALE:_BASE] * math.exp(-PER_DEGREE * liquid)
+        z = self._check_impedance(impedance) * state[_SCALE:_BASE] * math.exp(-state[_PER_DEGREE] * liquid)
         state[:NELECTRODE] = z
         state[PRESSURE], state[TEMPERATURE] = self._check_scalars(pressure, temperature)
         state[_GIVEN_PRESSURE:_LAG] = pressure, temperature
         state[_LAG] = 0.0
         state[IMPEDANCE_TIME] = time
         state[FILTER:HELD] = pressure, pressure, 0.0, 0.0
-        change = channels.counts_from_impedance(z) - state[_BASE:_NOISE]
-        mixing = state[_MIXING:_MIXED].reshape(NELECTRODE, NELECTRODE)
-        state[HELD:HELD_PDC] = state[_BASE:_NOISE] + mixing @ change
+        base = state[_BASE:_NOISE]
+        rest = channels.impedance_from_counts(base)
+        change = channels.counts_from_impedance(rest * (z / rest) ** state[_POWER]) - base
+        change = state[_MIXING:_MIXED].reshape(NELECTRODE, NELECTRODE) @ change
+        change -= np.sign(change) * state[_SATURATED] * np.maximum(np.abs(change) - state[_KNEE], 0.0)
+        state[HELD:HELD_PDC] = base + change
+        state[_PAST:OWN] = np.tile(base + change, 1 + _FRAMES)
         change = channels.counts_from_pressure(pressure) - channels.PDC_REST
         state[HELD_PDC] = state[_PDC_REST] + state[_PDC_GAIN] * change
         state[HELD_TAC] = state[_TAC_REST]

@@ -57,7 +57,7 @@ FULL_SCALE = 4095.0
 # average in two
 REST_TEMPERATURE = 48.4
 
-_DIVIDER = 10e3  # [ohm]
+DIVIDER = 10e3  # [ohm]
 _PDC_GAIN = 36.5  # [Pa] per count
 # CHOSEN: the manual gives no offset. Leaves 76 kPa above rest; the offset of a real sensor depends on its
 # filling
@@ -92,13 +92,13 @@ REST_COUNTS = {
 def counts_from_impedance(impedance: ArrayLike) -> np.ndarray:
     """Electrode counts E = 4095 / (Z / 10 kohm + 1). impedance [ohm], any shape; more liquid, lower Z, higher
     E."""
-    return np.float64(FULL_SCALE) / (impedance / np.float64(_DIVIDER) + np.float64(1.0))
+    return np.float64(FULL_SCALE) / (impedance / np.float64(DIVIDER) + np.float64(1.0))
 
 
 def impedance_from_counts(counts: ArrayLike) -> np.ndarray:
     """Z = (4095 / E - 1) * 10 kohm [ohm]; infinite at E = 0."""
     with np.errstate(divide="ignore"):
-        return (FULL_SCALE / np.asarray(counts, dtype=float) - 1) * _DIVIDER
+        return (FULL_SCALE / np.asarray(counts, dtype=float) - 1) * DIVIDER
 
 
 def log_impedance(counts: ArrayLike) -> np.ndarray:

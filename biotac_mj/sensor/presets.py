@@ -31,6 +31,7 @@ from biotac_mj.sensor.channels import (
 
 __all__ = [
     "MEASURED",
+    "MOST_LATENCY",
     "NAMES",
     "NNUMBER",
     "NUMBERS",
@@ -43,6 +44,7 @@ __all__ = [
 
 # [1/C] of ln Z: all electrodes answer the liquid's temperature by -6.4 to -7.8 % per degree in five sensors
 PER_DEGREE = 0.071
+MOST_LATENCY = 0.11  # [s] eleven frames
 _EYE = tuple(map(tuple, np.eye(NELECTRODE).tolist()))
 # Scatter of an electrode's gain: 3 to 15 % (`effects.sensing.Gain`); no recording has the state beside it.
 _GAIN = 0.1
@@ -59,10 +61,15 @@ class Sensor:
       pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
       pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
       tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
+      per_degree: by how much ln Z falls when the liquid is warmer [1/C].
       warm_up: how much warmer it gets after the reset [C], all electrodes with it; warm_time: of the
-        exponential [s]. A sensor with heat has its own time.
+        exponential [s]; warm_share: (19,) of it that each electrode takes, () is all. A sensor with heat has
+        its own time.
       relaxation: share and time [s] by which PDC answers pressure too much and comes back.
-      loss: of the liquid [1/h]; drift: of all electrodes [counts/s].
+      loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (19,).
+      power: of the change of ln Z from rest. saturation: share and knee [counts]: of a change beyond the
+        knee that share is lost. lowpass: time constant of the electrodes [s]. latency: theirs [s], to
+        MOST_LATENCY.
 
     Raises:
       ValueError: a number that cannot be.
@@ -85,13 +92,20 @@ class Sensor:
     warm_time: float = 205.0
     relaxation: tuple = (0.0, 1.0)
     loss: float = 0.0
-    drift: float = 0.0
+    drift: float | tuple = 0.0
+    per_degree: float = PER_DEGREE
+    warm_share: tuple = ()
+    power: float = 1.0
+    saturation: tuple = (0.0, 1.0)
+    lowpass: float = 0.0
+    latency: float = 0.0
 
     def __post_init__(self):
-        shapes = {"rest": (19,), "noise": (19,), "mixing": (19, 19), "relaxation": (2,)}
+        shapes = {"rest": (19,), "noise": (19,), "mixing": (19, 19), "relaxation": (2,), "saturation": (2,)}
+        shapes |= {"warm_share": (19,), "drift": np.shape(self.drift) and (19,)}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is None or (field.name == "mixing" and not len(value)):
+            if value is None or (field.name in ("mixing", "warm_share") and not len(value)):
                 continue
             try:
                 number = np.asarray(value, float)
@@ -118,6 +132,14 @@ class Sensor:
             raise ValueError("rest counts of a sensor lie between 0 and 4095, pac_colour between 0 and 1")
         if min(least) < 0 or min(self.warm_time, self.relaxation[1]) <= 0:
             raise ValueError("noise and loss of a sensor are not negative, and its times are positive [s]")
+        share, knee = self.saturation
+        if self.per_degree == 0 or min(self.power, knee) <= 0 or not 0 <= share <= 1:
+            raise ValueError(
+                "per_degree of a sensor is not zero, its power is positive, its saturation a share up to 1 "
+                "beyond a positive knee"
+            )
+        if not (self.lowpass >= 0 and 0 <= self.latency <= MOST_LATENCY):
+            raise ValueError(f"lowpass of a sensor is not negative, latency from 0 to {MOST_LATENCY} s")
 
     @property
     def temperature(self) -> float:
@@ -151,6 +173,10 @@ class Sensor:
             "noise": self._noise_factor(),
             "mixing": self.mixing or _EYE,
             "mixed": float(bool(self.mixing)),
+            "warm_share": self.warm_share or np.ones(NELECTRODE),
+            "drift": np.full(NELECTRODE, self.drift),
+            "saturated": self.saturation[0],
+            "knee": self.saturation[1],
             "relax_share": self.relaxation[0],
             "relax_time": self.relaxation[1],
         }
@@ -159,10 +185,12 @@ class Sensor:
         return np.concatenate([np.ravel(values.get(name, getattr(self, name, 0))) for name in NUMBERS])
 
 
-_WIDE = {"scale": NELECTRODE, "base": NELECTRODE, "noise": NELECTRODE, "mixing": NELECTRODE**2}
+_WIDE = dict.fromkeys(("scale", "base", "noise", "warm_share", "drift"), NELECTRODE)
+_WIDE["mixing"] = NELECTRODE**2
 _ORDER = (
-    *_WIDE, "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise", "pac_colour", "tdc_noise",
-    "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_share", "relax_time", "loss", "drift",
+    *_WIDE, "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise", "pac_colour",
+    "tdc_noise", "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_share", "relax_time", "loss",
+    "per_degree", "power", "saturated", "knee", "lowpass", "latency",
 )  # fmt: skip
 _ENDS = np.cumsum([_WIDE.get(name, 1) for name in _ORDER]).tolist()
 NUMBERS = dict(zip(_ORDER, [0, *_ENDS], strict=False))  # name -> where it begins
