@@ -195,7 +195,9 @@ class Sense:
         return self.cells.get(path)
 
 
-_NO_MODES = {"quick set": Refused("the condensed tier know no vibration", "its contacts are not kept there")}
+_NO_MODES = {
+    "quick set": Refused("sets of the condensed tier know no vibration", "its contacts are not kept there")
+}
 
 SENSES = (
     Sense("presets of real sensors", '`sensor="epfl_f2"`', {"sensor": "epfl_f2"}, "electrodes", 30),
