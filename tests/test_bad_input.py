@@ -566,7 +566,7 @@ def settings():
         ('{"modulus":3}', "modulus is 3: pass a positive factor"),
         ('{"readings":{"nose":true}}', "options['readings'] has 'nose': did you mean 'noise'?"),
         ('{"readings":{"noise":3}}', "noise of options['readings'] is 3: pass true or false"),
-        ('{"readings":{"sensor":1}}', "sensor of options['readings'] is 1: pass a text"),
+        ('{"readings":{"sensor":1}}', "sensor of options['readings'] is 1: pass a text or a dict"),
         ('{"effects":[]}', "options has 'effects'"),
         ("[1]", "no options at [1]"),
         ("nowhere.json", "no options at nowhere.json"),

@@ -28,7 +28,7 @@ LAYERS = {
     "data": "geometry skin sensor effects fields files reading versions press.approach press.indenter "
     "press.path",
     "tasks": "coupling plugin sensor effects geometry files reading data.objects view.offscreen",
-    "view": "coupling plugin skin sensor effects geometry files reading tasks press.approach press.scene",
+    "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments data sensor effects geometry fields files reading",
     "discrepancy": "effects data skin sensor geometry fields files reading",
     "biotac_mj": "plugin",

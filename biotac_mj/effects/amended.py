@@ -20,7 +20,7 @@ from .in_skin import memory_of
 from .sensor_file import SensorFile, read_sensor_file
 from .sensors import RUNNING, with_effects
 
-__all__ = ["Effects", "Model", "amend", "take_effects"]
+__all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
 
 Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as `attach` takes them
 
@@ -80,8 +80,11 @@ def amend(model: Model, effects: Effects) -> Model:
     friction, bulk, of_sensor, of_rubber = model.friction, 0.0, [], []
     for effect, theta in sorted(file.effects, key=lambda pair: _ORDER.get(pair[0].id, len(_ORDER))):
         if effect.id == "friction":
-            mu = material.friction if friction is None else np.asarray(friction, float)
-            friction = mu * float(np.exp(theta["log_mu"]))
+            more = float(np.exp(theta["log_mu"]))
+            if friction is None:
+                material = dataclasses.replace(material, friction=more * material.friction)
+            else:
+                friction = more * np.asarray(friction, float)
         elif effect.id == "bubble":
             bulk += theta["volume"] / (_AIR * _liquid(skin_reference(skin)[1]))
         elif effect.stage in "SB" or effect.id == "force_cross" or theta.get("delay", 0.0) < 0:
@@ -102,6 +105,21 @@ def amend(model: Model, effects: Effects) -> Model:
     if inside.model:
         options["modulus"] = _modulus(options.get("modulus"), inside.model["modulus"], skin)
     return Model(skin, material, options, _plain_sensor(with_effects(sensor, of_sensor)), friction)
+
+
+def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
+    """Settings of a dataclass, such as PressOptions, with effects in them; what is as `kind` has it by
+    default is left to the effects' file.
+
+    Raises:
+      FileNotFoundError, ValueError: see `amend`.
+    """
+    default = {f.name: f.default for f in dataclasses.fields(kind)}
+    names = [f.name for f in dataclasses.fields(Model) if f.name in default]
+    said = {name: None if given.get(name) == default[name] else given.get(name) for name in names}
+    said["options"] = read_dict(said["options"], "options")
+    out = amend(Model(**{f.name: said.get(f.name) for f in dataclasses.fields(Model)}), effects)
+    return {**given, **{name: plain(getattr(out, name)) for name in names}}
 
 
 def _joined(material, new):
