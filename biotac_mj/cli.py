@@ -113,6 +113,11 @@ def _add_sensor(verb, touched):
         metavar="EFFECT",
         help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
     )
+    verb.add_argument(
+        "--effects",
+        metavar="FILE.yaml",
+        help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
+    )
     for name, example in (("thermal", "steel"), ("texture", "cork")):
         verb.add_argument(
             f"--{name}",
@@ -231,7 +236,7 @@ def _press(args):
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
-    options = PressOptions(
+    settings = dict(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
@@ -252,6 +257,11 @@ def _press(args):
         options=args.options,
         **_of_sensor(args),
     )
+    if args.effects:
+        from .effects.amended import amend_settings
+
+        settings = amend_settings(settings, PressOptions, args.effects)
+    options = PressOptions(**settings)
     _check_device(args)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)

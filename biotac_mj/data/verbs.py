@@ -7,9 +7,10 @@ __all__ = ["export_verb", "generate_verb", "import_verb"]
 
 def generate_verb(args: argparse.Namespace) -> None:
     """`biotac generate`; raises ValueError or FileNotFoundError for what cannot be."""
+    from ..effects.amended import amend_settings
     from .generate import GenerateOptions, generate
 
-    options = GenerateOptions(
+    settings = dict(
         count=args.count,
         labelled=min(359, args.count) if args.labelled is None else args.labelled,
         recordings=args.recordings,
@@ -34,6 +35,9 @@ def generate_verb(args: argparse.Namespace) -> None:
         randomise=tuple(args.randomise),
         **{name: _one_or_many(getattr(args, name)) for name in ("thermal", "texture")},
     )
+    if args.effects:
+        settings = amend_settings(settings, GenerateOptions, args.effects)
+    options = GenerateOptions(**settings)
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
     print(

@@ -105,7 +105,10 @@ class Sensor:
         shapes |= {"warm_share": (19,), "drift": np.shape(self.drift) and (19,)}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is None or (field.name in ("mixing", "warm_share") and not len(value)):
+            if value is None:
+                continue
+            if field.name in ("mixing", "warm_share") and not len(value):
+                object.__setattr__(self, field.name, ())
                 continue
             try:
                 number = np.asarray(value, float)
