@@ -102,14 +102,12 @@ def _add_sensor(verb, touched):
     verb.add_argument(
         "--sensor",
         type=_choice,
-        default="1",
         metavar="NAME",
-        help="which sensor: 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, or JSON",
+        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random or JSON",
     )
     verb.add_argument(
         "--randomise",
         nargs="+",
-        default=(),
         metavar="EFFECT",
         help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
     )

@@ -173,3 +173,20 @@ def test_what_cannot_be_is_refused():
     ):
         with pytest.raises(ValueError, match=text):
             make(press_spec(), 2, coupling="one-way", **settings)
+
+
+def test_worlds_that_are_told_poses_feel_the_same():
+    """`batch.make`, which gets poses, against `batch.attach` in mujoco_warp's own step."""
+    felt = {"sensor": "phac_f0", "readings": {"noise": False}, "seed": 4, **FELT}
+    mjm, m, d, _ = make(press_spec(), 1, coupling="one-way", **felt)
+    spec = press_spec()
+    biotac_mj.batch.add(spec, body="world", skin=shell(), coupling="one-way")
+    told = biotac_mj.batch.make(spec.compile(), 1, str(d.qpos.device), skin=shell(), **felt)
+    for i in range(45):
+        drive(m, d, 1, i)
+        told.step(d.xpos, d.xmat, d.xipos)
+    expected = {channel: read(mjm, d, channel) for channel in ("electrodes", "pdc", "pac", "tac", "tdc")}
+    for channel, there in expected.items():
+        mine = told.readings()[channel].numpy()
+        assert np.abs(mine - there).max() <= 1 + 0.02 * np.ptp(there), channel
+    assert np.abs(expected["tac"] - SENSORS["phac_f0"].tac_rest).max() > 2

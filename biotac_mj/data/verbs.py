@@ -31,8 +31,8 @@ def generate_verb(args: argparse.Namespace) -> None:
         device=args.device,
         options=args.options,
         vary=args.vary,
-        sensor=args.sensor,
-        randomise=tuple(args.randomise),
+        sensor="1" if args.sensor is None else args.sensor,
+        randomise=tuple(args.randomise or ()),
         **{name: _one_or_many(getattr(args, name)) for name in ("thermal", "texture")},
     )
     if args.effects:

@@ -64,8 +64,8 @@ class PressOptions:
     two_way: bool = False
     friction: float | None = None
     seed: int = 0
-    sensor: str | dict = "1"
-    randomise: tuple | dict = ()
+    sensor: str | dict | None = None
+    randomise: tuple | dict | None = None
     thermal: str | dict | tuple | None = None
     texture: str | dict | tuple | None = None
     device: str = "cpu"
