@@ -223,6 +223,9 @@ SENSES = (
 )  # fmt: skip
 
 _READINGS = (
+    ("effects that measured data showed (`biotac diagnose`)", "`effects=` a sensor file, or a list",
+     "attach, condensed (those of the rubber and the contact's law: full), batch, tasks; press and generate: "
+     "`--effects`. Effects of the set-up are left out by name"),
     ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate and its LeRobot export; "
      "`readings.csv` of a press has the latest, of the synthetic measured sensor too"),
