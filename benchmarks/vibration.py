@@ -60,19 +60,25 @@ def _open(path):
 # --- floor ---
 
 
-def read_log(path: pathlib.Path) -> np.ndarray:
-    """PAC blocks (n, 88) [counts] of a native log: rows of time, batch, frame, channel, ..., count, flag."""
-    time_, value = [], []
+def read_rows(path: pathlib.Path) -> np.ndarray:
+    """(n, 3) time [s], channel and count of a native log: rows of time, batch, frame, channel, ..., count,
+    flag."""
+    rows = []
     with _open(path) as file:
         for line in file:
             if line.startswith("Begin"):
                 break
         for line in file:
             row = line.split()
-            if len(row) == 10 and row[3] == "0":
-                time_.append(float(row[0]))
-                value.append(float(row[8]))
-    time_, value = np.array(time_), np.array(value)
+            if len(row) == 10:
+                rows.append((float(row[0]), float(row[3]), float(row[8])))
+    return np.array(rows)
+
+
+def read_log(path: pathlib.Path) -> np.ndarray:
+    """PAC blocks (n, 88) [counts] of a native log."""
+    rows = read_rows(path)
+    time_, value = rows[rows[:, 1] == 0][:, [0, 2]].T
     starts = np.concatenate([[0], np.flatnonzero(np.diff(time_) > 1.2 / RATE) + 1, [len(time_)]])
     blocks = [
         value[a : a + (b - a) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)

@@ -99,6 +99,53 @@ def _add_skin(verb, seed="of the sensor's noise"):
     _add_options(verb)
 
 
+def _add_sensor(verb, touched):
+    verb.add_argument(
+        "--sensor",
+        type=_choice,
+        metavar="NAME",
+        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random or JSON",
+    )
+    verb.add_argument(
+        "--randomise",
+        nargs="+",
+        metavar="EFFECT",
+        help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
+    )
+    verb.add_argument(
+        "--effects",
+        metavar="FILE.yaml",
+        help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
+    )
+    for name, example in (("thermal", "steel"), ("texture", "cork")):
+        verb.add_argument(
+            f"--{name}",
+            nargs="+",
+            type=_choice,
+            metavar="MATERIAL",
+            help=f"of what {touched}, as in {example}, or JSON; of several one is drawn (default: left out)",
+        )
+
+
+def _choice(text):
+    """A name, or JSON of a dict."""
+    import json
+
+    if not text.startswith("{"):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON ({error})") from error
+
+
+def _of_sensor(args):
+    """Settings of a press or a set from the arguments of `_add_sensor`."""
+    one = {name: getattr(args, name) for name in ("thermal", "texture")}
+    one = {name: v[0] if v and len(v) == 1 else v for name, v in one.items()}  # of several one is drawn
+    return {"sensor": args.sensor, "randomise": args.randomise, **one}
+
+
 def _add_options(verb, name="--options", of="the skin"):
     verb.add_argument(
         name,
@@ -165,6 +212,7 @@ def _add_press(verbs):
         help="friction between skin and indenter (default: the material's)",
     )
     _add_skin(verb)
+    _add_sensor(verb, "the indenter is")
     files = output_folder("readings.csv", "skin.h5", "press.png")
     verb.add_argument("--out", type=files, default="out/press", metavar="DIR", help="folder of the results")
     verb.add_argument(
@@ -187,7 +235,7 @@ def _press(args):
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
-    options = PressOptions(
+    settings = dict(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
@@ -206,7 +254,13 @@ def _press(args):
         seed=args.seed,
         device=args.device,
         options=args.options,
+        **_of_sensor(args),
     )
+    if args.effects:
+        from .effects.amended import amend_settings
+
+        settings = amend_settings(settings, PressOptions, args.effects)
+    options = PressOptions(**settings)
     _check_device(args)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
@@ -549,6 +603,7 @@ def _add_generate(verbs):
         '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
     )
     _add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
+    _add_sensor(verb, "the objects are")
     verb.add_argument(
         "--out",
         type=output_folder("generate.json"),

@@ -1,12 +1,22 @@
-"""What the skin can do, and by which path: one table, of which `docs/features.md` is made and which
-`tests/test_features.py` walks.
+"""What skin and sensor can do, and by which path: two tables, of which `docs/features.md` is made and which
+`tests/test_features.py` and `tests/test_features_senses.py` walk.
 
     python -m biotac_mj.features > docs/features.md
 """
 
 import dataclasses
 
-__all__ = ["FEATURES", "PATHS", "Absent", "Feature", "Refused", "markdown"]
+__all__ = [
+    "FEATURES",
+    "PATHS",
+    "SENSES",
+    "SENSE_PATHS",
+    "Absent",
+    "Feature",
+    "Refused",
+    "Sense",
+    "markdown",
+]
 
 # name of a path -> what it is
 PATHS = {
@@ -20,6 +30,18 @@ PATHS = {
     "compare": "`calibration.comparison.evaluate`, `biotac compare`",
     "generate": '`biotac generate`, tier "full"',
     "diagnose": '`discrepancy`\'s Simulator, `biotac diagnose`, tier "full"',
+}
+
+
+# the same for the sensor
+SENSE_PATHS = {
+    "attach": '`biotac_mj.attach`, tier "full"',
+    "condensed": '`biotac_mj.attach`, tier "condensed" (tasks use it)',
+    "batch": "`batch.attach` and `batch.make`",
+    "tasks": "the suite and Gymnasium, `biotac=` settings of the Entity",
+    "press": "`biotac press`",
+    "generate": '`biotac generate`, tier "full"',
+    "quick set": '`biotac generate`, tier "condensed"',
 }
 
 
@@ -149,19 +171,70 @@ FEATURES = (
                 "cannot vary 'modulus'", "an interval says nothing of a map; vary youngs_modulus"))),
 )  # fmt: skip
 
+
+@dataclasses.dataclass(frozen=True)
+class Sense:
+    """A row of the table of the sensor: settings without which a channel reads otherwise.
+
+    Attributes:
+      name: in the table; where: what sets it.
+      settings: of `attach`; geoms are named "touched" here.
+      channel: that changes, by `least` counts at least in a press that slides.
+      cells: path -> Refused; all others do it.
+    """
+
+    name: str
+    where: str
+    settings: dict
+    channel: str
+    least: float
+    cells: dict = dataclasses.field(default_factory=dict)
+
+    def cell(self, path: str) -> Refused | None:
+        """What a path has of it; None: it does it."""
+        return self.cells.get(path)
+
+
+_NO_MODES = {
+    "quick set": Refused("sets of the condensed tier know no vibration", "its contacts are not kept there")
+}
+
+SENSES = (
+    Sense("presets of real sensors", '`sensor="epfl_f2"`', {"sensor": "epfl_f2"}, "electrodes", 30),
+    Sense("random sensors", '`sensor="random"`', {"sensor": "random"}, "electrodes", 30),
+    Sense("gains of single electrodes", '`randomise=["gain"]`', {"randomise": {"gain": 5.0}},
+          "electrodes", 5),
+    Sense("dead taxels", '`randomise=["dead"]`', {"randomise": {"dead": 40.0}}, "electrodes", 5),
+    Sense("cross-talk", '`randomise=["crosstalk"]`', {"randomise": {"crosstalk": 6.0}},
+          "electrodes", 5),
+    Sense("gain of PDC", '`randomise=["pdc_gain"]`', {"randomise": {"pdc_gain": 40.0}}, "pdc", 3),
+    Sense("relaxation, felt by PDC", '`randomise=["relax"]`', {"randomise": {"relax": 70.0}},
+          "pdc", 1),
+    Sense("warm-up", '`randomise=["warmup"]`', {"randomise": {"warmup": 1e3}}, "electrodes", 0.5),
+    Sense("loss of liquid", '`randomise=["fluidloss"]`', {"randomise": {"fluidloss": 1e3}},
+          "electrodes", 0.5),
+    Sense("drift of counts", '`randomise=["drift"]`', {"randomise": {"drift": 40.0}},
+          "electrodes", 5),
+    Sense("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
+          {"thermal": {"touched": "steel at -20000"}}, "tac", 3),
+    Sense("vibration: PAC by texture, slip and taps", "`textures=` (press, generate: `texture`)",
+          {"textures": {"touched": {"roughness": 5e-5}}}, "pac", 10,
+          cells=_NO_MODES),
+)  # fmt: skip
+
 _READINGS = (
-    ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, generate"),
-    ("PAC", "22 values a frame", "attach, condensed, batch; `generate` keeps the latest of them"),
+    ("effects that measured data showed (`biotac diagnose`)", "`effects=` a sensor file, or a list",
+     "attach, condensed (those of the rubber and the contact's law: full), batch, tasks; press and generate: "
+     "`--effects`. Effects of the set-up are left out by name"),
+    ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
+    ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate and its LeRobot export; "
+     "`readings.csv` of a press has the latest, of the synthetic measured sensor too"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
     ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
     ("status (tier, steps lost, rounds, share of the way, push withheld)", "yes",
      "attach, condensed, batch; `converged` in generate"),
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
-    ("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
-     "attach, condensed; batch, generate, tasks, diagnose leave it out: TDC and TAC rest"),
-    ("vibration: PAC by texture, slip and taps", "`textures=`",
-     "attach, condensed; batch has PAC's coloured noise alone, generate, tasks and diagnose leave it out"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
      "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
      "materials, contact laws and fill"),
@@ -187,7 +260,7 @@ parameters."""
 def markdown() -> str:
     """`docs/features.md`."""
     lines = [
-        "# What the skin can do, by path",
+        "# What skin and sensor can do, by path",
         "",
         "Made by `python -m biotac_mj.features > docs/features.md` from the table in "
         "`biotac_mj/features.py`. "
@@ -216,6 +289,26 @@ def markdown() -> str:
     lines += [f"{i + 1}. `{one.match}`: {one.why}." for i, one in enumerate(notes)]
     lines += ["", "Nothing to ask for:"]
     lines += [f"- ({'abcdefgh'[i]}) {one.why}." for i, one in enumerate(absent)]
+    lines += ["", "## The sensor", ""]
+    lines.append("`tests/test_features_senses.py` walks this table: a press that slides must read otherwise.")
+    lines += ["", *(f"- **{path}**: {text}" for path, text in SENSE_PATHS.items())]
+    lines += ["", f"| sense | set by | {' | '.join(SENSE_PATHS)} |"]
+    lines.append(f"|---|---|{'---|' * len(SENSE_PATHS)}")
+    refused = []
+    for sense in SENSES:
+        cells = []
+        for path in SENSE_PATHS:
+            cell = sense.cell(path)
+            if cell is not None and cell not in refused:
+                refused.append(cell)
+            cells.append("yes" if cell is None else f"no ({refused.index(cell) + 1})")
+        lines.append(f"| {sense.name} | {sense.where} | {' | '.join(cells)} |")
+    lines += ["", *(f"{i + 1}. `{one.match}`: {one.why}." for i, one in enumerate(refused))]
+    lines += [
+        "",
+        "`diagnose` fits the same classes of effects (`biotac_mj/effects`) to data, and leaves heat and",
+    ]
+    lines.append("vibration out; calibrate and compare have no sensor.")
     lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _READINGS]
     lines += ["", "## How options travel", ""]

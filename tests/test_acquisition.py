@@ -6,6 +6,7 @@ import pytest
 
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+from biotac_mj.sensor.presets import Sensor
 
 REST = channels.impedance_from_counts(channels.REST_COUNTS["1"])
 
@@ -160,7 +161,7 @@ def test_noise_is_that_of_numpys_philox(seed):
         expected = np.rint(electrode + channels.electrode_noise(electrode) * normal[1:38:2])
         readings = acquisition.readings(state)
         assert np.array_equal(readings["electrodes"], expected)
-        assert readings["pdc"] == np.rint(2000 + normal[39])
+        assert readings["pdc"] == np.rint(2000 + Sensor().pdc_noise * normal[39])
         coloured = []
         for white in channels.PAC_NOISE * normal[::2]:
             # the first slot of all came before the first step

@@ -547,6 +547,18 @@ def settings():
         given = f'{{"skin":{{"contact_law":{{"{field.name}":"a"}}}}}}'
         yield Row(f"{OPTIONS} {given}", f"{field.name} is 'a': pass a number")
     for given, said in (
+        ("--sensor f9", "sensor is 'f9': pass one of '1'"),
+        ('--sensor {"rest":[1]}', "rest of a sensor is [1]: give (19,), finite"),
+        ('--sensor {"colour":1}', "a sensor has no 'colour': choose from like, rest"),
+        ("--sensor {rest", "is no JSON"),
+        ("--randomise gremlins", "cannot randomise 'gremlins': choose from gain, dead"),
+        ("--thermal mithril", "no material is known by 'mithril'"),
+        ("--thermal steel mithril", "no material is known by 'mithril'"),
+        ('--texture {"height":1}', "give a material, pitch and height, or roughness"),
+    ):
+        yield Row(f"press --quiet --skin coarse {given}", said)
+        yield Row(f"generate --quiet --count 1 --labelled 0 {given}", said)
+    for given, said in (
         ('{"skn":{}}', "options has 'skn': did you mean 'skin'?"),
         ('{"skin":{"sample":3}}', "options['skin'] has 'sample': did you mean 'samples'?"),
         ('{"skin":3}', "options['skin'] is int: pass a dict"),
@@ -563,7 +575,7 @@ def settings():
         ('{"modulus":3}', "modulus is 3: pass a positive factor"),
         ('{"readings":{"nose":true}}', "options['readings'] has 'nose': did you mean 'noise'?"),
         ('{"readings":{"noise":3}}', "noise of options['readings'] is 3: pass true or false"),
-        ('{"readings":{"sensor":1}}', "sensor of options['readings'] is 1: pass a text"),
+        ('{"readings":{"sensor":1}}', "sensor of options['readings'] is 1: pass a text or a dict"),
         ('{"effects":[]}', "options has 'effects'"),
         ("[1]", "no options at [1]"),
         ("nowhere.json", "no options at nowhere.json"),

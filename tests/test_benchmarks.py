@@ -307,3 +307,31 @@ def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatc
     assert asked == [1]
     assert both["steps"] == first["steps"] + 14 and both["stuck"] == 2 and both["presses"] == 4
     assert json.loads((tmp_path / "out.json").read_text()) == both
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
+    """Synthetic: three minutes of a sensor that warms up, with and without force on it."""
+    from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
+    from biotac_mj.sensor.presets import PER_DEGREE, SENSORS
+
+    rng, n, rate = np.random.default_rng(0), 21000, 118.0
+    rest, time = np.array(SENSORS["epfl_f2"].rest), np.arange(21000) / 118.0
+    force = np.stack([0.2 * np.sin(time), 0.1 * np.cos(time), -3 + 2.9 * np.cos(2 * time)], 1)
+    log_z = log_impedance(rest) - PER_DEGREE * 4.0 * (1 - np.exp(-time / 90.0))[:, None]
+    if loaded:
+        slope = 0.05 * np.sin(np.arange(19))
+        log_z = log_z - slope * force[:, 2:] + 0.3 * slope * force[:, :1]
+        np.savetxt(tmp_path / "force.txt", force)
+    noise = np.linspace(1, 6, 19)
+    counts = np.rint(counts_from_log_impedance(log_z) + noise * rng.normal(size=(n, 19)))
+    np.savetxt(tmp_path / "electrodes.txt", counts, "%d")
+    more = ["--force", tmp_path / "force.txt"] if loaded else []
+    out = tmp_path / "out.json"
+    done = _run(repo, "sensor_presets.py", tmp_path / "electrodes.txt", "--rate", rate, "--json", out, *more)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())["electrodes.txt"]
+    np.testing.assert_allclose(found["rest"], rest, atol=20 if loaded else 4)
+    np.testing.assert_allclose(found["noise"], noise, rtol=0.1, atol=0.1)
+    assert found["warm_up"] == pytest.approx(4.0, rel=0.1) and found["loaded"] is loaded
+    assert found["warm_time"] == pytest.approx(90.0, rel=0.1)

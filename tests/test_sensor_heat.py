@@ -14,6 +14,7 @@ from biotac_mj.sensor.heat import (
     GIVEN,
     LIQUID,
     LOST,
+    MADE,
     NCELL,
     THERMISTOR,
     Heat,
@@ -122,7 +123,7 @@ def test_what_a_body_takes_is_what_it_holds():
     heat = Heat([FOAM])
     state = touch(heat, 1e-4, 2.0, 0.01, 500)[0]
     rate, conductance, fast, slow = half_space()
-    above = state[SURFACE : BODIES + BODY] - FOAM.temperature
+    above = state[SURFACE : BODIES + MADE] - FOAM.temperature
     held = FOAM.effusivity * (fast * above[0] + conductance / rate @ above[1:])
     # the slowest tail alone leads to the undisturbed body
     assert 0 < state[GIVEN] - 1e-4 * held < 0.01 * state[GIVEN]
@@ -173,7 +174,7 @@ def test_a_step_of_any_length_stays_between_the_temperatures():
     heat = Heat([material_of("copper")], nworld=1)
     for dt in (1e-4, 1.0, 1e3):
         state = touch(heat, 1e-4, 10.0, dt, 20)[0]
-        warm = np.r_[state[:LOST], state[FREE:BODIES], state[BODIES + 1 :]]
+        warm = np.r_[state[:LOST], state[FREE:BODIES], state[BODIES + 1 : BODIES + MADE]]
         assert warm.min() > ROOM - 1e-9 and warm.max() < HeatParameters().rest()[CORE] + 1e-9
 
 

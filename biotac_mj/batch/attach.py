@@ -4,6 +4,7 @@ into `mujoco_warp.step`."""
 import pathlib
 import typing
 import warnings
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -16,12 +17,16 @@ from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
+from ..effects.amended import Model, amend
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
+from ..sensor.materials import check_choices, read_thermal
+from ..sensor.vibration import read_texture
 from ..skin.per_world import make_room
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings, plain, read_material
 from .batch import Batch, Hook
+from .senses import Senses, draws
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch
 
@@ -112,7 +117,7 @@ def attach(
     m: "mjw.Model",
     d: "mjw.Data",
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: str | dict | None = None,
     liquid: bool | None = None,
     friction: float | None = None,
@@ -122,6 +127,11 @@ def attach(
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
+    sensor: str | dict | list | None = None,
+    randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
+    thermal: dict | list | None = None,
+    textures: dict | list | None = None,
     options: dict | None = None,
     worlds: dict | None = None,
 ) -> Batch:
@@ -139,8 +149,11 @@ def attach(
       friction: of the skin, one number or (nworld,); None takes the material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
-        dict of `PhysicsReadings`' settings: noise, sensor, film_every_step, temperature; or what
+        dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
         `SensorBioTac(...).batch()` gives.
+      sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is drawn,
+        every reset of a world draws again, by its seed. sensor, thermal and textures may be lists of one for
+        each world, which resets leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
         elements}, as for `biotac_mj.attach`, of all worlds.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
@@ -156,6 +169,9 @@ def attach(
         raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
+    skin, material, options, sensor, friction = _with_effects(
+        Model(skin, material, options, sensor, friction), effects
+    )
     settings = dict(
         material=material,
         liquid=liquid,
@@ -171,13 +187,14 @@ def attach(
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
         _warn_of_damping(mjm, touching)
-    film, acquisition = _readings(readings, rest_geometry(config, geometry), d.nworld, seed, device)
+    felt = sensor, randomise, thermal, textures
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
-    skins = skin_of(bool(slots)), film, acquisition
+    skin = skin_of(bool(slots) or textures is not None)
+    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
-    batch = Batch(mjm, touching, slots, *skins, addresses, solid)
+    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid)
     Hook.of(m).add(batch)
     return batch
 
@@ -187,7 +204,7 @@ def make(
     nworld: int,
     device: str | None = None,
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: str | dict | None = None,
     liquid: bool | None = None,
     friction: float | None = None,
@@ -196,6 +213,11 @@ def make(
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
+    sensor: str | dict | list | None = None,
+    randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
+    thermal: dict | list | None = None,
+    textures: dict | list | None = None,
     options: dict | None = None,
     worlds: dict | None = None,
 ) -> PoseBatch:
@@ -206,13 +228,16 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, options, worlds:
-      as for `attach`.
+      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, sensor, randomise,
+      thermal, effects, textures, options, worlds: as for `attach`.
 
     Raises:
       ValueError: see `attach`.
     """
     device = str(wp.get_device(device))
+    skin, material, options, sensor, friction = _with_effects(
+        Model(skin, material, options, sensor, friction), effects
+    )
     settings = dict(
         material=material,
         liquid=liquid,
@@ -224,8 +249,21 @@ def make(
         worlds=dict(worlds or {}),
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
-    film, acquisition = _readings(readings, rest_geometry(config, geometry), nworld, seed, device)
-    return PoseBatch(mjm, touching, skin_of(False), film, acquisition)
+    felt = sensor, randomise, thermal, textures
+    skin = skin_of(textures is not None)
+    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    return PoseBatch(mjm, touching, skin, senses)
+
+
+def _with_effects(model, effects):
+    """The model's parts, with the effects in them."""
+    if effects is not None:
+        for name, value in (("material", model.material), ("sensor", model.sensor)):
+            if isinstance(value, (list, tuple)):
+                raise ValueError(f"{name} of each world beside effects: give one of them, or neither")
+        model = amend(model, effects)
+    skin = "default" if model.skin is None else model.skin
+    return skin, model.material, model.options, model.sensor, model.friction
 
 
 def _skins(mjm, prefix, skin, nworld, device, settings):
@@ -389,30 +427,49 @@ def _slots(mjm, m, d, touching, prefix):
     return {g: place[root] for g, root in enumerate(roots) if root in needed}
 
 
-def _readings(choice, geometry, nworld, seed, device):
+def _senses(choice, felt, geometry, seed, skin, touching, mjm):
+    """The sensors of the worlds, or None."""
+    nworld, device = skin.nworld, str(skin.model.device)
+    sensor, randomise, thermal, textures = felt
     seeds = np.atleast_1d(seed)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
         raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
+    own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
     if choice is False:
-        return None, None
-    from ..sensor.acquisition import BatchAcquisition
+        if own or thermal is not None or textures is not None:
+            raise ValueError("readings is False: leave sensor, randomise, thermal and textures out")
+        return None
     from ..sensor.film import BatchFilm, FilmConduction
     from ..sensor.readings import check_settings
 
-    settings = (
-        {}
-        if choice is True
-        else {**check_settings(choice, {"signal": str, "weights": str | None}, "readings")}
-    )
-    signal = settings.pop("signal", "physics")
+    settings = {**({} if choice is True else choice), **own}
+    known = {"signal": str, "weights": str | None, "cold": bool}
+    many = settings.get("sensor")
+    for one in many if isinstance(many, list) else [many]:
+        check_settings(
+            {k: v for k, v in {**settings, "sensor": one}.items() if v is not None}, known, "readings"
+        )
+    for wanted, read in ((thermal, read_thermal), (textures, read_texture)):
+        for one in wanted if isinstance(wanted, list) else [wanted or {}]:
+            for name, value in one.items():
+                _resolve_geom(mjm, name)
+                check_choices(value, read)
+    rows, redraw = draws(nworld, seed, settings, thermal, textures, touching.geoms)
+    signal, weights = settings.pop("signal", "physics"), settings.pop("weights", None)
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
     if signal != "physics":
         from ..learning.serve import LearnedBatchFilm
 
-        film = LearnedBatchFilm(
-            geometry, nworld, device, settings.pop("weights", None), settings.pop("sensor", "1")
-        )
-        return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)
-    film = BatchFilm(FilmConduction(geometry, sensor=settings.pop("sensor", "1")), nworld, device)
-    return film, BatchAcquisition(film.rest, nworld, seed=seed, device=device, **settings)
+        film = LearnedBatchFilm(geometry, nworld, device, weights)
+    else:
+        film = BatchFilm(FilmConduction(geometry), nworld, device)
+    settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
+    return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)
+
+
+def _resolve_geom(mjm, name):
+    names = [mjm.geom(i).name for i in range(mjm.ngeom)]
+    if not any(n == name or n.endswith(name) for n in names):
+        found = ", ".join(n for n in names if n) or "no named geom"
+        raise ValueError(f"no geom {name!r} to touch: the model has {found}")

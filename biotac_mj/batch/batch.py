@@ -20,6 +20,7 @@ import warp as wp
 from ..coupling.touching import Touching
 from . import dynamics, kernels, rounds
 from .scratch import Scratch
+from .senses import Senses
 from .skin import BatchSkin
 from .skins import Skins
 
@@ -43,12 +44,11 @@ class Batch(Skins):
         touching: Touching,
         slots: dict,
         skin: BatchSkin,
-        film: object,
-        acquisition: object,
+        senses: Senses | None,
         addresses: list,
         thickness: float | None,
     ):
-        super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, addresses)
+        super().__init__(touching, skin, senses, mjm.opt.timestep, addresses)
         self.active = True
         self.moving = thickness is not None  # whether forces change where anything goes
         weld = sorted(set(slots.values()))

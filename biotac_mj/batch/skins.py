@@ -10,6 +10,7 @@ from ..coupling.touching import Touching
 from ..sensor.acquisition import NSTATE
 from ..sensor.channels import WIDTHS
 from . import kernels
+from .senses import Senses
 from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
@@ -20,7 +21,7 @@ class Skins:
 
     Args:
       touching: `coupling.touching.Touching`, what can touch.
-      skin: BatchSkin. film, acquisition: BatchFilm and BatchAcquisition, or None.
+      skin: BatchSkin. senses: its sensors, or None.
       dt: time step [s].
       addresses: where each of CHANNELS begins in the sensor data; -1: nowhere.
 
@@ -35,16 +36,15 @@ class Skins:
         self,
         touching: Touching,
         skin: BatchSkin,
-        film: object,
-        acquisition: object,
+        senses: Senses | None,
         dt: float,
         addresses: list,
     ):
-        self.nworld, self.skin, self.film, self.acquisition = skin.nworld, skin, film, acquisition
+        self.nworld, self.skin, self.senses = skin.nworld, skin, senses
         self.device, self.dt = skin.model.device, float(dt)
         self._core = int(touching.core)
         shape = skin.ngroup, skin.nworld
-        if acquisition is None:
+        if senses is None:
             addresses = [-1 if c in WIDTHS else a for c, a in zip(CHANNELS, addresses)]
         with wp.ScopedDevice(self.device):
             self._body = wp.array(touching.body.astype(np.int32), dtype=int)
@@ -59,7 +59,7 @@ class Skins:
             # how a step goes in which bodies and skin do not meet: one round, all of the push
             self._settled, self._rounds = (wp.ones(self.nworld, dtype=int) for _ in range(2))
             self._push = wp.ones(self.nworld, dtype=wp.float64)
-            self._valid = film.valid if film else wp.ones(self.nworld, dtype=int)
+            self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.reset()
@@ -86,8 +86,8 @@ class Skins:
             )
         self.skin.reset(mask)
         self._launch(kernels.reset_models, self.nworld, [mask], [self.model, self.failed, self.began])
-        if self.acquisition:
-            self.acquisition.reset(mask)
+        if self.senses:
+            self.senses.reset(mask)
 
     @property
     def vert_xpos(self) -> np.ndarray:
@@ -103,15 +103,15 @@ class Skins:
     @property
     def nbytes(self) -> int:
         """Device memory that grows with the number of worlds, of skins and sensors together [bytes]."""
-        return self.skin.nbytes + (
-            self.film.nbytes + self.acquisition.state.capacity if self.acquisition else 0
-        )
+        return self.skin.nbytes + (self.senses.nbytes if self.senses else 0)
 
     def begin_step(self) -> None:
         """Before the first `solve_at` of a step. Launches only."""
         for name in kernels.Model.vars:
             wp.copy(getattr(self._last, name), getattr(self.model, name))
         self.skin.data.worlds.wanted.fill_(1)
+        if self.senses:
+            self.senses.begin_step()
 
     def end_step(self) -> None:
         """After the last one. Launches only."""
@@ -143,10 +143,8 @@ class Skins:
         """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches
         only."""
         state, skin = self._no_state, self.skin
-        if self.acquisition:
-            self.film.solve_film(skin.x, self.acquisition.find_due(self.dt))
-            self.acquisition.advance(self.dt, self.film.impedance, self.film.valid, skin.pressure)
-            state = self.acquisition.state
+        if self.senses:
+            state = self.senses.advance(self.model.wrench0, self.model.tangent0)
         outputs = [state, self.model.wrench0, skin.reason, self._valid, self._settled, self.failed]
         how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
         self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs, *how], [sensordata])
@@ -174,11 +172,9 @@ class PoseBatch(Skins):
       sensordata: (nworld, 58) wp.array float, the channels of `readings` one after another.
     """
 
-    def __init__(
-        self, mjm: mujoco.MjModel, touching: Touching, skin: BatchSkin, film: object, acquisition: object
-    ):
+    def __init__(self, mjm: mujoco.MjModel, touching: Touching, skin: BatchSkin, senses: Senses | None):
         widths = list(CHANNELS.values())
-        super().__init__(touching, skin, film, acquisition, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
+        super().__init__(touching, skin, senses, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
             self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
             self._geom_quat = wp.array(

@@ -6,14 +6,17 @@ import importlib.util
 import pathlib
 import typing
 import weakref
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
+from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
-from ..sensor.materials import read_thermal
+from ..sensor.materials import check_choices, read_thermal
+from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
 from .stepper import check_names, make_readings
@@ -58,11 +61,36 @@ class Handle:
         share of its push that was withheld): see docs/coupling.md."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
+    @property
+    def numbers(self) -> Sensor:
+        """The sensor's own numbers by its settings: rest counts, noise, levels."""
+        return take_sensor(self.config.options.get("readings", {}), self.config.seed)[0]
+
+    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
+        """Puts another sensor at rest in the place of this one, until the next reset, where the settings
+        leave it open (`sensor="random"`, `randomise`, lists of materials or textures); all of it lies in
+        mjData.plugin_state. The next mj_forward or mj_step shows it.
+
+        Args:
+          seed: which one, 0 .. 2**64 - 1.
+
+        Returns:
+          its numbers; None where the readings know none.
+        """
+        setup, start = self._place(model)
+        if not hasattr(setup.skin.readings, "draw"):
+            return None
+        own = setup.parts(data.plugin_state[start : start + setup.nstate])[3]
+        with setup.skin.lock:
+            return setup.skin.readings.draw(own, seed)
+
+    def _place(self, model):
+        index = int(model.body_plugin[model.body(self.body).id])
+        return _setup(model, index), model.plugin_stateadr[index]
+
     def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
-        index = int(model.body_plugin[model.body(self.body).id])
-        setup = _setup(model, index)
-        start = model.plugin_stateadr[index]
+        setup, start = self._place(model)
         return setup.skin.stepper.vert_xpos(
             setup.parts(data.plugin_state[start : start + setup.nstate])[2]
         ).copy()
@@ -88,7 +116,7 @@ def attach(
     pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
     quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     material: "str | dict | Material | None" = None,
     liquid: bool | None = None,
     coupling: str = "two-way",
@@ -96,6 +124,9 @@ def attach(
     rounding: dict | None = None,
     thermal: dict | None = None,
     textures: dict | None = None,
+    sensor: str | dict | None = None,
+    randomise: list | dict | None = None,
+    effects: str | pathlib.Path | Sequence | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -115,19 +146,27 @@ def attach(
       site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: pose [m] of the BioTac frame there.
       prefix: of every name it adds, so that a model may hold several.
-      skin: "coarse", "default", "fine", a stored skin's file, or a SkinGeometry.
+      skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
       material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
       liquid, friction: None takes the material's choice.
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "readings": of the sensor (noise, sensor, film_every_step, temperature; weights).
+        elements' centroids; "readings": of the sensor (noise, sensor, randomise, film_every_step,
+        temperature, cold; weights).
+      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by the
+        seed), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for options["readings"].
+      randomise: names of effects that are drawn by the seed ("dead", "crosstalk", "relax"), or {name: size};
+        see `effects.sensors.RANDOM`. Short for options["readings"].
+      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
+        (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,
+        or [(Effect, theta)]; see `effects.amended`.
       thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
-        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]. {} makes all of plastic at 23 C, None
-        leaves heat out.
+        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {} makes all of
+        plastic at 23 C, None leaves heat out.
       textures: geom name -> what slides feel of it: {"pitch": 1e-3, "height": 5e-5} of ridges, {"roughness":
-        1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"). {} makes all smooth: PAC feels taps and
-        stick-slip. None leaves vibration out.
+        1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"); of a list one is drawn. {} makes all
+        smooth: PAC feels taps and stick-slip. None leaves vibration out.
       coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
 
     Raises:
@@ -137,10 +176,20 @@ def attach(
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
     _check_place(spec, site, body, prefix, pos, quat)
-    text, geometry = skin_reference(skin)
     from ..skin.settings import plain
 
+    if effects is not None:
+        from ..effects.amended import Model, amend
+
+        amended = amend(Model(skin, material, options, sensor, friction), effects)
+        skin, material, options = amended.skin, amended.material, amended.options
+        sensor, friction = amended.sensor, amended.friction
+    text, geometry = skin_reference("default" if skin is None else skin)
+
     material, options = plain(material), plain({} if options is None else options, geometry)
+    own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
+    if own and isinstance(options.get("readings", {}), dict):
+        options = {**options, "readings": {**options.get("readings", {}), **own}}
     if stepper == "fem":
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
@@ -164,9 +213,9 @@ def attach(
     )
     _check(config, geometry)
     for value in (config.thermal or {}).values():
-        read_thermal(value)
+        check_choices(value, read_thermal)
     for value in (config.textures or {}).values():
-        read_texture(value)
+        check_choices(value, read_texture)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
     if slots is not None:

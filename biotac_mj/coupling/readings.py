@@ -3,12 +3,15 @@
 import functools
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction
 from ..sensor.heat import state_size
 from ..sensor.materials import Material, read_thermal
+from ..sensor.presets import Sensor
 from ..sensor.readings import PhysicsReadings, check_settings
 from ..sensor.vibration import Texture, Vibration, read_texture
 from ..sensor.vibration import state_size as vibration_size
@@ -18,33 +21,38 @@ from .fem import FemStepper, rest_geometry
 from .stepper import Geom, SkinResult
 from .vibration import Shaking
 
-__all__ = ["SensorReadings"]
+__all__ = ["SensorReadings", "materials_of", "textures_of"]
 
 
 class SensorReadings:
     """`PhysicsReadings` behind the `Readings` protocol.
 
-    `config.options["readings"]` goes to it (noise, sensor, film_every_step, temperature, cold).
+    `config.options["readings"]` goes to it (noise, sensor, randomise, film_every_step, temperature,
+    cold).
 
     The film, with its factorisations, is made at the first reset and shared by all sensors of one geometry.
     """
 
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
-        self._options = check_settings(config.options.get("readings", {}), {"cold": bool})
+        settings = check_settings(config.options.get("readings", {}), {"cold": bool})
+        self.sensor, self._options, _ = take_sensor(settings, config.seed)
         self._bodies: list[Material] | None = None
+        self._textures: list[Texture] | None = None
+        self._geoms: list[Geom] = []
         self._shaking: Shaking | None = None
         self.nstate = Acquisition.nstate
 
     def feel_heat(self, geoms: list[Geom]) -> None:
         """A body is made of what the first of its geoms that `config.thermal` names is made of."""
-        self._bodies = _by_body(geoms, self._config.thermal, read_thermal, "plastic")
+        self._bodies = materials_of(geoms, self._config.thermal, self._config.seed)
+        self._geoms = geoms
         self.nstate += state_size(len(self._bodies))
 
     def feel_vibration(self, geoms: list[Geom], stepper: FemStepper) -> None:
         """A body has the texture of the first of its geoms that `config.textures` names."""
-        self._textures: list[Texture] = _by_body(geoms, self._config.textures, read_texture, "smooth")
-        self._shaking = Shaking(stepper, geoms)
+        self._textures = textures_of(geoms, self._config.textures, self._config.seed)
+        self._geoms, self._shaking = geoms, Shaking(stepper, geoms)
         self.nstate += vibration_size(NMODE, len(self._textures))
 
     def shaking(self, before: np.ndarray, result: SkinResult, dt: float) -> tuple | None:
@@ -56,9 +64,10 @@ class SensorReadings:
         geometry = (
             rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
         )
-        film = _film(_Skin(geometry), self._options.get("sensor", "1"))
+        film = _film(_Skin(geometry))
         sound = self._shaking and Vibration(self._shaking.modes, self._textures, seed=self._seed)
-        more = {"film": film, "bodies": self._bodies, "vibration": sound}
+        more = {"film": film, "bodies": self._bodies, "vibration": sound, "sensor": self.sensor}
+        more["textures"] = self._textures
         return PhysicsReadings(geometry, seed=self._seed, **more, **self._options)
 
     @functools.cached_property
@@ -69,6 +78,14 @@ class SensorReadings:
 
     def reset(self, state: np.ndarray) -> None:
         self._physics.reset(state)
+
+    def draw(self, state: np.ndarray, seed: int) -> Sensor:
+        """Resets to another sensor, other materials and textures, where the settings leave them open."""
+        sensor = take_sensor(self._config.options.get("readings", {}), seed)[0]
+        bodies = self._bodies and materials_of(self._geoms, self._config.thermal, seed)
+        textures = self._textures and textures_of(self._geoms, self._config.textures, seed)
+        self._physics.reset(state, sensor=sensor, bodies=bodies, textures=textures)
+        return sensor
 
     def advance(
         self,
@@ -85,10 +102,24 @@ class SensorReadings:
         return self._physics.readings(state)
 
 
-def _by_body(geoms, wanted, read, else_):
-    """What each body has of what geoms are named to have."""
+def materials_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Material]:
+    """Of each body, of names as `Config.thermal` has them; of a list one is drawn by the seed."""
+    return _by_body(geoms, wanted, read_thermal, "plastic", _rng(seed, 0x4EA7))
+
+
+def textures_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Texture]:
+    """Likewise, of names as `Config.textures` has them."""
+    return _by_body(geoms, wanted, read_texture, "smooth", _rng(seed, 0x7E47))
+
+
+def _rng(seed, what):
+    return np.random.default_rng([*np.atleast_1d(seed).tolist(), what])
+
+
+def _by_body(geoms, wanted, read, else_, rng):
     bodies = [read(else_)] * (1 + max((g.group for g in geoms), default=-1))
-    named = [(g, value) for g in geoms for key, value in wanted.items() if _is(g.name, key)]
+    chosen = {k: v[rng.integers(len(v))] if isinstance(v, (list, tuple)) else v for k, v in wanted.items()}
+    named = [(g, value) for g in geoms for key, value in chosen.items() if _is(g.name, key)]
     for geom, value in reversed(named):
         bodies[geom.group] = read(value)
     return bodies
@@ -113,5 +144,5 @@ class _Skin:
 
 
 @functools.lru_cache(maxsize=4)
-def _film(skin, sensor):
-    return FilmConduction(skin.geometry, sensor=sensor)
+def _film(skin):
+    return FilmConduction(skin.geometry)

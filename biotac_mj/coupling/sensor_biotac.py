@@ -3,6 +3,7 @@ batches alike."""
 
 import dataclasses
 
+from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 
 __all__ = ["SIGNALS", "SensorBioTac"]
@@ -19,7 +20,7 @@ class SensorBioTac:
     Attributes:
       signal: "physics": conduction in the liquid film; "latent_projection": the learned model that did best
         on unseen objects, trained on synthetic data (docs/learning.md).
-      sensor: "1" | "2" | "3", whose published rest counts are shown.
+      sensor: which one it is, see `sensor.presets.read_sensor`. randomise: see `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
 
@@ -28,10 +29,11 @@ class SensorBioTac:
     """
 
     signal: str = "physics"
-    sensor: str = "1"
+    sensor: str | dict = "1"
     noise: bool = True
     weights: str | None = None
     film_every_step: bool = False
+    randomise: list | dict = ()
 
     def __post_init__(self):
         if self.signal not in SIGNALS:
@@ -45,6 +47,8 @@ class SensorBioTac:
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
         out = {"sensor": self.sensor, "noise": self.noise, "film_every_step": self.film_every_step}
+        if self.randomise:
+            out["randomise"] = self.randomise
         return out if self.weights is None else out | {"weights": str(self.weights)}
 
     def settings(self, options: dict | None = None) -> dict:
@@ -59,10 +63,11 @@ class SensorBioTac:
 
     def readings(self, geometry: SkinGeometry, seed: int = 0) -> object:
         """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
+        sensor, options, _ = take_sensor(self.options(), seed)
         if self.signal == "physics":
             from ..sensor.readings import PhysicsReadings
 
-            return PhysicsReadings(geometry, seed=seed, **self.options())
+            return PhysicsReadings(geometry, seed=seed, sensor=sensor, **options)
         from ..learning.serve import NetworkReadings
 
-        return NetworkReadings(geometry, seed=seed, **self.options())
+        return NetworkReadings(geometry, seed=seed, sensor=sensor, **options)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..sensor.vibration import Modes
 from ..skin.modes import NMODE, skin_modes
+from ..skin.touched import faces_of
 from .fem import FemStepper
 from .stepper import Geom, SkinResult
 
@@ -38,11 +39,9 @@ class Shaking:
     @functools.cached_property
     def _faces(self):
         """(nface, (nmode + 1) 3) modal forces and steady pressure of a unit force on each outer face."""
-        modes = self._modes
-        place = np.zeros(self._stepper.model.nvert, int)
-        place[modes.node] = np.arange(len(modes.node))
-        each = np.concatenate([modes.shape, modes.static[None]])[:, place[self._stepper.model.outer.face_np]]
-        return np.ascontiguousarray(each.mean(2).swapaxes(0, 1).reshape(-1, 3 * (NMODE + 1)), np.float32)
+        model = self._stepper.model
+        each = faces_of(self._modes, model.outer.face_np, model.nvert)
+        return np.ascontiguousarray(each.reshape(-1, 3 * (NMODE + 1)), np.float32)
 
     def of_step(self, before: np.ndarray, result: SkinResult, dt: float) -> tuple | None:
         """`drive`, `gain`, `slip` and `area` of `sensor.vibration.Vibration` at the end of a step.

@@ -9,10 +9,13 @@ import time
 
 import numpy as np
 
+from ..effects.sensors import take_sensor
 from ..fields import check_types
 from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
+from ..sensor.materials import check_choices, read_thermal
+from ..sensor.vibration import read_texture
 from ..skin.settings import plain, read_dict, read_settings
 from .objects import OBJECTS
 from .plan import KINDS
@@ -47,7 +50,11 @@ class GenerateOptions:
         friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
         can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
         parameters, under "skin".
-      sensor: whose published rest counts the simulated electrodes show.
+      sensor, randomise: which sensor it is, and effects that are drawn, see `biotac_mj.attach`; all that is
+        drawn is drawn anew for each interaction and kept in its parameters.
+      thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
+        surface (`sensor.vibration.read_texture`); of a list one is drawn for each interaction. None leaves
+        heat or vibration out.
       batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
         part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
         objects. A shard holds one batch.
@@ -69,7 +76,10 @@ class GenerateOptions:
     material: str | dict = "default"
     element: str | None = None
     liquid: bool | None = None
-    sensor: str = "1"
+    sensor: str | dict = "1"
+    randomise: tuple | dict = ()
+    thermal: str | dict | tuple | None = None
+    texture: str | dict | tuple | None = None
     batch: int = 160
     measured_batch: int = 90
     measured_seed: int = 0
@@ -87,6 +97,10 @@ class GenerateOptions:
             object.__setattr__(self, name, None if value is None else plain(read_dict(value, name)))
         check_types(self)
         check_vary(self.vary or {})
+        take_sensor({"sensor": self.sensor, "randomise": self.randomise})
+        for value, read in ((self.thermal, read_thermal), (self.texture, read_texture)):
+            if value is not None:
+                check_choices(value, read)
         if self.vary and self.tier == "condensed":
             raise ValueError(
                 "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"

@@ -11,7 +11,7 @@ import numpy as np
 import tqdm
 
 from ..files import replacing
-from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE
+from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE, NPAC
 
 __all__ = ["VERSION", "export_lerobot"]
 
@@ -19,6 +19,7 @@ VERSION = "v3.0"
 _FILE_MB = 100  # of one data file, lerobot's default
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+PAC = tuple(f"pac{i + 1}" for i in range(NPAC))
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 
@@ -29,7 +30,7 @@ def export_lerobot(
     """Writes the folder `out` (built under another name, then renamed).
 
     Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc,
-      .pac, .tdc, .tac (1 each)
+      .tdc, .tac (1 each), .pac (22, or the latest where the set has no more)
     [counts], observation.force (6, of the skin on the object) and action (7), the pose at the next time step.
     The task says what is done
     with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that
@@ -81,11 +82,13 @@ class _Export:
         self.data, self.folder, self.counts, self.chosen = data, folder, counts, chosen
         self.recorded = recorded
         self.fps = self._rate()
+        self.pac = counts == "counts" and "pac" in data.columns
         self.features = {
             "observation.state": _feature(_POSE),
             "observation.force": _feature(self._axes()),
             "observation.tactile.electrodes": _feature(ELECTRODES),
             **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[NELECTRODE:]},
+            **({"observation.tactile.pac": _feature(PAC)} if self.pac else {}),
             "action": _feature(_POSE),
         }
         index = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDEX[1:]}
@@ -171,6 +174,7 @@ class _Export:
                 f"observation.tactile.{name}": counts[:, NELECTRODE + k]
                 for k, name in enumerate(CHANNELS[NELECTRODE:])
             },
+            **({"observation.tactile.pac": data["pac"][rows].astype(np.float32)} if self.pac else {}),
             "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
             "timestamp": (np.arange(n) / self.fps).astype(np.float32),
             "frame_index": np.arange(n),

@@ -24,7 +24,7 @@ from .plan import plan_motions
 from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
 from .store import write_shard
-from .vary import draw_worlds, refuse_impossible
+from .vary import draw_sense, draw_worlds, refuse_impossible
 
 __all__ = ["Maker", "make_shards"]
 
@@ -213,6 +213,13 @@ class Maker:
             "liquid": model.has_liquid,
             "device": _device_name(model.device),
         }
+        self.modes = self.few = None
+        if options.texture is not None:
+            from ..sensor.vibration import Modes
+            from ..skin.modes import skin_modes
+
+            self.modes = skin_modes(model)
+            self.few = Modes(self.modes.rate, self.modes.share)
         self.time = np.arange(options.steps) / options.rate
         ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
         parts = [
@@ -234,12 +241,9 @@ class Maker:
         """Makes the shards of an iterator of batches with that many worker processes."""
         from . import readings, synthetic_sensor
 
-        o = self.options
         rest = None if self._rest is self.geometry else self._rest.vert
-        args = (self.geometry, o.sensor, self.measured and self.measured.meter(), rest)
-        with readings.readings_pool(
-            self.geometry, o.sensor, workers, synthetic_sensor.start_worker, args
-        ) as pool:
+        args = (self.geometry, self.measured and self.measured.meter(), rest)
+        with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:
                 waiting.append(self._begin(batch, pool))
@@ -282,11 +286,24 @@ class Maker:
                 )
                 for motion, one in zip(motions, drawn):
                     motion.parameters["skin"] = one
-            fields = running.fields = walk(self.model, batch.names, motions, self.update, self.time, *skins)
+            senses = []
+            for i, motion in zip(batch.members, motions):
+                sense, drawn = draw_sense(o, [o.seed, i, 3], self.few)
+                senses.append(sense)
+                motion.parameters.update(drawn)
+            fields = running.fields = walk(
+                self.model, batch.names, motions, self.update, self.time, *skins, modes=self.modes
+            )
             clock = self._count("skin", clock)
             running.reads = [
                 pool.submit(
-                    readings.read_in_worker, fields.displacement[k], self.time, fields.pressure[k], noise[k]
+                    readings.read_in_worker,
+                    fields.displacement[k],
+                    self.time,
+                    fields.pressure[k],
+                    noise[k],
+                    senses[k],
+                    fields.touch(k),
                 )
                 for k in range(len(motions))
             ]
@@ -346,6 +363,7 @@ class Maker:
                     "pressure": fields.pressure[k],
                     "impedance": read.impedance,
                     "counts": read.counts,
+                    "pac": read.pac,
                 }
                 columns["converged"] &= fields.converged[k] & ~read.failed
             if batch.measured:

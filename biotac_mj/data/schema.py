@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import CHANNELS, NELECTRODE
+from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
 
 __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
 
@@ -27,6 +27,7 @@ COLUMNS = {
     "pressure": ((), "f4", "Pa"),
     "impedance": ((NELECTRODE,), "f4", "ohm"),
     "counts": ((len(CHANNELS),), "f4", "count"),
+    "pac": ((NPAC,), "u2", "count"),
     "indenter_pos": ((3,), "f8", "m"),
     "indenter_quat": ((4,), "f8", "w x y z"),
     "converged": ((), "u1", "0 or 1"),
@@ -53,6 +54,7 @@ class Interaction:
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, 19) e1..e19 of the simulated film [ohm].
       counts: (n, 23) simulated readings in the order of sensor.channels.CHANNELS [counts].
+      pac: (n, 22) of these, PAC of the last 10 ms in the order of time [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
       measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it
@@ -73,6 +75,7 @@ class Interaction:
     pressure: np.ndarray | None = None
     impedance: np.ndarray | None = None
     counts: np.ndarray | None = None
+    pac: np.ndarray | None = None
     indenter_pos: np.ndarray | None = None
     indenter_quat: np.ndarray | None = None
     converged: np.ndarray | None = None

@@ -8,10 +8,13 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from ..skin import GeomSet, SkinModel, step
+from ..skin.modes import SkinModes
 from ..skin.per_world import make_worlds
+from ..skin.touched import Touched
 from ..skin.types import real, vec3
 from .clearance import Placed
 from .objects import grid_of, make_object
+from .readings import Touch
 from .schema import DISPLACEMENT_SCALE, nodes_of
 
 __all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
@@ -34,6 +37,9 @@ class Fields:
         unstressed skin.
       contact_force: (k, n, nouter, 3) float32 [N]; None where the condensed tier does not know it.
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
+      area: (k, n) that the object touches [m^2].
+      slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; nothing
+        where no modes were given.
     """
 
     displacement: np.ndarray
@@ -41,6 +47,15 @@ class Fields:
     wrench: np.ndarray
     pressure: np.ndarray
     converged: np.ndarray
+    area: np.ndarray
+    slip: np.ndarray
+    drive: np.ndarray
+    gain: np.ndarray
+
+    def touch(self, i: int) -> Touch:
+        """What the object does to the skin in interaction i."""
+        force = np.linalg.norm(self.wrench[i, :, :3], axis=1)
+        return Touch(self.area[i], force, self.slip[i], self.drive[i], self.gain[i])
 
     def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
         """(n, nvert, 3) nodes of interaction i as they are stored [m]; vert: the skin at rest."""
@@ -55,6 +70,7 @@ def simulate(
     time: np.ndarray | list | None = None,
     materials: list | None = None,
     worlds: dict | None = None,
+    modes: SkinModes | None = None,
 ) -> Fields:
     """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
     batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
@@ -69,6 +85,7 @@ def simulate(
         it. What comes before the first row takes as long as what comes after it.
       materials: one for each motion, or None for the model's.
       worlds: name -> (k,) in what motions differ besides, see `skin.per_world.make_worlds`.
+      modes: of the skin, where slip, drive and gain are wanted; they need time.
 
     Raises:
       ValueError: an object deep inside the rigid core (plans keep clear of it), or no time where it is
@@ -79,26 +96,27 @@ def simulate(
     times = [None] * k if time is None else list(time) if np.ndim(time[0]) else [time] * k
     worlds = {name: np.asarray(value) for name, value in (worlds or {}).items()}
     if model.device.is_cuda:
-        return _simulate(model, names, motions, progress, times, materials, worlds)
+        return _simulate(model, names, motions, progress, times, materials, worlds, modes)
     ones = []
     for i in range(k):
         mine = None if materials is None else materials[i : i + 1]
         own = {name: value[i : i + 1] for name, value in worlds.items()}
         one = slice(i, i + 1)
-        ones.append(_simulate(model, names[one], motions[one], progress, times[one], mine, own))
+        ones.append(_simulate(model, names[one], motions[one], progress, times[one], mine, own, modes))
     return Fields(
         *(np.concatenate([getattr(one, field.name) for one in ones]) for field in dataclasses.fields(Fields))
     )
 
 
-def _simulate(model, names, motions, progress, times=None, materials=None, worlds=None):
+def _simulate(model, names, motions, progress, times=None, materials=None, worlds=None, modes=None):
     nworld, nstep = len(motions), len(motions[0].pos)
     data = make_worlds(model, nworld, materials, worlds)
     scene = Scene(names, model.device, model.material.friction)
     if materials is not None:
         scene.geoms.set_friction([[m.friction] * scene.geoms.count for m in materials])
     outer = nodes_of(model.geometry)
-    fields = _empty(nworld, nstep, model.nvert, len(outer))
+    fields = _empty(nworld, nstep, model.nvert, len(outer), 0 if modes is None else len(modes.rate))
+    touched = Touched(data, np.zeros(scene.geoms.count, int), 1, modes)
     reader = _Reader(model, outer)
     walks = [_walk(m.pos, m.mat) for m in motions]
     clocks = None
@@ -109,6 +127,7 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         at = [min(k, len(w[0]) - 1) for w in walks]  # who has arrived waits there
         scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
         dt = None if clocks is None else np.array([c[i] for c, i in zip(clocks, at)])
+        touched.begin()
         step(model, data, scene.geoms, dt)
         there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
         if not len(there):
@@ -119,9 +138,27 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         fields.converged[who, row] = data.converged[who]
         fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
         fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
+        if dt is not None:
+            data.dt.assign(dt)
+        _feel(touched, data, scene.geoms, modes is not None)
+        for name in ("area", "slip", "drive", "gain"):
+            array = getattr(touched, name).numpy()
+            getattr(fields, name)[who, row] = array[who] if name == "drive" else array[who, 0]
         if progress:
             progress(len(there))
     return fields
+
+
+def _feel(touched, data, geoms, shaken):
+    """Has `touched` look at what the step left; the tangent costs a solve."""
+    device = data.model.device
+    wrench = np.ascontiguousarray(np.swapaxes(data.wrench, 0, 1))
+    shape = (geoms.ngroup, data.nworld, 6, 6)
+    tangent = np.swapaxes(data.tangent(geoms), 0, 1) if shaken else np.zeros(shape)
+    touched.end(
+        wp.array(wrench, dtype=wp.spatial_vectord, ndim=2, device=device),
+        wp.array(np.ascontiguousarray(tangent), dtype=wp.spatial_matrixd, ndim=2, device=device),
+    )
 
 
 def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, np.ndarray]:
@@ -144,12 +181,13 @@ def simulate_condensed(
     time: np.ndarray | list | None = None,
     materials: list | None = None,
     worlds: dict | None = None,
+    modes: SkinModes | None = None,
 ) -> Fields:
     """The same with the condensed skin, one interaction after another on one core; it has no contact forces
     of nodes, and nothing in it takes time.
 
     Raises:
-      ValueError: what the condensed tier cannot do, or materials or worlds that differ.
+      ValueError: what the condensed tier cannot do, materials or worlds that differ, or modes.
     """
     from ..skin.condensed import CondensedSkin, Memory
 
@@ -157,9 +195,12 @@ def simulate_condensed(
         raise ValueError(
             "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
         )
+    if modes is not None:
+        raise ValueError("sets of the condensed tier know no vibration: leave texture out, or tier='full'")
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     nstep = len(motions[0].pos)
-    fields = _empty(len(motions), nstep, model.nvert, None)
+    fields = _empty(len(motions), nstep, model.nvert, None, 0)
+    share, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
     skins = {}
     for k, (name, motion) in enumerate(zip(names, motions)):
         if name not in skins:
@@ -178,6 +219,7 @@ def simulate_condensed(
                     memory.pressure,
                 )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
+                fields.area[k, row] = share[memory.contacts[:, 0].astype(int) // nsample].sum()
         if progress:
             progress(nstep)
     return fields
@@ -273,13 +315,17 @@ class _Reader:
         return displacement.numpy(), force.numpy()
 
 
-def _empty(nworld, nstep, nvert, nouter):
+def _empty(nworld, nstep, nvert, nouter, nmode):
     return Fields(
         np.zeros((nworld, nstep, nvert, 3), np.int16),
         None if nouter is None else np.zeros((nworld, nstep, nouter, 3), np.float32),
         np.zeros((nworld, nstep, 6)),
         np.zeros((nworld, nstep)),
         np.ones((nworld, nstep), bool),
+        np.zeros((nworld, nstep)),
+        np.zeros((nworld, nstep)),
+        np.zeros((nworld, nstep, nmode)),
+        np.zeros((nworld, nstep, nmode + 1 if nmode else 0)),
     )
 
 

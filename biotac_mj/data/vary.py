@@ -1,13 +1,18 @@
-"""Skins that differ from interaction to interaction: what is drawn for each."""
+"""Skins, sensors and surfaces that differ from interaction to interaction: what is drawn for each."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
+from ..effects.sensors import take_sensor
+from ..sensor.materials import read_thermal
+from ..sensor.vibration import Modes, read_texture
 from ..skin.per_world import NAMES
 from ..skin.rubber.material import Material
+from .readings import Sense
 
-__all__ = ["check_vary", "draw_worlds", "refuse_impossible"]
+__all__ = ["check_vary", "draw_sense", "draw_worlds", "refuse_impossible"]
 
 _NUMBERS = ("youngs_modulus", "poissons_ratio", "friction", "stiffening")
 _FACTORS = ("prony", "hysteresis")
@@ -68,3 +73,27 @@ def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | Non
     if not set(vary) - set(worlds):
         return None, worlds, drawn
     return [_of_material(material, one) for one in drawn], worlds, drawn
+
+
+def draw_sense(options: Any, seed: list, modes: Modes | None) -> tuple[Sense, dict]:
+    """The sensor of an interaction and what it touches.
+
+    Args:
+      options: GenerateOptions: sensor, randomise, thermal, texture. seed: of the interaction. modes: of the
+        skin, for vibration.
+
+    Returns:
+      Sense, and what of it was drawn: {"sensor": numbers, "thermal": value, "texture": value}.
+    """
+    sensor, _, open_ = take_sensor({"sensor": options.sensor, "randomise": options.randomise}, seed)
+    drawn, rng = {}, np.random.default_rng(seed)
+    if open_:
+        drawn["sensor"] = {k: v for k, v in dataclasses.asdict(sensor).items() if v not in (None, ())}
+    chosen = {}
+    for name in ("thermal", "texture"):
+        value = chosen[name] = getattr(options, name)
+        if isinstance(value, (list, tuple)):
+            drawn[name] = chosen[name] = value[rng.integers(len(value))]
+    body = None if chosen["thermal"] is None else read_thermal(chosen["thermal"])
+    surface = None if chosen["texture"] is None else read_texture(chosen["texture"])
+    return Sense(sensor, body, surface, modes), drawn

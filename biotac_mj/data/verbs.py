@@ -7,9 +7,10 @@ __all__ = ["export_verb", "generate_verb", "import_verb"]
 
 def generate_verb(args: argparse.Namespace) -> None:
     """`biotac generate`; raises ValueError or FileNotFoundError for what cannot be."""
+    from ..effects.amended import amend_settings
     from .generate import GenerateOptions, generate
 
-    options = GenerateOptions(
+    settings = dict(
         count=args.count,
         labelled=min(359, args.count) if args.labelled is None else args.labelled,
         recordings=args.recordings,
@@ -30,7 +31,13 @@ def generate_verb(args: argparse.Namespace) -> None:
         device=args.device,
         options=args.options,
         vary=args.vary,
+        sensor="1" if args.sensor is None else args.sensor,
+        randomise=tuple(args.randomise or ()),
+        **{name: _one_or_many(getattr(args, name)) for name in ("thermal", "texture")},
     )
+    if args.effects:
+        settings = amend_settings(settings, GenerateOptions, args.effects)
+    options = GenerateOptions(**settings)
     report = generate(args.out, options, args.workers, not args.quiet)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
     print(
@@ -44,6 +51,10 @@ def generate_verb(args: argparse.Namespace) -> None:
         f"{report.device}"
     )
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
+
+
+def _one_or_many(values):
+    return values[0] if values and len(values) == 1 else values
 
 
 def import_verb(args: argparse.Namespace) -> None:

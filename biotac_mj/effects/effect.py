@@ -133,6 +133,16 @@ class Effect(abc.ABC):
         """Why fitted parameters are not what the effect could be, or None."""
         return None
 
+    def draw(self, rng: np.random.Generator, size: float = 1.0) -> dict:
+        """A sensor's theta: normal about no effect, `size` times `scale` wide, within the bounds; on the
+        possible side where there is but one. Shape parameters are one of the grid's."""
+        theta = self.default() | dict(self.grid[rng.integers(len(self.grid))])
+        for name in self.free:
+            p = self.params[name]
+            step = rng.normal(0.0, size * p.scale)
+            theta[name] = float(np.clip(abs(step) if p.low == p.start else p.start + step, p.low, p.high))
+        return theta
+
     @property
     def free(self) -> list[str]:
         """Names of the parameters that are fitted; shape parameters come from `grid`, then are polished."""

@@ -12,6 +12,7 @@ __all__ = [
     "WarmUp",
     "Asperities",
     "Gain",
+    "DeadTaxels",
     "CrossTalk",
     "Saturation",
     "LowPass",
@@ -106,6 +107,25 @@ class Gain(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
         run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))
+
+
+class DeadTaxels(Effect):
+    """Not in the catalogue: `diagnose` finds stuck channels of recordings by themselves."""
+
+    id, name, stage = "dead", "electrodes that no longer answer", "A"
+    physics = "a broken lead or a corroded contact: the electrode shows its rest and its noise"
+    params = {
+        f"e{k + 1}": Param("1", 0.0, 1.0, "none to all; share of electrodes: CHOSEN", 0.02) for k in range(19)
+    }
+    confusable = {"gain": "a gain is smaller, not nothing"}
+
+    def draw(self, rng: np.random.Generator, size: float = 1.0) -> dict:
+        """Each electrode is dead with the probability `size` times `scale`."""
+        return {k: float(rng.random() < size * p.scale) for k, p in self.params.items()}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
+        run.counts = rest + (run.counts - rest) * (1 - np.array([theta[k] for k in self.params]))
 
 
 class CrossTalk(Effect):

@@ -8,8 +8,9 @@ import typing
 import numpy as np
 import torch
 
+from ..effects.sensors import take_sensor
 from ..sensor.acquisition import Acquisition
-from ..sensor.channels import REST_COUNTS, REST_TEMPERATURE, impedance_from_counts
+from ..sensor.presets import Sensor, read_sensor
 from ..sensor.readings import check_settings
 from .weights import load_forward, shipped, window_of
 
@@ -29,8 +30,8 @@ class NetworkReadings:
     Args:
       geometry: the skin that the weights were trained on.
       weights: file; None takes those of the package (trained on synthetic data).
-      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; `sensor` gives the rest
-        counts that d ln Z is added to.
+      seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
+        rest of `sensor`.
 
     Attributes:
       nstate: length of the state: the acquisition's, the time of the last film, and what the network's window
@@ -43,15 +44,15 @@ class NetworkReadings:
         weights: pathlib.Path | str | None = None,
         seed: int = 0,
         noise: bool = True,
-        sensor: str = "1",
+        sensor: str | dict | Sensor = "1",
         film_every_step: bool = False,
-        temperature: float = REST_TEMPERATURE,
+        temperature: float | None = None,
     ):
-        check_settings({"sensor": sensor})
-        self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
+        sensor = read_sensor(sensor, seed)
+        self.acquisition = Acquisition(seed, noise, film_every_step, sensor, sensor.impedance)
         self.temperature = temperature
         self._weights, self._geometry = weights or shipped("forward"), geometry
-        self._rest = impedance_from_counts(REST_COUNTS[sensor])
+        self._rest = sensor.impedance
         self._memory = window_of(self._weights, geometry)
         self.nstate = Acquisition.nstate + 1 + int(np.prod(self._memory))
 
@@ -63,10 +64,13 @@ class NetworkReadings:
         n = Acquisition.nstate
         return state[:n], state[n : n + 1], state[n + 1 :]
 
-    def reset(self, state: np.ndarray, pressure: float = 0.0, time: float = 0.0) -> None:
-        """Writes the skin at rest into state (nstate,)."""
-        acquisition, last, memory = self._parts(state)
-        self.acquisition.reset(acquisition, self._rest, pressure, self.temperature, time)
+    def reset(
+        self, state: np.ndarray, pressure: float = 0.0, time: float = 0.0, sensor: Sensor | None = None
+    ) -> None:
+        """Writes the skin at rest into state (nstate,), from now on of `sensor`."""
+        counts, last, memory = self._parts(state)
+        acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
+        acquisition.reset(counts, self._rest, pressure, self.temperature, time)
         last[:], memory[:] = time, 0
 
     def advance(
@@ -106,7 +110,9 @@ class LearnedReadings:
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         settings = check_settings(config.options.get("readings", {}), more={"weights": str | None})
-        self._network = NetworkReadings(geometry, seed=config.seed, **settings)
+        self._settings = settings
+        sensor, settings, _ = take_sensor(settings, config.seed)
+        self._network = NetworkReadings(geometry, seed=config.seed, sensor=sensor, **settings)
         self.nstate = self._network.nstate
 
     @functools.cached_property
@@ -117,6 +123,12 @@ class LearnedReadings:
 
     def reset(self, state: np.ndarray) -> None:
         self._network.reset(state)
+
+    def draw(self, state: np.ndarray, seed: int) -> Sensor:
+        """Resets to another sensor, where the settings leave it open."""
+        sensor = take_sensor(self._settings, seed)[0]
+        self._network.reset(state, sensor=sensor)
+        return sensor
 
     def advance(
         self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
@@ -145,7 +157,7 @@ class LearnedBatchFilm:
         nworld: int,
         device: str = "cpu",
         weights: pathlib.Path | str | None = None,
-        sensor: str = "1",
+        sensor: str | Sensor = "1",
         dt: float = 0.01,
     ):
         import warp as wp
@@ -153,7 +165,7 @@ class LearnedBatchFilm:
         self.device, self._dt = wp.get_device(device), dt
         torch_device = wp.device_to_torch(self.device)
         self.model = load_forward(weights or shipped("forward"), geometry).to(torch_device)
-        self.rest = impedance_from_counts(REST_COUNTS[sensor])
+        self.rest = read_sensor(sensor).impedance
         with wp.ScopedDevice(self.device):
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=wp.float64)
             self.valid = wp.ones(nworld, dtype=int)

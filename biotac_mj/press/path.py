@@ -41,7 +41,10 @@ class PressOptions:
       timestep: [s]. speed: of the indenter [m/s]. hold: rest at the end of the press and of the slide [s].
       two_way: a servo with mass pushes the indenter and gives way, instead of a prescribed path.
       friction: Coulomb coefficient; None takes the material's.
-      seed: of the sensor's noise.
+      seed: of the sensor's noise, and of what is drawn.
+      sensor, randomise: which sensor it is, see `biotac_mj.attach`.
+      thermal: what the indenter is of ("steel"), texture: of what surface ("cork"); see `biotac_mj.attach`.
+        None leaves heat or vibration out.
       device: of the skin, "cpu" or "cuda:0".
     """
 
@@ -61,6 +64,10 @@ class PressOptions:
     two_way: bool = False
     friction: float | None = None
     seed: int = 0
+    sensor: str | dict | None = None
+    randomise: tuple | dict | None = None
+    thermal: str | dict | tuple | None = None
+    texture: str | dict | tuple | None = None
     device: str = "cpu"
     options: str | dict | None = None
 

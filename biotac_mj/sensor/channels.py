@@ -17,11 +17,13 @@ __all__ = [
     "FULL_SCALE",
     "NELECTRODE",
     "NPAC",
-    "OTHER_NOISE",
     "PAC_COLOUR",
     "PAC_NOISE",
+    "PAC_REST",
+    "PDC_REST",
     "REST_COUNTS",
     "REST_TEMPERATURE",
+    "TAC_REST",
     "WIDTHS",
     "counts_from_heating",
     "counts_from_impedance",
@@ -55,13 +57,13 @@ FULL_SCALE = 4095.0
 # average in two
 REST_TEMPERATURE = 48.4
 
-_DIVIDER = 10e3  # [ohm]
+DIVIDER = 10e3  # [ohm]
 _PDC_GAIN = 36.5  # [Pa] per count
 # CHOSEN: the manual gives no offset. Leaves 76 kPa above rest; the offset of a real sensor depends on its
 # filling
-_PDC_REST = 2000.0
+PDC_REST = 2000.0
 _PAC_GAIN = 0.37  # [Pa] per count
-_MIDDLE = FULL_SCALE / 2
+_MIDDLE = PAC_REST = TAC_REST = FULL_SCALE / 2
 _SERIES, _PARALLEL = 155183.0, 46555.0  # of the thermistor's divider
 _TDC_SCALE, _ZERO_CELSIUS = 4025.0, 273.15  # [K]
 _TAC_SCALE = -41.07  # [C/s]
@@ -69,7 +71,6 @@ _TAC_SCALE = -41.07  # [C/s]
 # TAC and TDC of 30 traces of two sensors (PHAC-2, holds of steel, acrylic and sponge), against 6603.
 _TAC_SHARE = 0.233
 _HOTTEST = -0.1  # [C/s] of the manual's formula, beyond which TAC's circuit is saturated
-OTHER_NOISE = 1.0  # [counts] of pdc, tdc, tac: CHOSEN, none was measured
 # MEASURED: what a resting PAC shows is n[i] = PAC_COLOUR n[i - 1] + PAC_NOISE white [counts]. Fitted to the
 # spectrum, 25 to 1000 Hz, of 7.6 s of a resting BioTac SP (native log); in 25 Hz bands 1.3 dB off at most,
 # 0.5 dB RMS. `benchmarks/vibration.py` does it again.
@@ -91,13 +92,13 @@ REST_COUNTS = {
 def counts_from_impedance(impedance: ArrayLike) -> np.ndarray:
     """Electrode counts E = 4095 / (Z / 10 kohm + 1). impedance [ohm], any shape; more liquid, lower Z, higher
     E."""
-    return np.float64(FULL_SCALE) / (impedance / np.float64(_DIVIDER) + np.float64(1.0))
+    return np.float64(FULL_SCALE) / (impedance / np.float64(DIVIDER) + np.float64(1.0))
 
 
 def impedance_from_counts(counts: ArrayLike) -> np.ndarray:
     """Z = (4095 / E - 1) * 10 kohm [ohm]; infinite at E = 0."""
     with np.errstate(divide="ignore"):
-        return (FULL_SCALE / np.asarray(counts, dtype=float) - 1) * _DIVIDER
+        return (FULL_SCALE / np.asarray(counts, dtype=float) - 1) * DIVIDER
 
 
 def log_impedance(counts: ArrayLike) -> np.ndarray:
@@ -114,12 +115,12 @@ def counts_from_log_impedance(log_z: ArrayLike) -> np.ndarray:
 
 def counts_from_pressure(pressure: ArrayLike) -> np.ndarray:
     """PDC counts: 36.5 Pa per count over a rest count that is chosen (2000). pressure: above rest [Pa]."""
-    return np.float64(_PDC_REST) + pressure / np.float64(_PDC_GAIN)
+    return np.float64(PDC_REST) + pressure / np.float64(_PDC_GAIN)
 
 
 def pressure_from_counts(counts: ArrayLike) -> np.ndarray:
     """Pressure above rest [Pa] of PDC counts."""
-    return (np.asarray(counts, dtype=float) - _PDC_REST) * _PDC_GAIN
+    return (np.asarray(counts, dtype=float) - PDC_REST) * _PDC_GAIN
 
 
 def counts_from_pac(pressure: ArrayLike) -> np.ndarray:

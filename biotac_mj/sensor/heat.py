@@ -19,21 +19,26 @@ stays with the body. A body that is left altogether is forgotten: the finger com
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.materials import Material
+from biotac_mj.sensor.presets import PER_DEGREE
 
 __all__ = [
     "CORE",
     "GIVEN",
+    "ABOVE",
     "LIQUID",
     "LOST",
+    "MADE",
     "THERMISTOR",
     "Heat",
     "HeatParameters",
+    "begin_heat",
     "electrode_factor",
     "half_space",
     "state_size",
@@ -44,16 +49,19 @@ wp.set_module_options({"enable_backward": False})
 NCELL = 8  # finite volumes through the skin
 NBRANCH = 10  # stores of a half-space
 # The state: temperatures [C] of the thermistor (and of the core about it), the core, the liquid; heat lost to
-# the air and the mount and heat given to bodies since the reset [J]; cells of the free skin, inside first;
-# then for each body the area [m^2], cells, its surface and its stores.
-THERMISTOR, CORE, LIQUID, LOST, GIVEN, FREE = range(6)
+# the air and the mount and heat given to bodies since the reset [J]; the heater's power [W]; the liquid's
+# temperature at which the electrodes show their rest, and how much warmer it is [C]; cells of the free skin,
+# inside first; then for each body the area [m^2], cells, its surface, its stores, and what it is of:
+# effusivity [W s^0.5 / (m^2 K)], temperature [C], conductivity [W/(m K)], so that a reset may change it.
+THERMISTOR, CORE, LIQUID, LOST, GIVEN, POWER, REFERENCE, ABOVE, FREE = range(9)
 BODIES = FREE + NCELL
 _SURFACE, _STORE = 1 + NCELL, 2 + NCELL
-BODY = _STORE + NBRANCH
+MADE = _STORE + NBRANCH
+_EFFUSIVITY, _BODY_TEMPERATURE, _BODY_CONDUCTIVITY = MADE, MADE + 1, MADE + 2
+BODY = MADE + 3
 
 _LN_RATIO = 2.0  # of neighbouring rates: 1.4 % of the impedance at the worst frequency, see `half_space`
 _SLOWEST = 1e-5  # [1/s]
-_PER_DEGREE = 0.071  # [1/C], of ln Z
 
 real = wp.float64
 _CELL = 1.0 / NCELL
@@ -115,30 +123,51 @@ class HeatParameters:
         """The same sensor with the power that keeps its core at a temperature [C]."""
         return dataclasses.replace(self, power=self.loss() * (temperature - self.ambient))
 
-    def rest(self, ngroup: int = 0) -> np.ndarray:
-        """The steady state (nstate,) of a sensor that nothing touches."""
+    def rest(self, bodies: Sequence[Material] = ()) -> np.ndarray:
+        """The steady state (nstate,) of a sensor that nothing touches, and that these bodies can."""
         layers = self.thickness / self.conductivity
         skin = self.area / (1 / self.gap + layers + 1 / self.air)
         above = self.power / self.loss()
         flux = above / (1 / self.inside + 1 / skin) / self.area
-        state = np.zeros(state_size(ngroup))
+        state = np.zeros(state_size(len(bodies)))
+        for g, b in enumerate(bodies):
+            begin = BODIES + BODY * g + MADE
+            state[begin : begin + 3] = b.effusivity, b.temperature, b.conductivity
         state[[THERMISTOR, CORE]] = self.ambient + above
         state[LIQUID] = self.ambient + flux * (1 / self.gap + layers + 1 / self.air)
         depth = layers * (np.arange(NCELL) + 0.5) / NCELL
         state[FREE:BODIES] = state[LIQUID] - flux * (1 / self.gap + depth)
+        state[POWER], state[REFERENCE] = self.power, state[LIQUID]
         return state
+
+
+def begin_heat(
+    temperature: float, warm_up: float = 0.0, cold: bool = False, bodies: Sequence[Material] = ()
+) -> np.ndarray:
+    """The state (nstate,) of a sensor whose core is at a temperature [C] at its reset and gets warmer by
+    `warm_up` [C]; `cold`: that is switched on at the reset and comes to that temperature. The heater's power
+    is in the state, so that sensors of one `Heat` may differ in it."""
+    sensor = HeatParameters().at_rest(temperature)
+    begin, reference = sensor.rest(bodies), sensor.rest()[LIQUID]
+    if cold:
+        begin = sensor.at_rest(sensor.ambient).rest(bodies)
+        begin[POWER] = sensor.power
+    else:
+        begin[POWER] = sensor.at_rest(temperature + warm_up).power
+    begin[REFERENCE], begin[ABOVE] = reference, begin[LIQUID] - reference
+    return begin
 
 
 def electrode_factor(temperature: ArrayLike, reference: ArrayLike) -> np.ndarray:
     """What the electrodes' impedances are multiplied by when the liquid is at a temperature and not at the
     reference [C] at which they were taken: -6.4 to -7.8 % per degree in five sensors, here -7.1 %."""
-    return np.exp(-_PER_DEGREE * (np.asarray(temperature, float) - reference))
+    return np.exp(-PER_DEGREE * (np.asarray(temperature, float) - reference))
 
 
 _FIELDS = [field.name for field in dataclasses.fields(HeatParameters)]
 Parameters = wp.types.vector(len(_FIELDS), real)
 (
-    _POWER, _AMBIENT, _C_CORE, _C_LIQUID, _C_NEAR, _MOUNT, _INSIDE, _SPREAD, _AREA, _THICKNESS, _CONDUCTIVITY,
+    _, _AMBIENT, _C_CORE, _C_LIQUID, _C_NEAR, _MOUNT, _INSIDE, _SPREAD, _AREA, _THICKNESS, _CONDUCTIVITY,
     _CAPACITY, _GAP, _FILM, _AIR, _CONTACT,
 ) = range(len(_FIELDS))  # fmt: skip
 
@@ -186,7 +215,6 @@ def step_heat(
     # In:
     dt: real,
     parameters: wp.array(dtype=Parameters),
-    bodies: wp.array2d(dtype=wp.vec3d),
     area: wp.array2d(dtype=real),
     force: wp.array2d(dtype=real),
     # Out:
@@ -228,8 +256,8 @@ def step_heat(
         if added > real(0.0):
             for i in range(NCELL):
                 state[w, b + 1 + i] = _mix(state[w, b + 1 + i], had, state[w, FREE + i], added)
-            for i in range(_SURFACE, BODY):
-                state[w, b + i] = _mix(state[w, b + i], had, bodies[w, g][1], added)
+            for i in range(_SURFACE, MADE):
+                state[w, b + i] = _mix(state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added)
             free -= added
             state[w, b] += added
 
@@ -257,17 +285,18 @@ def step_heat(
         b = BODIES + BODY * g
         patch = state[w, b]
         if patch > real(0.0):
-            body = bodies[w, g]
-            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], body[2])
+            effusivity = state[w, b + _EFFUSIVITY]
+            k_body = state[w, b + _BODY_CONDUCTIVITY]
+            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], k_body)
             touch = one / (half / layer + one / h)
-            known = body[0] * real(_SLOW) * body[1]
-            pull = body[0] * real(_SLOW)
+            known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
+            pull = effusivity * real(_SLOW)
             for i in range(NBRANCH):
-                c = body[0] * _branches[i] / (one + dt * _rates[i])
+                c = effusivity * _branches[i] / (one + dt * _rates[i])
                 known += c * state[w, b + _STORE + i]
                 pull += c
             at = b + _SURFACE
-            hold = body[0] * real(_FAST) / dt
+            hold = effusivity * real(_FAST) / dt
             total = hold + pull + touch
             state[w, at] = (hold * state[w, at] + known) / total
             scratch[w, at] = touch / total
@@ -293,13 +322,18 @@ def step_heat(
     liquid_share = q[_INSIDE] / liquid_total
     rest = (q[_C_CORE] - q[_C_NEAR]) / dt
     core = (
-        rest * state[w, CORE] + q[_POWER] + q[_MOUNT] * q[_AMBIENT] + q[_SPREAD] * near + q[_INSIDE] * liquid
+        rest * state[w, CORE]
+        + state[w, POWER]
+        + q[_MOUNT] * q[_AMBIENT]
+        + q[_SPREAD] * near
+        + q[_INSIDE] * liquid
     ) / (rest + q[_MOUNT] + q[_SPREAD] * (one - near_share) + q[_INSIDE] * (one - liquid_share))
     near += near_share * core
     liquid += liquid_share * core
     state[w, CORE] = core
     state[w, THERMISTOR] = near
     state[w, LIQUID] = liquid
+    state[w, ABOVE] = liquid - state[w, REFERENCE]
 
     # and outwards again
     t = liquid
@@ -312,7 +346,6 @@ def step_heat(
         b = BODIES + BODY * g
         patch = state[w, b]
         if patch > real(0.0):
-            body = bodies[w, g]
             t = near
             for i in range(1, _SURFACE + 1):
                 inside = t
@@ -322,7 +355,8 @@ def step_heat(
                 a = dt * _rates[i]
                 at = b + _STORE + i
                 state[w, at] = (state[w, at] + a * t) / (one + a)
-            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], body[2])
+            k_body = state[w, b + _BODY_CONDUCTIVITY]
+            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], k_body)
             given += patch * (inside - t) / (half / layer + one / h)
     state[w, LOST] += dt * lost
     state[w, GIVEN] += dt * given
@@ -361,25 +395,34 @@ class Heat:
             )
         self.ngroup, self.nworld, self.device = len(bodies), nworld, wp.get_device(device)
         self._parameters = parameters
-        rest = np.array([p.rest(self.ngroup) for p in parameters])
+        rest = np.array([p.rest(bodies) for p in parameters])
         self.nstate = rest.shape[1]
         numbers = np.array([dataclasses.astuple(p) for p in parameters], float)
         with wp.ScopedDevice(self.device):
             self.state = wp.array(rest, dtype=real)
             self._scratch = wp.zeros_like(self.state)
             self._constants = wp.array(numbers, dtype=Parameters)
-            self._bodies = wp.array(_numbers([bodies] * nworld), dtype=wp.vec3d, ndim=2)
             self.area = wp.zeros((nworld, self.ngroup), dtype=real)
             self.force = wp.zeros((nworld, self.ngroup), dtype=real)
-        inputs = [1.0, self._constants, self._bodies, self.area, self.force]
+        inputs = [1.0, self._constants, self.area, self.force]
         # packing the arguments takes longer than the step of one sensor
         self._step = wp.launch(
             step_heat, nworld, inputs, [self.state, self._scratch], device=self.device, record_cmd=True
         )
 
+    def read_from(self, area: wp.array, force: wp.array) -> None:
+        """From now on `area` and `force` are these (nworld, ngroup) arrays of the device."""
+        self.area, self.force = area, force
+        self._step.set_param_at_index(2, area)
+        self._step.set_param_at_index(3, force)
+
     def set_bodies(self, bodies: list[list[Material]]) -> None:
         """Gives every world bodies of its own: (nworld, ngroup) materials."""
-        self._bodies.assign(_numbers(bodies))
+        state = self.state.numpy()
+        made = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
+        patches = state[:, BODIES:].reshape(self.nworld, self.ngroup, BODY)
+        patches[:, :, MADE:] = np.array(made, float).reshape(self.nworld, self.ngroup, 3)
+        self.state.assign(state)
 
     def advance(self, dt: float) -> None:
         """One step of dt [s] with `area` and `force`. A launch only: may be captured in a CUDA graph."""
@@ -398,8 +441,3 @@ class Heat:
                 p.near * s[THERMISTOR] + (p.core - p.near) * s[CORE] + p.liquid * s[LIQUID] + cells * skin
             )
         return np.array(out)
-
-
-def _numbers(bodies):
-    rows = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
-    return np.array(rows, float).reshape(len(bodies), -1, 3)

@@ -7,9 +7,9 @@ import dataclasses
 import math
 import re
 import statistics
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-__all__ = ["MATERIALS", "ROOM", "SKIN", "Material", "material_of", "read_thermal"]
+__all__ = ["MATERIALS", "ROOM", "SKIN", "Material", "check_choices", "material_of", "read_thermal"]
 
 ROOM, SKIN = 23.0, 33.0  # [C] of things that lie about, of a living hand
 
@@ -191,6 +191,12 @@ def material_of(name: str) -> Material:
         f"no material is known by {name!r}: use one of {', '.join(MATERIALS)}, or give "
         "dict(effusivity=, temperature=)"
     )
+
+
+def check_choices(value: object, read: Callable) -> None:
+    """Raises ValueError for what of a value, or of one of a list of choices, `read` cannot read."""
+    for one in value if isinstance(value, (list, tuple)) and value else [value]:
+        read(one)
 
 
 def read_thermal(value: str | Material | Mapping) -> Material:

@@ -6,15 +6,21 @@ import numpy as np
 from biotac_mj.fields import check_entries, refuse_unknown
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
-from biotac_mj.sensor.channels import REST_COUNTS, REST_TEMPERATURE
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.sensor.heat import LIQUID, THERMISTOR, Heat, HeatParameters, electrode_factor
+from biotac_mj.sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from biotac_mj.sensor.materials import Material
-from biotac_mj.sensor.vibration import Vibration
+from biotac_mj.sensor.presets import Sensor, read_sensor
+from biotac_mj.sensor.vibration import Texture, Vibration
 
 __all__ = ["PhysicsReadings", "check_settings", "record"]
 
-_SETTINGS = {"noise": bool, "sensor": str, "film_every_step": bool, "temperature": float}
+_SETTINGS = {
+    "noise": bool,
+    "sensor": str | dict,
+    "randomise": list | dict,
+    "film_every_step": bool,
+    "temperature": float,
+}
 
 
 class PhysicsReadings:
@@ -25,18 +31,18 @@ class PhysicsReadings:
       geometry: the skin.
       seed: of the noise; give every sensor its own.
       noise: False leaves quantisation only.
-      sensor: "1" | "2" | "3", whose published rest counts the electrodes show at rest.
+      sensor: which one it is, see `presets.read_sensor`; "random" is drawn by the seed.
       film_every_step: solve the film in every step that samples an electrode, not once per 10 ms frame (see
       `Acquisition.needs_impedance`).
-      temperature: of the core at rest [C]; without `bodies` it is steady, TDC constant and TAC at mid-scale
-        but for noise.
+      temperature: of the core at the reset [C], None: the sensor's; without `bodies` nothing but the sensor's
+        own warm-up changes it.
       bodies: of what is made what may touch, one of each body; the sensor then has a heat of its own
         (`sensor.heat`), which moves TDC, TAC and, with the liquid's temperature, all electrodes. None: it has
         none.
       cold: the sensor is switched on at the reset: it begins at the temperature around it and warms up.
       film: a FilmConduction to share between sensors of the same geometry; None builds one.
-      vibration: of one sensor on the CPU, for what PAC feels of textures, taps and stick-slip; None: it feels
-        the pressure of whole steps alone.
+      vibration: of one sensor on the CPU, for what PAC feels of taps, stick-slip and `textures` of the
+        bodies; None: it feels the pressure of whole steps alone.
 
     Attributes:
       nstate: length of the state vector.
@@ -47,45 +53,58 @@ class PhysicsReadings:
         geometry: SkinGeometry,
         seed: int = 0,
         noise: bool = True,
-        sensor: str = "1",
+        sensor: str | dict | Sensor = "1",
         film_every_step: bool = False,
-        temperature: float = REST_TEMPERATURE,
+        temperature: float | None = None,
         film: FilmConduction | None = None,
         bodies: list[Material] | None = None,
         cold: bool = False,
         vibration: Vibration | None = None,
+        textures: list[Texture] | None = None,
     ):
-        self.film = FilmConduction(geometry, sensor=sensor) if film is None else film
-        self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step)
-        self.temperature = temperature
-        self._heat = self._begin = None
+        self.film = FilmConduction(geometry) if film is None else film
+        own = self.sensor = read_sensor(sensor, seed)
+        more = {"sensor": own, "film_rest": self.film.rest, "heat": bodies is not None}
+        self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step, **more)
+        self._temperature, self._cold = temperature, cold
+        self._heat = None
         if bodies is not None:
-            sensor = HeatParameters().at_rest(temperature)
-            self._heat = Heat(bodies, sensor)
-            begins = sensor if not cold else sensor.at_rest(sensor.ambient)
-            self._begin, self._liquid = begins.rest(len(bodies)), sensor.rest()[LIQUID]
+            self._heat = Heat(bodies)
         elif cold:
             raise ValueError("cold is of a sensor with heat: give bodies, in attach thermal")
         self._warm = slice(self.acquisition.nstate, self.acquisition.nstate)
         if self._heat is not None:
             self._warm = slice(self._warm.start, self._warm.start + self._heat.nstate)
-        self._vibration = vibration
+        self._vibration, self._bodies, self._textures = vibration, bodies, textures or []
         self.nstate = self._warm.stop + (0 if vibration is None else vibration.nstate)
         self._rest, self._rest_vert = self.film.impedance(geometry.vert), geometry.vert
 
     def reset(
-        self, state: np.ndarray, vert_xpos: np.ndarray | None = None, pressure: float = 0.0, time: float = 0.0
+        self,
+        state: np.ndarray,
+        vert_xpos: np.ndarray | None = None,
+        pressure: float = 0.0,
+        time: float = 0.0,
+        sensor: Sensor | None = None,
+        bodies: list[Material] | None = None,
+        textures: list[Texture] | None = None,
+        impedance: np.ndarray | None = None,
     ) -> None:
-        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], by default at rest, into state
-        (nstate,)."""
-        impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
-        temperature = self.temperature
+        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (19,)
+        [ohm], by default at rest, into state (nstate,); from now on those of `sensor`, which what is of
+        `bodies` with `textures` may touch, by default those of the settings."""
+        if impedance is None:
+            impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
+        acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)
+        own = acquisition.sensor
+        temperature, liquid = own.temperature if self._temperature is None else self._temperature, 0.0
         if self._heat is not None:
-            state[self._warm] = self._begin
-            temperature = self._begin[THERMISTOR]
-            impedance = impedance * electrode_factor(self._begin[LIQUID], self._liquid)
-        state[self._warm.stop :] = 0.0
-        self.acquisition.reset(self._counts(state), impedance, pressure, temperature, time)
+            begin = begin_heat(temperature, own.warm_up, self._cold, bodies or self._bodies)
+            state[self._warm] = begin
+            temperature, liquid = begin[THERMISTOR], begin[ABOVE]
+        if self._vibration is not None:
+            state[self._warm.stop :] = self._vibration.rest(textures or self._textures)
+        acquisition.reset(self._counts(state), impedance, pressure, temperature, time, liquid)
 
     def _counts(self, state):
         return state[: self.acquisition.nstate]
@@ -95,11 +114,12 @@ class PhysicsReadings:
         state: np.ndarray,
         time: float,
         dt: float,
-        vert_xpos: np.ndarray,
+        vert_xpos: np.ndarray | None,
         pressure: float,
         area: np.ndarray | None = None,
         force: np.ndarray | None = None,
         shaking: tuple | None = None,
+        impedance: np.ndarray | None = None,
     ) -> None:
         """Samples the step (time, time + dt].
 
@@ -111,24 +131,21 @@ class PhysicsReadings:
           area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
             touches.
           shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
+          impedance: (19,) of the film at the end of the step [ohm], which is not solved then.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
         """
-        impedance, counts, temperature = None, self._counts(state), self.temperature
+        counts, temperature, liquid = self._counts(state), None, 0.0
         heat = self._advance_heat(state, dt, area, force)
         if heat is not None:
-            temperature = heat[THERMISTOR]
-        if self.acquisition.needs_impedance(
-            counts, time, dt
-        ):  # a skin that nothing touches need not be solved again
-            impedance = (
-                self._rest if np.array_equal(vert_xpos, self._rest_vert) else self.film.impedance(vert_xpos)
-            )
-            if heat is not None:
-                impedance = impedance * electrode_factor(heat[LIQUID], self._liquid)
+            temperature, liquid = heat[THERMISTOR], heat[ABOVE]
+        if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
+            # a skin that nothing touches need not be solved again
+            still = np.array_equal(vert_xpos, self._rest_vert)
+            impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
-        self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken)
+        self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
         if heat is not None:
             state[self._warm] = heat
         if moved is not None:
@@ -176,8 +193,7 @@ def check_settings(given: dict, more: dict | None = None, what: str = "options['
     known = _SETTINGS | (more or {})
     check_entries(what, given, known, known)
     refuse_unknown(given, known, what)
-    if given.get("sensor", "") not in ("", *REST_COUNTS):
-        raise ValueError(f"sensor is {given['sensor']!r}: pass one of {', '.join(map(repr, REST_COUNTS))}")
+    read_sensor(given.get("sensor", "1"))
     return given
 
 

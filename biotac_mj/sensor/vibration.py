@@ -58,8 +58,9 @@ ROUGHNESS = {
 }
 _LOW, _HIGH = (math.tan(math.pi * hertz / SLOT_RATE) for hertz in (1040.0, 10.0))  # of the band-pass
 _FILTER = 4  # numbers of the band-pass, behind the modes in the state
-# of a body: phase; what makes the waves, waves and grain, over their RMS; speed; then the gains
-_BODY, _SPEED = 5, 4
+# of a body: phase; what makes the waves, waves and grain, over their RMS; speed; its texture: pitch, height,
+# roughness [m], so that a reset may change it; then the gains
+_BODY, _SPEED, _TEXTURE = 8, 4, 5
 _KEY = 0x1E3779B97F4A7C15  # by which the seeds of the roughness differ from the noise's
 
 
@@ -158,7 +159,6 @@ def shake(
     dt: real,
     section: wp.array(dtype=wp.vec3d),
     share: wp.array(dtype=real),
-    texture: wp.array2d(dtype=wp.vec3d),
     seed: wp.array(dtype=wp.uint64),
     time: wp.array(dtype=real),
     drive: wp.array2d(dtype=real),
@@ -190,7 +190,7 @@ def shake(
         for g in range(nbody):
             b = bodies + size * g
             speed = state[w, b + _SPEED] + s * (slip[w, g] - state[w, b + _SPEED])
-            t = texture[w, g]
+            t = wp.vec3d(state[w, b + _TEXTURE], state[w, b + _TEXTURE + 1], state[w, b + _TEXTURE + 2])
             wave = turn / t[0]
             phase = state[w, b] + wave * speed * period
             state[w, b] = phase - turn * wp.floor(phase / turn)
@@ -248,11 +248,11 @@ class Vibration:
       modes: of the skin.
       textures: of the touching bodies, the same in every world.
       nworld: number of sensors.
-      seed: of the roughness, 0 .. 2**64 - 1; world w has seed + w.
+      seed: of the roughness, 0 .. 2**64 - 1; world w has seed + w. Or (nworld,) of them.
       device: Warp device.
 
     Attributes:
-      state: (nworld, nstate) wp.array float64, zero where nothing moves.
+      state: (nworld, nstate) wp.array float64, as `rest` says where nothing moves.
       time: (nworld,) wp.array float64, at the start of the next step [s]; the caller's.
       drive: (nworld, nmode) wp.array float64, modal force of all contacts at the end of the step
         [N kg^-1/2]. gain: (nworld, nbody, nmode + 1), modal forces that a height under each body makes
@@ -263,19 +263,19 @@ class Vibration:
     """
 
     def __init__(
-        self, modes: Modes, textures: list[Texture], nworld: int = 1, seed: int = 0, device: str = "cpu"
+        self, modes: Modes, textures: list[Texture], nworld: int = 1, seed: ArrayLike = 0, device: str = "cpu"
     ):
         self.nmode, self.nbody, self.nworld = len(modes.rate), len(textures), nworld
         self.device, self.nstate = wp.get_device(device), state_size(self.nmode, self.nbody)
-        seeds = (np.uint64(seed) + np.arange(nworld, dtype=np.uint64)).astype(np.uint64)
-        rows = np.array([[dataclasses.astuple(t) for t in textures]] * nworld, float).reshape(nworld, -1, 3)
+        seeds = np.asarray(seed, np.uint64)
+        if not seeds.ndim:
+            seeds = seeds + np.arange(nworld, dtype=np.uint64)
         with wp.ScopedDevice(self.device):
             self._section = wp.array(sections(modes.rate), dtype=wp.vec3d)
             self._share = wp.array(modes.share, dtype=real)
-            self._texture = wp.array(rows, dtype=wp.vec3d, ndim=2)
             self._seed = wp.array(seeds, dtype=wp.uint64)
             self.time = wp.zeros(nworld, dtype=real)
-            self.state = wp.zeros((nworld, self.nstate), dtype=real)
+            self.state = wp.array(np.tile(self.rest(textures), (nworld, 1)), dtype=real)
             self.drive = wp.zeros((nworld, self.nmode), dtype=real)
             self.gain = wp.zeros((nworld, self.nbody, self.nmode + 1), dtype=real)
             self.slip, self.area, self._height = (
@@ -283,17 +283,36 @@ class Vibration:
             )
         self._dt, self.pressure = None, None
 
-    def advance(self, dt: float) -> None:
-        """The slots of a step of dt [s]. A launch only once dt is known: may be captured in a CUDA graph."""
+    def rest(self, textures: list[Texture]) -> np.ndarray:
+        """The state (nstate,) of a sensor that nothing moves, with textures of the bodies."""
+        state = np.zeros(self.nstate)
+        bodies = state[3 * self.nmode + _FILTER :].reshape(self.nbody, _BODY + self.nmode + 1)
+        made = [dataclasses.astuple(t) for t in textures]
+        bodies[:, _TEXTURE : _TEXTURE + 3] = np.array(made, float).reshape(-1, 3)
+        return state
+
+    def read_from(
+        self, time: wp.array, drive: wp.array, gain: wp.array, slip: wp.array, area: wp.array
+    ) -> None:
+        """From now on `time`, `drive`, `gain`, `slip` and `area` are these arrays of the device."""
+        self.time, self.drive, self.gain, self.slip, self.area = time, drive, gain, slip, area
+        self._dt = None
+
+    def prepare(self, dt: float) -> None:
+        """Makes room for steps of dt [s]."""
         if dt != self._dt:
             self._dt = dt
             nslot = math.ceil(dt * SLOT_RATE) + 1
             self.pressure = wp.zeros((self.nworld, nslot), dtype=real, device=self.device)
-            inputs = [self._section, self._share, self._texture, self._seed, self.time, self.drive]
+            inputs = [self._section, self._share, self._seed, self.time, self.drive]
             inputs += [self.gain, self.slip, self.area]
             outputs = [self.state, self._height, self.pressure]
             # packing the arguments takes longer than the step of one sensor
             self._step = wp.launch(
                 shake, self.nworld, [dt, *inputs], outputs, device=self.device, record_cmd=True
             )
+
+    def advance(self, dt: float) -> None:
+        """The slots of a step of dt [s]. A launch only, once prepared: may be captured in a CUDA graph."""
+        self.prepare(dt)
         self._step.launch()

@@ -10,7 +10,11 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
 from .. import plugin
-from ..sensor.channels import FULL_SCALE, OTHER_NOISE, electrode_noise
+from ..effects.sensors import take_sensor
+from ..sensor.channels import FULL_SCALE
+from ..sensor.materials import check_choices, read_thermal
+from ..sensor.presets import Sensor
+from ..sensor.vibration import read_texture
 
 __all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
 
@@ -69,6 +73,8 @@ class BioTac(composer.Entity):
         noise=True,
         geoms=None,
         rounding=None,
+        thermal=None,
+        textures=None,
         options=None,
         on_error="raise",
         **settings,
@@ -79,7 +85,9 @@ class BioTac(composer.Entity):
           skin, tier: see `biotac_mj.attach`; "condensed" steps in real time.
           slots: how many bodies of the whole model may touch it two-way.
           noise: whether the observables have the real sensor's noise.
-          geoms, rounding: see `biotac_mj.coupling.Config`; names are those of the whole model.
+          geoms, rounding, thermal, textures: see `biotac_mj.attach`; names are those of the whole model. Of a
+            list of materials or textures every reset draws one, as it draws sensor="random" and what
+            `randomise` names, from the environment's random state.
           on_error: "raise" ends the episode with what went wrong inside a step, "warn" goes on without touch.
           options, settings: further ones of `biotac_mj.attach`.
 
@@ -111,6 +119,9 @@ class BioTac(composer.Entity):
             slots=slots,
             options=options,
             on_error=on_error,
+            # which geoms are of what is said below: the arena is not here yet
+            thermal=None if thermal is None else {},
+            textures=None if textures is None else {},
             **settings,
         )
         with plugin.explained():
@@ -123,13 +134,17 @@ class BioTac(composer.Entity):
         for element in root.find_all("default"):
             if (element.dclass or "").startswith(_PREFIX):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
-        self._name_geoms(root, geoms, rounding)
-        self._mjcf_root, self._noise = root, noise
+        for named, reads in ((thermal, read_thermal), (textures, read_texture)):
+            for value in (named or {}).values():
+                check_choices(value, reads)
+        self._name_geoms(root, geoms, rounding, thermal, textures)
+        self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
         self._outer = _outer_nodes(skin)
 
-    def _name_geoms(self, root, geoms, rounding):
+    def _name_geoms(self, root, geoms, rounding, thermal, textures):
         """Settings about geoms that are not here yet, but in the arena."""
         named = {"geoms": None if geoms is None else tuple(geoms), "rounding": dict(rounding or {})}
+        named |= {"thermal": thermal, "textures": textures}
         self.handle = dataclasses.replace(
             self.handle, config=dataclasses.replace(self.handle.config, **named)
         )
@@ -162,24 +177,40 @@ class BioTac(composer.Entity):
         for reading in self.observables.readings():
             reading.resolve(physics.timestep())
 
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Draws what the settings leave open: sensor, effects, materials, textures."""
+        if self._draws:
+            found = self._here().draw(physics.model.ptr, physics.data.ptr, int(random_state.randint(2**31)))
+            self._sensor = found or self._sensor
+
+    @property
+    def _draws(self):
+        config = self.handle.config
+        choices = [*(config.thermal or {}).values(), *(config.textures or {}).values()]
+        open_ = take_sensor(config.options.get("readings", {}))[2]
+        return open_ or any(isinstance(value, (list, tuple)) for value in choices)
+
+    @property
+    def sensor(self) -> Sensor:
+        """Its own numbers in this episode."""
+        return self._sensor
+
     def read(self, physics: mjcf.Physics, channel: str) -> np.ndarray:
         """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m],
         status; see `Handle.read`."""
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
     def rest(self) -> np.ndarray:
-        """(19,) counts of the electrodes at rest: the published ones of the sensor that `options` names."""
-        from ..sensor.channels import REST_COUNTS
-
-        return REST_COUNTS[self.handle.config.options["readings"].get("sensor", "1")].copy()
+        """(19,) counts of the electrodes at rest."""
+        return np.array(self.sensor.rest)
 
     def vert_xpos(self, physics: mjcf.Physics) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame."""
-        from ..coupling.attachment import Handle
+        return self._here().vert_xpos(physics.model.ptr, physics.data.ptr)
 
-        return Handle("", self.core.full_identifier, self.handle.config).vert_xpos(
-            physics.model.ptr, physics.data.ptr
-        )
+    def _here(self):
+        """Its handle in the whole model."""
+        return dataclasses.replace(self.handle, prefix="", body=self.core.full_identifier)
 
     def contact_patch(self, physics: mjcf.Physics) -> np.ndarray:
         """(6,) where the skin is pushed, BioTac frame: the point of the deformed skin [m] that is nearest to
@@ -220,7 +251,13 @@ class BioTacObservables(composer.Observables):
 
     def _channel(self, name, noise):
         entity = self._entity
-        return Reading(lambda physics: entity.read(physics, name), noise=noise if entity.noise else None)
+
+        def corrupt(counts, random_state):
+            return np.clip(np.round(counts + noise(entity.sensor, counts, random_state)), 0, FULL_SCALE)
+
+        return Reading(
+            lambda physics: entity.read(physics, name), noise=corrupt if noise and entity.noise else None
+        )
 
     @composer.observable
     def electrodes(self) -> Reading:
@@ -228,19 +265,19 @@ class BioTacObservables(composer.Observables):
 
     @composer.observable
     def pac(self) -> Reading:
-        return self._channel("pac", _other_noise)
+        return self._channel("pac", _pac_noise)
 
     @composer.observable
     def pdc(self) -> Reading:
-        return self._channel("pdc", _other_noise)
+        return self._channel("pdc", _white("pdc_noise"))
 
     @composer.observable
     def tac(self) -> Reading:
-        return self._channel("tac", _other_noise)
+        return self._channel("tac", _white("tac_noise"))
 
     @composer.observable
     def tdc(self) -> Reading:
-        return self._channel("tdc", _other_noise)
+        return self._channel("tdc", _white("tdc_noise"))
 
     @composer.observable
     def contact_force(self) -> Reading:
@@ -256,16 +293,24 @@ class BioTacObservables(composer.Observables):
         return Reading(lambda physics: entity.vert_xpos(physics)[entity.outer])
 
 
-def _counts(values):
-    return np.clip(np.round(values), 0, FULL_SCALE)
+def _electrode_noise(sensor, counts, random_state):
+    return sensor.electrode_noise(counts) * random_state.standard_normal(np.shape(counts))
 
 
-def _electrode_noise(counts, random_state):
-    return _counts(counts + electrode_noise(counts) * random_state.standard_normal(np.shape(counts)))
+def _white(name):
+    def noise(sensor, counts, random_state):
+        return getattr(sensor, name) * random_state.standard_normal(np.shape(counts))
+
+    return noise
 
 
-def _other_noise(counts, random_state):
-    return _counts(counts + OTHER_NOISE * random_state.standard_normal(np.shape(counts)))
+def _pac_noise(sensor, counts, random_state):
+    """Coloured within the frame, which begins as if it had gone on for ever."""
+    out = sensor.pac_noise * random_state.standard_normal(np.shape(counts))
+    out[0] /= np.sqrt(1 - sensor.pac_colour**2)
+    for i in range(1, len(out)):
+        out[i] += sensor.pac_colour * out[i - 1]
+    return out
 
 
 def _outer_nodes(skin):

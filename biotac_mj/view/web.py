@@ -12,7 +12,7 @@ import numpy as np
 from ..coupling.show import electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5
-from ..sensor.channels import CHANNELS, NELECTRODE, REST_COUNTS, check_counts, check_force
+from ..sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
 
 __all__ = ["Finger", "Page", "play_file", "play_model"]
 
@@ -236,7 +236,7 @@ def play_model(
         fingers = {
             name: Finger.of(
                 load_skin(h.config.skin),
-                REST_COUNTS[h.config.options.get("readings", {}).get("sensor", "1")],
+                np.array(h.numbers.rest),
             )
             for name, h in handles.items()
         }

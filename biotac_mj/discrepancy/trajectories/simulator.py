@@ -16,8 +16,9 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
+from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...fields import check_types
-from ...files import replacing, write_npz
+from ...files import write_npz
 from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...skin.settings import plain, read_material, read_settings
@@ -26,9 +27,8 @@ from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
-__all__ = ["SCHEMA", "Fields", "Simulator", "placed"]
+__all__ = ["Fields", "Simulator", "placed"]
 
-SCHEMA = "biotac_mj.sensor/1"
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
 _RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
@@ -351,40 +351,11 @@ class Simulator:
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes the stages and effects as YAML."""
-        import yaml
-
-        stages = {
-            "set-up": [],
-            "boundary": [],
-            "contact": [],
-            "constitutive": [],
-            "transduction": [],
-            "acquisition": [],
-        }
-        for effect, theta in self.effects:
-            parameters = {}
-            for name, value in theta.items():
-                low, high = self.intervals.get(effect.id, {}).get(name, (None, None))
-                entry = {"value": float(value), "unit": effect.params[name].unit}
-                if low is not None:
-                    entry["interval95"] = [float(low), float(high)]
-                parameters[name] = entry
-            stages[STAGES[effect.stage]].append(
-                {"effect": effect.id, "name": effect.name, "parameters": parameters}
-            )
-        document = {
-            "schema": SCHEMA,
-            "skin": self.skin,
-            "tier": self.tier,
-            "material": plain(self.material),
-            **({"options": plain(self.options)} if self.options else {}),
-            "sensor": self.sensor,
-            "constitutive": self.constitutive,
-            "modulus_factor": float(self.modulus),
-            "stages": {k: v for k, v in stages.items() if v},
-        }
-        with replacing(path) as temporary:
-            temporary.write_text(yaml.safe_dump(document, sort_keys=False))
+        base = {"skin": self.skin, "tier": self.tier, "material": plain(self.material)}
+        base |= {"options": plain(self.options)} if self.options else {}
+        base |= {"sensor": self.sensor, "constitutive": self.constitutive}
+        base["modulus_factor"] = float(self.modulus)
+        write_sensor_file(path, SensorFile(base, self.effects, self.intervals))
 
 
 @dataclasses.dataclass

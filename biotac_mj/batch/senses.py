@@ -1,0 +1,203 @@
+"""The sensors of all worlds: film, acquisition, and heat and vibration where they are wanted."""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ..coupling.readings import materials_of, textures_of
+from ..coupling.stepper import Geom
+from ..effects.sensors import take_sensor
+from ..sensor.acquisition import BatchAcquisition
+from ..sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
+from ..sensor.materials import Material
+from ..sensor.presets import Sensor
+from ..sensor.vibration import Modes, Texture, Vibration
+from ..skin.modes import skin_modes
+from ..skin.touched import Touched
+from .skin import BatchSkin
+
+__all__ = ["Draw", "Senses", "draws"]
+
+wp.set_module_options({"enable_backward": False})
+
+_POOL = 256  # sensors that resets draw from, at least
+
+
+class Draw(NamedTuple):
+    """What one world's sensor is, and what the bodies that touch it are of; None without heat, vibration."""
+
+    sensor: Sensor
+    bodies: list[Material] | None
+    textures: list[Texture] | None
+
+
+def draws(
+    nworld: int,
+    seed: ArrayLike,
+    settings: dict,
+    thermal: dict | list | None,
+    textures: dict | list | None,
+    geoms: list[Geom],
+) -> tuple[list[Draw], bool]:
+    """What worlds begin with, or what their resets draw from.
+
+    Args:
+      nworld: number of worlds. seed: of what is drawn, one or (nworld,), of which the first counts.
+      settings: of the readings; its "sensor", thermal and textures may be lists of one for each world.
+      geoms: that can touch.
+
+    Returns:
+      [Draw], one for each world or more, and whether every reset draws one.
+
+    Raises:
+      ValueError: lists of another length, or what cannot be.
+    """
+    lists = {"sensor": settings.get("sensor"), "thermal": thermal, "textures": textures}
+    lists = {name: value for name, value in lists.items() if isinstance(value, list)}
+    for name, value in lists.items():
+        if len(value) != nworld:
+            raise ValueError(f"{len(value)} {name} for {nworld} worlds: pass one for each, or a single one")
+
+    def row(i):
+        mine = {**settings, "sensor": lists["sensor"][i]} if "sensor" in lists else settings
+        made, brushed = (v[i] if isinstance(v, list) else v for v in (thermal, textures))
+        key = [int(np.ravel(seed)[0]), i]
+        sensor, _, drawn = take_sensor(mine, key)
+        bodies = None if made is None else materials_of(geoms, made, key)
+        surfaces = None if brushed is None else textures_of(geoms, brushed, key)
+        choices = [*(made or {}).values(), *(brushed or {}).values()]
+        return Draw(sensor, bodies, surfaces), drawn or any(isinstance(c, (list, tuple)) for c in choices)
+
+    first, drawn = row(0)
+    if not (drawn or lists):
+        return [first] * nworld, False
+    redraw = not lists
+    count = max(_POOL, nworld) if redraw else nworld
+    return [row(i)[0] for i in range(count)], redraw
+
+
+@wp.kernel
+def reset_rows(
+    # In:
+    mask: wp.array(dtype=bool),
+    row: wp.array(dtype=int),
+    rest: wp.array2d(dtype=wp.float64),
+    # Out:
+    state_out: wp.array2d(dtype=wp.float64),
+):
+    """Rest states of worlds: the row of `rest` that each has drawn."""
+    w, i = wp.tid()
+    if mask[w]:
+        state_out[w, i] = rest[row[w], i]
+
+
+class Senses:
+    """Of the skins of a batch.
+
+    Args:
+      skin: BatchSkin. film: BatchFilm, or what stands for it.
+      group: (ngeom,) body of each geom.
+      rows: [Draw] of `draws`; redraw: whether resets draw from them.
+      seed: see `BatchAcquisition`. dt: time step [s].
+      cold, temperature: see `PhysicsReadings`. settings: noise, film_every_step.
+
+    Attributes:
+      acquisition: BatchAcquisition. heat: Heat, vibration: Vibration, or None.
+    """
+
+    def __init__(
+        self,
+        skin: BatchSkin,
+        film: object,
+        group: np.ndarray,
+        rows: list[Draw],
+        redraw: bool,
+        seed: ArrayLike,
+        dt: float,
+        cold: bool = False,
+        temperature: float | None = None,
+        **settings: object,
+    ):
+        self._skin, self.film, self._dt = skin, film, dt
+        device, nworld, ngroup = skin.model.device, skin.nworld, skin.ngroup
+        warm, shaken = rows[0].bodies is not None, rows[0].textures is not None
+        self.heat = self.vibration = self._touched = None
+        self._rests, begins = [], None
+        if warm:
+            self.heat = Heat(rows[0].bodies, nworld=nworld, device=device)
+            begins = np.array([_begin(row, temperature, cold) for row in rows])
+            self._rests.append((wp.array(begins, dtype=wp.float64, device=device), self.heat.state))
+            temperature = begins[:, THERMISTOR]
+        elif cold:
+            raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
+        self.acquisition = BatchAcquisition(
+            film.rest,
+            nworld,
+            seed,
+            temperature=temperature,
+            liquid=begins[:, ABOVE] if warm else 0.0,
+            sensor=[r.sensor for r in rows],
+            redraw=redraw,
+            heat=warm,
+            device=device,
+            **settings,
+        )
+        if warm:
+            self.acquisition.temperature = self.heat.state[:, THERMISTOR]
+            self.acquisition.liquid = self.heat.state[:, ABOVE]
+        modes = skin_modes(skin.model) if shaken else None
+        if shaken:
+            few = Modes(modes.rate, modes.share)
+            self.vibration = Vibration(
+                few, rows[0].textures, nworld, self.acquisition.seed.numpy(), str(device)
+            )
+            rests = np.array([self.vibration.rest(r.textures) for r in rows])
+            self._rests.append((wp.array(rests, dtype=wp.float64, device=device), self.vibration.state))
+        if warm or shaken:
+            t = self._touched = Touched(skin.data, group, ngroup, modes)
+        if warm:
+            self.heat.read_from(t.area, t.force)
+        if shaken:
+            self.vibration.read_from(self.acquisition.time, t.drive, t.gain, t.slip, t.area)
+            self.vibration.prepare(dt)
+
+    @property
+    def nbytes(self) -> int:
+        """Device memory that grows with the number of worlds [bytes]."""
+        states = [self.acquisition.state, *(state for _, state in self._rests)]
+        return self.film.nbytes + sum(state.capacity for state in states)
+
+    def reset(self, mask: wp.array) -> None:
+        """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest; may draw other sensors."""
+        self.acquisition.reset(mask)
+        for rest, state in self._rests:
+            inputs = [mask, self.acquisition.row, rest]
+            wp.launch(reset_rows, state.shape, inputs, [state], device=state.device)
+
+    def begin_step(self) -> None:
+        """Before the skins are solved."""
+        if self.vibration:
+            self._touched.begin()
+
+    def advance(self, wrench: wp.array, tangent: wp.array) -> wp.array:
+        """After it; wrench, tangent (ngroup, nworld) of the skins ON the bodies. Returns the states (nworld,
+        NSTATE)."""
+        skin, acquisition = self._skin, self.acquisition
+        if self._touched:
+            self._touched.end(wrench, tangent)
+        if self.heat:
+            self.heat.advance(self._dt)
+        self.film.solve_film(skin.x, acquisition.find_due(self._dt))
+        shaken = None
+        if self.vibration:
+            self.vibration.advance(self._dt)
+            shaken = self.vibration.pressure
+        acquisition.advance(self._dt, self.film.impedance, self.film.valid, skin.pressure, shaken)
+        return acquisition.state
+
+
+def _begin(row, temperature, cold):
+    warm = row.sensor.temperature if temperature is None else temperature
+    return begin_heat(warm, row.sensor.warm_up, cold, row.bodies)

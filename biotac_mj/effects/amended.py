@@ -1,0 +1,167 @@
+"""A sensor that runs with effects: what each becomes of the skin, its contact and liquid, and of the sensor's
+own numbers, so that every path that takes these has the effect."""
+
+import dataclasses
+import pathlib
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.skins import skin_reference
+from ..sensor.presets import Sensor, read_sensor
+from ..skin.contact.law import ContactLaw
+from ..skin.model import SkinOptions
+from ..skin.settings import plain, read_dict, read_material, read_modulus
+from .catalogue import CATALOGUE
+from .effect import STAGES, Effect
+from .in_skin import memory_of
+from .sensor_file import SensorFile, read_sensor_file
+from .sensors import RUNNING, with_effects
+
+__all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
+
+Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as `attach` takes them
+
+_AIR = 101325.0  # [Pa]
+_ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
+
+
+@dataclasses.dataclass
+class Model:
+    """What a sensor is made with, as `attach` takes it: `skin`, `material`, `options` and `sensor` may be
+    None. `friction` is what the caller gave."""
+
+    skin: str | pathlib.Path | SkinGeometry | None
+    material: object
+    options: dict | None
+    sensor: object
+    friction: object
+
+
+def take_effects(effects: Effects) -> tuple[SensorFile, str]:
+    """A sensor file, or [(Effect, theta)] with nothing said of the base model; and where they come from.
+
+    Raises:
+      FileNotFoundError, ValueError: see `sensor_file.read_sensor_file`; no such list.
+    """
+    if isinstance(effects, (str, pathlib.Path)):
+        return read_sensor_file(effects), str(effects)
+    try:
+        pairs = [(effect, {**effect.default(), **theta}) for effect, theta in effects]
+    except (TypeError, ValueError, AttributeError):
+        raise ValueError(
+            f"effects is {effects!r}: give a sensor file, or a list of (Effect, theta)"
+        ) from None
+    return SensorFile({}, pairs, {}), "effects"
+
+
+def amend(model: Model, effects: Effects) -> Model:
+    """The model with effects in it; where it leaves something open, the base model of their file is taken.
+
+    The set-up's effects (misalignment, the tool's radius) belong to where the data was taken: they are left
+    out with a warning.
+
+    Args:
+      effects: a sensor file, such as `biotac diagnose` writes, or [(Effect, theta)].
+
+    Raises:
+      FileNotFoundError, ValueError: see `take_effects`; an effect that no sensor can run with.
+    """
+    file, where = take_effects(effects)
+    base, left = file.base, []
+    skin = base.get("skin", "default") if model.skin is None else model.skin
+    material = read_material(base.get("material") if model.material is None else model.material)
+    options = {**base.get("options", {}), **(model.options or {})}
+    sensor = read_sensor(base.get("sensor", "1") if model.sensor is None else model.sensor)
+    factor = float(base.get("modulus_factor", 1.0))
+    material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
+    friction, bulk, of_sensor, of_rubber = model.friction, 0.0, [], []
+    for effect, theta in sorted(file.effects, key=lambda pair: _ORDER.get(pair[0].id, len(_ORDER))):
+        if effect.id == "friction":
+            more = float(np.exp(theta["log_mu"]))
+            if friction is None:
+                material = dataclasses.replace(material, friction=more * material.friction)
+            else:
+                friction = more * np.asarray(friction, float)
+        elif effect.id == "bubble":
+            bulk += theta["volume"] / (_AIR * _liquid(skin_reference(skin)[1]))
+        elif effect.stage in "SB" or effect.id == "force_cross" or theta.get("delay", 0.0) < 0:
+            left.append(effect)  # a negative delay is of the other clock
+        elif effect.id in RUNNING:
+            of_sensor.append((effect, theta))
+        else:
+            of_rubber.append((effect, theta))
+    inside = memory_of(of_rubber)
+    if inside.rest:
+        raise ValueError(f"{where}: no running sensor can have the effect {inside.rest[0][0].id!r}")
+    if left:
+        names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in left)
+        warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=3)
+    material = dataclasses.replace(material, **_joined(material, inside.material))
+    if inside.contact or bulk:
+        options["skin"] = _skin_options(options.get("skin"), inside.contact, bulk)
+    if inside.model:
+        options["modulus"] = _modulus(options.get("modulus"), inside.model["modulus"], skin)
+    return Model(skin, material, options, _plain_sensor(with_effects(sensor, of_sensor)), friction)
+
+
+def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
+    """Settings of a dataclass, such as PressOptions, with effects in them; what is as `kind` has it by
+    default is left to the effects' file.
+
+    Raises:
+      FileNotFoundError, ValueError: see `amend`.
+    """
+    default = {f.name: f.default for f in dataclasses.fields(kind)}
+    names = [f.name for f in dataclasses.fields(Model) if f.name in default]
+    said = {name: None if given.get(name) == default[name] else given.get(name) for name in names}
+    said["options"] = read_dict(said["options"], "options")
+    out = amend(Model(**{f.name: said.get(f.name) for f in dataclasses.fields(Model)}), effects)
+    return {**given, **{name: plain(getattr(out, name)) for name in names}}
+
+
+def _joined(material, new):
+    """Terms of memory go beside those that are there."""
+    out = {k: v for k, v in new.items() if k not in ("prony", "hysteresis")}
+    for name in ("prony", "hysteresis"):
+        if new.get(name):
+            out[name] = (*getattr(material, name), *new[name])
+    return out
+
+
+def _skin_options(given, contact, bulk):
+    options = given if isinstance(given, SkinOptions) else SkinOptions(**read_dict(given, "options['skin']"))
+    changes = dict(contact)
+    if "contact_law" in changes:
+        law = options.contact_law or ContactLaw()
+        changes["contact_law"] = dataclasses.replace(law, **changes["contact_law"])
+    if bulk:  # liquid and air in series: V / K + V0 / p0
+        changes["bulk_modulus"] = 1 / (1 / options.bulk_modulus + bulk)
+    if "tolerance" in changes:
+        changes["tolerance"] = min(changes["tolerance"], options.tolerance)
+    return plain(dataclasses.replace(options, **changes))
+
+
+def _modulus(given, function, skin):
+    """Factors on the elements' modulus, by those that are there."""
+    before, geometry = read_modulus(given), skin_reference(skin)[1]
+    factors = np.array(plain(function, geometry))
+    if before is not None:
+        factors = factors * (np.array(plain(before, geometry)) if callable(before) else before)
+    return factors.tolist()
+
+
+def _liquid(geometry):
+    """Volume between skin and core [m^3]."""
+
+    def volume(vert, face):
+        a, b, c = (vert[face[:, i]] for i in range(3))
+        return abs((np.cross(a, b) * c).sum()) / 6
+
+    return volume(geometry.vert, geometry.inner_face) - volume(geometry.core_vert, geometry.core_face)
+
+
+def _plain_sensor(sensor: Sensor) -> dict:
+    return plain({f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)})

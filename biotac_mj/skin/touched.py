@@ -1,0 +1,183 @@
+"""What bodies that touch the skin do to it besides pushing: the area of each, its slip, and what its force
+and a height under it do to the skin's modes. For the sensors of all worlds, after a step.
+
+A body's force acts on the samples that it touches, along itself; a height is a motion along it too, and what
+it makes is the tangent of the step. The speed of slip is that at which what holds the samples in friction
+moves over the body, on average."""
+
+import numpy as np
+import warp as wp
+
+from .data import SkinData
+from .modes import SkinModes
+from .types import real, vec3
+
+__all__ = ["Touched", "faces_of"]
+
+wp.set_module_options({"enable_backward": False})
+
+vec6 = wp.spatial_vectord
+mat66 = wp.spatial_matrixd
+
+_CHUNK = 96  # faces that one thread sums
+# of a chunk's sums: samples, area, samples that touched before, their anchors' way
+_COUNT, _AREA, _KNOWN, _WAY = range(4)
+
+
+def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
+    """(nface, nmode + 1, 3) modal forces [N kg^-1/2 / N] and, last, steady pressure [Pa/N] of a unit force on
+    each face (nface, 3) of the outer surface of nvert nodes."""
+    place = np.zeros(nvert, int)
+    place[modes.node] = np.arange(len(modes.node))
+    each = np.concatenate([modes.shape, modes.static[None]])[:, place[face]]
+    return each.mean(2).swapaxes(0, 1)
+
+
+@wp.kernel
+def sum_chunks(
+    # In:
+    nsample: int,
+    area: wp.array(dtype=real),
+    group: wp.array(dtype=int),
+    heard: wp.array2d(dtype=vec3),
+    kept: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    geom_last: wp.array2d(dtype=int),
+    anchor_last: wp.array2d(dtype=vec3),
+    # Out:
+    sum_out: wp.array3d(dtype=vec6),
+    heard_out: wp.array4d(dtype=vec3),
+):
+    """Of a chunk of faces: `sum_out` [group, chunk, world] by the threads of row 0, and what each row of
+    modes hears of unit forces on the samples [row, group, chunk, world]."""
+    m, c, w = wp.tid()
+    for g in range(sum_out.shape[0]):
+        heard_out[m, g, c, w] = vec3()
+        if m == 0:
+            sum_out[g, c, w] = vec6()
+    for f in range(c * _CHUNK, wp.min((c + 1) * _CHUNK, kept.shape[0])):
+        if kept[f, w] == 1:
+            for s in range(nsample):
+                i = f * nsample + s
+                k = geom[i, w]
+                if k >= 0:
+                    g = group[k]
+                    if heard.shape[0] > 0:
+                        heard_out[m, g, c, w] = heard_out[m, g, c, w] + heard[m, f]
+                    if m == 0:
+                        one = vec6()
+                        one[_COUNT] = real(1.0)
+                        one[_AREA] = area[f] / real(nsample)
+                        if geom_last[i, w] == k:
+                            one[_KNOWN] = real(1.0)
+                            way = anchor[i, w] - anchor_last[i, w]
+                            for a in range(3):
+                                one[_WAY + a] = way[a]
+                        sum_out[g, c, w] = sum_out[g, c, w] + one
+
+
+@wp.kernel
+def feel_bodies(
+    # In:
+    dt: wp.array(dtype=real),
+    wrench: wp.array2d(dtype=vec6),
+    tangent: wp.array2d(dtype=mat66),
+    sums: wp.array3d(dtype=vec6),
+    heard: wp.array4d(dtype=vec3),
+    # Out:
+    area_out: wp.array2d(dtype=real),
+    force_out: wp.array2d(dtype=real),
+    slip_out: wp.array2d(dtype=real),
+    drive_out: wp.array2d(dtype=real),
+    gain_out: wp.array3d(dtype=real),
+):
+    """One row of modes, the last of which is the steady pressure; row 0 tells area, force and slip too."""
+    m, w = wp.tid()
+    drive = real(0.0)
+    for g in range(sums.shape[0]):
+        total = vec6()
+        mean = vec3()
+        for c in range(sums.shape[1]):
+            total += sums[g, c, w]
+            mean += heard[m, g, c, w]
+        force = -vec3(wrench[g, w][0], wrench[g, w][1], wrench[g, w][2])
+        size = wp.length(force)
+        if m == 0:
+            way = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2]) / wp.max(total[_KNOWN], real(1.0))
+            area_out[w, g] = total[_AREA]
+            force_out[w, g] = size
+            slip_out[w, g] = real(0.0)
+            if dt[w] > real(0.0):
+                slip_out[w, g] = wp.length(way) / dt[w]
+        if gain_out.shape[2] > 0:
+            gain = real(0.0)
+            if total[_COUNT] > real(0.0) and size > real(0.0):
+                along = force / size
+                stiff = real(0.0)
+                for a in range(3):
+                    for b in range(3):
+                        stiff += along[a] * tangent[g, w][a, b] * along[b]
+                one = wp.dot(mean, along) / total[_COUNT]
+                drive += size * one
+                gain = stiff * one
+            gain_out[w, g, m] = gain
+    if m < drive_out.shape[1]:
+        drive_out[w, m] = drive
+
+
+class Touched:
+    """Of the skins of all worlds of a SkinData.
+
+    Args:
+      data: of the skins. group: (ngeom,) body of each geom. ngroup: how many bodies.
+      modes: of the skin; None: `drive` and `gain` are not wanted.
+
+    Attributes (wp.arrays float64, written by `end`):
+      area, force, slip: (nworld, ngroup) what each body touches [m^2], its force [N] and speed of slip [m/s].
+      drive: (nworld, nmode) modal force of all contacts [N kg^-1/2].
+      gain: (nworld, ngroup, nmode + 1) modal forces that a height under each body makes [N kg^-1/2 / m], and
+        last its steady pressure [Pa/m].
+    """
+
+    def __init__(self, data: SkinData, group: np.ndarray, ngroup: int, modes: SkinModes | None = None):
+        model, self._data, nworld = data.model, data, data.nworld
+        nface, self.device = len(model.outer.face_np), model.device
+        nmode = 0 if modes is None else len(modes.rate)
+        self._rows = nmode + 1
+        heard = np.zeros((0, nface, 3))
+        if modes is not None:
+            heard = np.ascontiguousarray(faces_of(modes, model.outer.face_np, model.nvert).swapaxes(0, 1))
+        chunks = -(-nface // _CHUNK)
+        with wp.ScopedDevice(self.device):
+            self._group = wp.array(np.asarray(group, np.int32), dtype=int)
+            self._heard = wp.array(heard, dtype=vec3, ndim=2)
+            self._geom, self._anchor = wp.empty_like(data.outer.anchor_geom), wp.empty_like(data.outer.anchor)
+            self._geom.fill_(-1)
+            self._sums = wp.zeros((ngroup, chunks, nworld), dtype=vec6)
+            self._heard_sums = wp.zeros((self._rows, ngroup, chunks, nworld), dtype=vec3)
+            self.area, self.force, self.slip = (wp.zeros((nworld, ngroup), dtype=real) for _ in range(3))
+            self.drive = wp.zeros((nworld, nmode), dtype=real)
+            self.gain = wp.zeros((nworld, ngroup, nmode + 1 if nmode else 0), dtype=real)
+
+    def begin(self) -> None:
+        """Before a step. Launches only."""
+        if self._heard.shape[0]:  # without modes nobody asks for slip
+            wp.copy(self._geom, self._data.outer.anchor_geom)
+            wp.copy(self._anchor, self._data.outer.anchor)
+
+    def end(self, wrench: wp.array, tangent: wp.array) -> None:
+        """After it. Launches only.
+
+        Args:
+          wrench: (ngroup, nworld) spatial_vectord of the skin ON each body [N, N m].
+          tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d motion; looked at where there are modes.
+        """
+        d, nworld = self._data, self._data.nworld
+        outer, shape = d.outer, (self._rows, self._sums.shape[1], nworld)
+        inputs = [len(d.model.sample), d.model.outer.area, self._group, self._heard, outer.kept]
+        inputs += [outer.anchor_geom, outer.anchor, self._geom, self._anchor]
+        wp.launch(sum_chunks, shape, inputs, [self._sums, self._heard_sums], device=self.device)
+        inputs = [d.dt, wrench, tangent, self._sums, self._heard_sums]
+        outputs = [self.area, self.force, self.slip, self.drive, self.gain]
+        wp.launch(feel_bodies, (self._rows, nworld), inputs, outputs, device=self.device)

@@ -1,0 +1,257 @@
+"""Sensors that run with effects: what `biotac diagnose` found acts in a simulation, on every path that has
+the sensor, and as the effect's own law says."""
+
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+import biotac_mj
+from biotac_mj import cli
+from biotac_mj.discrepancy import Simulator
+from biotac_mj.effects.amended import Model, amend
+from biotac_mj.effects.catalogue import CATALOGUE, by_id
+from biotac_mj.effects.effect import Effect, Param, Run
+from biotac_mj.effects.sensor_file import read_sensor_file
+from biotac_mj.effects.sensors import with_effects
+from biotac_mj.sensor.acquisition import Acquisition
+from biotac_mj.sensor.channels import counts_from_impedance
+from biotac_mj.sensor.presets import SENSORS, read_sensor
+
+SET_UP = {"radius", "misalign", "depth0", "mount", "rocking", "force_cross"}
+# of a press of 0.2 s what each effect has to change at least: counts of an electrode, of PDC, force [N]
+FELT = {
+    "relax": (0, 20, 0.1),
+    "stiffen": (20, 20, 0.1),
+    "inhomog": (20, 5, 0.02),
+    "bubble": (2, 2, 0),
+    "friction": (0, 0, 5e-4),
+    "asper": (100, 0, 0),
+    "gain": (50, 0, 0),
+    "crosstalk": (5, 0, 0),
+    "saturate": (50, 0, 0),
+    "lowpass": (100, 0, 0),
+    "latency": (100, 0, 0),
+    "warmup": (1, 0, 0),
+    "drift": (1, 0, 0),
+    "pdc_gain": (0, 20, 0),
+}
+
+
+def theta_of(effect):
+    """Three realistic sizes of an effect."""
+    sizes = {n: np.clip(3 * p.scale, p.low, p.high) for n, p in effect.params.items() if not p.shape}
+    return {**effect.default(), **sizes}
+
+
+def press(effects=None, **settings):
+    """(24, 26) electrodes, PDC, contact force of a ball that presses the pad by 1 mm and is moved aside."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 8e-3, [0, 0, 0]
+    ball = spec.worldbody.add_body(name="ball", mocap=True)
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[3.5e-3, 0, 0])
+    handle = biotac_mj.attach(
+        spec,
+        body="world",
+        coupling="one-way",
+        effects=effects,
+        options={"readings": {"noise": False}},
+        on_error="raise",
+        **{"skin": "coarse", **settings},
+    )
+    model = spec.compile()
+    data, out = mujoco.MjData(model), []
+    for i in range(24):
+        aside = 2e-4 if i > 16 else 0.0
+        data.mocap_pos[0] = [-9e-3 + aside, -12.5e-3 + 2.2e-3 * min(i / 12, 1), 1e-3]
+        mujoco.mj_step(model, data)
+        biotac_mj.plugin.check()
+        out.append(np.concatenate([handle.read(data, c) for c in ("electrodes", "pdc", "contact_force")]))
+    return np.array(out)
+
+
+@pytest.fixture(scope="module")
+def plain_press():
+    return {tier: press(tier=tier) for tier in ("full", "condensed")}
+
+
+@pytest.mark.parametrize("name", FELT)
+def test_an_effect_acts_in_mj_step(name, plain_press):
+    effect = by_id(name)
+    tier = "full" if effect.stage == "C" else "condensed"
+    change = np.abs(press([(effect, theta_of(effect))], tier=tier) - plain_press[tier])
+    found = change[:, :19].max(), change[:, 19].max(), change[:, 20:23].max()
+    assert all(f >= least for f, least in zip(found, FELT[name])), found
+
+
+def test_every_effect_of_the_catalogue_is_of_the_sensor_or_of_the_set_up():
+    # seen below, or by their constants
+    slow = {"creep", "hyster", "mullins", "adhesion", "fric_load", "fluidloss", "thermal"}
+    assert set(FELT) | SET_UP | slow == {effect.id for effect in CATALOGUE}
+    for name in ("creep", "hyster", "mullins", "adhesion", "fric_load"):
+        effect = by_id(name)
+        out = amend(Model(None, None, None, None, None), [(effect, theta_of(effect))])
+        law = (out.options.get("skin") or {}).get("contact_law") or {}
+        assert out.material.extensions or law.get("adhesion", 0) > 0 or law.get("friction_exponent", 0) > 0
+
+
+def test_effects_of_the_set_up_are_left_out_by_name(plain_press):
+    effects = [(by_id(name), theta_of(by_id(name))) for name in sorted(SET_UP)]
+    effects.append((by_id("latency"), {"delay": -0.02}))
+    with pytest.warns(UserWarning, match="not of the sensor itself: .*latency .acquisition"):
+        np.testing.assert_array_equal(press(effects, tier="condensed"), plain_press["condensed"])
+
+
+@pytest.mark.parametrize("name", ["asper", "gain", "crosstalk", "saturate", "fluidloss", "warmup"])
+def test_the_acquisition_does_what_the_effect_says(name):
+    """Of impedances that stand still for a while: counts of `Effect.apply`, rounded."""
+    effect, time = by_id(name), 30.0
+    theta = theta_of(effect)
+    sensor = SENSORS["1"]
+    z = sensor.impedance * np.exp(np.random.default_rng(0).uniform(-0.4, 0.6, 19))
+    run = Run(
+        *(np.full(2, v) for v in (0.0, time)),
+        tool="",
+        heading=np.zeros(3),
+        depth=np.zeros(2),
+        place=np.zeros(3),
+        order=0,
+        offset=np.zeros((2, 3)),
+        force=np.zeros((2, 3)),
+        pressure=np.zeros(2),
+        log_z=np.tile(np.log(z), (2, 1)),
+        temperature=None,
+        session={},
+        rest_log_z=np.log(sensor.impedance),
+    )
+    if effect.stage == "T":
+        effect.apply(run, theta)
+    run.counts = counts_from_impedance(np.exp(run.log_z))
+    if effect.stage == "A":
+        effect.apply(run, theta)
+    acquisition = Acquisition(noise=False, sensor=with_effects(sensor, [(effect, theta)]))
+    state = np.zeros(acquisition.nstate)
+    acquisition.reset(state, sensor.impedance)
+    for i in range(int(time / 0.01)):
+        acquisition.advance(state, 0.01 * i, 0.01, z)
+    np.testing.assert_allclose(acquisition.readings(state)["electrodes"], run.counts[1], atol=0.6)
+
+
+@pytest.mark.parametrize("name, value", [("lowpass", {"tau": 0.05}), ("latency", {"delay": 0.043})])
+def test_electrodes_come_late(name, value):
+    """Of a ramp of impedance: the same count later by the delay, or by the time constant."""
+    sensor = SENSORS["1"]
+    late = with_effects(sensor, [(by_id(name), value)])
+    lag, out = next(iter(value.values())), []
+    for one in (sensor, late):
+        acquisition = Acquisition(noise=False, film_every_step=True, sensor=one)
+        state = np.zeros(acquisition.nstate)
+        acquisition.reset(state, sensor.impedance)
+        rows = []
+        for i in range(1000):
+            acquisition.advance(state, 1e-3 * i, 1e-3, sensor.impedance * (1 + 2e-3 * (i + 1)))
+            rows.append(acquisition.readings(state)["electrodes"][4])
+        out.append(np.array(rows, float))
+    times = np.interp(-out[1][-200:], -out[0], 1e-3 * np.arange(1000))  # counts fall
+    assert np.median(1e-3 * np.arange(800, 1000) - times) == pytest.approx(lag, abs=6e-3)
+
+
+def test_warmth_and_drift_have_each_electrodes_share():
+    share = np.linspace(0.5, 1.5, 19)
+    sensor = {"warm_up": 4.0, "warm_time": 1.0, "warm_share": share, "drift": np.linspace(-5, 5, 19)}
+    one = read_sensor(sensor)
+    acquisition = Acquisition(noise=False, sensor=one)
+    state = np.zeros(acquisition.nstate)
+    acquisition.reset(state, one.impedance)
+    for i in range(1000):
+        acquisition.advance(state, 0.01 * i, 0.01, one.impedance)
+    warm = 4.0 * (1 - np.exp(-10.0))
+    expected = counts_from_impedance(one.impedance * np.exp(-one.per_degree * warm * share))
+    expected = expected + np.linspace(-5, 5, 19) * 9.99
+    np.testing.assert_allclose(acquisition.readings(state)["electrodes"], expected, atol=1.5)
+
+
+def test_a_sensor_file_is_attached_with_its_base_model(tmp_path):
+    """The file that `diagnose` writes: its material and sensor where none is given, then its effects."""
+    path = tmp_path / "sensor_amended.yaml"
+    effects = [(by_id("gain"), {**by_id("gain").default(), "e9": -0.5}), (by_id("stiffen"), {"c2": 0.4})]
+    Simulator(material={"youngs_modulus": 6e5}, sensor="2", effects=effects, modulus=1.5).save(path)
+    spec = mujoco.MjSpec()
+    handle = biotac_mj.attach(spec, body="world", effects=path)
+    assert handle.config.skin == "coarse" and handle.numbers.rest == SENSORS["2"].rest
+    assert handle.numbers.mixing[8][8] == pytest.approx(0.5)
+    assert handle.config.material["youngs_modulus"] == pytest.approx(9e5)
+    assert handle.config.material["stiffening"] > 1
+    spec = mujoco.MjSpec()
+    other = biotac_mj.attach(spec, body="world", effects=path, skin="default", material="rubber", sensor="3")
+    assert other.config.skin == "default" and other.numbers.rest == SENSORS["3"].rest
+    assert other.config.material["youngs_modulus"] == pytest.approx(1.5 * 2.8e5)
+    assert other.numbers.mixing[8][8] == pytest.approx(0.5)
+
+
+def test_batches_take_a_sensor_file(tmp_path):
+    mjw = pytest.importorskip("mujoco_warp")
+    path = tmp_path / "sensor.yaml"
+    gain = {**by_id("pdc_gain").default(), "gain": 1.0}
+    Simulator(effects=[(by_id("pdc_gain"), gain), (by_id("stiffen"), {"c2": 0.4})]).save(path)
+    rows = []
+    for effects in (None, path):
+        spec = mujoco.MjSpec()
+        spec.option.timestep = 8e-3
+        ball = spec.worldbody.add_body(name="ball", mocap=True, pos=[-9e-3, -11e-3, 1e-3])
+        ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[3.5e-3, 0, 0])
+        biotac_mj.batch.add(spec, body="world", skin="coarse", coupling="one-way")
+        mjm = spec.compile()
+        mjd = mujoco.MjData(mjm)
+        mujoco.mj_forward(mjm, mjd)
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+        settings = dict(skin="coarse", coupling="one-way", readings={"noise": False})
+        biotac_mj.batch.attach(mjm, m, d, effects=effects, **settings)
+        for _ in range(3):
+            mjw.step(m, d)
+        names = ("biotac_pdc", "biotac_contact_force")
+        rows.append([d.sensordata.numpy()[0, mjm.sensor(n).adr[0] : mjm.sensor(n).adr[0] + 2] for n in names])
+    (pdc, force), (more, stiffer) = rows
+    assert abs(stiffer[1]) > 1.05 * abs(force[1])
+    assert more[0] - 2000 > 1.8 * (pdc[0] - 2000) > 100
+
+
+def test_presses_take_a_sensor_file(tmp_path, monkeypatch):
+    path = tmp_path / "sensor.yaml"
+    Simulator(sensor="2", effects=[(by_id("gain"), {**by_id("gain").default(), "e1": 0.5})]).save(path)
+    words = f"press --skin coarse --tier condensed --depth 0.3 --no-render --quiet --out {tmp_path / 'o'}"
+    assert cli.main([*words.split(), "--effects", str(path)]) in (0, None)
+    row = (tmp_path / "o" / "readings.csv").read_text().splitlines()[-1]
+    rest = np.array(SENSORS["2"].rest)
+    counts = np.array([float(v) for v in row.split(",")[5:24]])
+    assert np.median(np.abs(counts - rest)) < 60
+    assert yaml.safe_load(path.read_text())["schema"] == "biotac_mj.sensor/1"
+    assert read_sensor_file(path).effects[0][0].id == "gain"
+
+
+def test_what_cannot_run_is_refused_by_name(tmp_path):
+    class Own(Effect):
+        id, name, stage, physics = "own", "of one's own", "A", ""
+        params = {"rate": Param("counts/s", -5, 5, "", 0.1)}
+
+        def apply(self, run, theta):
+            pass
+
+    nothing = Model(None, None, None, None, None)
+    with pytest.raises(ValueError, match="no running sensor can have the effect 'own'"):
+        amend(nothing, [(Own(), {"rate": 1.0})])
+    with pytest.raises(ValueError, match=r"latency from 0 to 0.11 s"):
+        amend(nothing, [(by_id("latency"), {"delay": 0.4})])
+    with pytest.raises(ValueError, match="give a sensor file, or a list"):
+        amend(nothing, [1])
+    with pytest.raises(FileNotFoundError, match="no sensor file at"):
+        amend(nothing, tmp_path / "none.yaml")
+    with pytest.raises(ValueError, match="the condensed tier is elastic"), warnings.catch_warnings():
+        biotac_mj.attach(
+            mujoco.MjSpec(),
+            body="world",
+            tier="condensed",
+            effects=[(by_id("relax"), {"g": 0.2, "tau": 1.0})],
+        )
