@@ -26,8 +26,8 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",
-    "data": "recordings geometry skin sensor effects fields files reading versions press.approach press.indenter "
-    "press.path",
+    "data": "recordings geometry skin sensor effects fields files reading versions press.approach "
+    "press.indenter press.path",
     "tasks": "coupling plugin sensor effects geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading",
