@@ -109,8 +109,9 @@ class SparsePreconditioner:
     """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
 
     Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
-    solve takes many products gets the factor of its present shape, for this step alone, so that a step
-    remains a function of the state it starts from. Worlds share a factor: not where there are many.
+    solves have taken more products than a factor costs gets that of its present shape, again and again, for
+    this step alone, so that a step remains a function of the state it starts from. Worlds share a factor: not
+    where there are many.
     """
 
     precision = DOUBLE
@@ -151,22 +152,17 @@ class SparsePreconditioner:
             program.call(watch)
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Takes the factor of the shape x, once in a step."""
+        """Takes the factor of the shape x."""
         x = x.numpy()
-
-        def renew():
-            if self._products >= 0:
-                self._renew(x)
-
         if self._renews:
-            program.call(renew)
+            program.call(lambda: self._renew(x))
 
     @property
     def _renews(self):
         return self._model.material.poissons_ratio > 0.45 and len(self._small) == 1
 
     def _renew(self, x):
-        self._products = -np.inf  # once is enough until the next step
+        self._products = 0
         with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
             self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
 

@@ -16,6 +16,8 @@ changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTIO
 integration is full, as in CalculiX's C3D10. Four nodes have one point, which feels all of lam.
 """
 
+import copy
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
@@ -107,6 +109,25 @@ class Tetrahedra:
             self.mesh.weight = wp.array(weight, dtype=real, ndim=2)
             self.mesh.volume = wp.array(weight.sum(1), dtype=real)
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
+
+    def deformed(self, vert: np.ndarray) -> "Tetrahedra":
+        """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
+        definite: turned as these are under the corotational law, which measures volume change along the axes
+        that turn; made in that shape under the others.
+
+        Args:
+          vert: (nvert, 3) [m].
+
+        Raises:
+          ValueError: see the class; not under the corotational law.
+        """
+        if self.law != LAWS["corotational"]:
+            return Tetrahedra(vert, self._elem, self.law, self.device, self.modulus)
+        there = copy.copy(self)
+        left, _, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self._elem], self._gradient))
+        left[..., 2] *= np.linalg.det(left @ right)[..., None]
+        there._gradient = np.einsum("eqij,eqaj->eqai", left @ right, self._gradient)
+        return there
 
     def rest_stiffness(self, mu: float, lame: float) -> sp.csc_matrix:
         """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]: every law here has the same linearisation, but
