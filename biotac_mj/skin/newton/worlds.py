@@ -261,13 +261,11 @@ def judge_balance(
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
             settled = 0
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
-    far = wp.abs(rz) / (tolerance * tolerance * work)
-    # no error is halved faster than the last one was: do so many halvings fit in what is left?
-    pace = real(st.iterations[w] - st.since[w])
-    late = pace * real(0.5) * wp.log2(wp.max(far, real(1.0))) > real(st.limit[w] - st.iterations[w])
-    if far <= real(1.0) and settled == 1:
+    if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif late or st.iterations[w] >= st.limit[w] or st.work[w] >= allowed:
+    elif (  # what has not halved the error in so many iterations will hardly do so in the fewer left
+        st.iterations[w] - st.since[w] >= st.limit[w] - st.iterations[w] or st.work[w] >= allowed
+    ):
         st.active[w] = 0
         st.failed[w] = 1
     else:
