@@ -387,9 +387,6 @@ class SkinModel:
 
         Args:
           vert_xpos: (nvert, 3) [m].
-
-        Raises:
-          ValueError: a tetrahedron is inverted there, of another law than the corotational.
         """
         stiffness = self.elements.deformed(vert_xpos).rest_stiffness(self.material.mu, self.material.lame)
         return self.factor_of(self._of_free(stiffness))

@@ -9,7 +9,6 @@ identity gives
   and g).
 """
 
-import contextlib
 import typing
 from collections.abc import Callable
 
@@ -163,8 +162,7 @@ class SparsePreconditioner:
 
     def _renew(self, x):
         self._products = 0
-        with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
-            self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
+        self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
 
     # --- solves ---
 

@@ -31,6 +31,7 @@ __all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
 
 POINTWISE = 5.0  # of mu; docs/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/elements.md has the error
+_SQUEEZED = 0.2  # least stretch that `deformed` takes
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
@@ -112,21 +113,20 @@ class Tetrahedra:
 
     def deformed(self, vert: np.ndarray) -> "Tetrahedra":
         """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
-        definite: turned as these are under the corotational law, which measures volume change along the axes
-        that turn; made in that shape under the others.
+        definite: made in that shape, but for what is squeezed to nothing or inside out; under the corotational
+        law, which measures volume change along the axes that turn, only turned.
 
         Args:
           vert: (nvert, 3) [m].
-
-        Raises:
-          ValueError: see the class; not under the corotational law.
         """
-        if self.law != LAWS["corotational"]:
-            return Tetrahedra(vert, self._elem, self.law, self.device, self.modulus)
         there = copy.copy(self)
-        left, _, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self._elem], self._gradient))
+        left, stretch, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self._elem], self._gradient))
         left[..., 2] *= np.linalg.det(left @ right)[..., None]
-        there._gradient = np.einsum("eqij,eqaj->eqai", left @ right, self._gradient)
+        stretch = np.maximum(stretch, _SQUEEZED)
+        if self.law == LAWS["corotational"]:
+            stretch = np.ones_like(stretch)
+        there._gradient = np.einsum("eqij,eqaj->eqai", (left / stretch[..., None, :]) @ right, self._gradient)
+        there._weight = self._weight * stretch.prod(-1)
         return there
 
     def rest_stiffness(self, mu: float, lame: float) -> sp.csc_matrix:
