@@ -113,8 +113,8 @@ class Tetrahedra:
 
     def deformed(self, vert: np.ndarray) -> "Tetrahedra":
         """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
-        definite: made in that shape, but for what is squeezed to nothing or inside out; under the corotational
-        law, which measures volume change along the axes that turn, only turned.
+        definite: made in that shape, but for what is squeezed to nothing or inside out; only turned under the
+        corotational law, which measures volume change along the axes that turn.
 
         Args:
           vert: (nvert, 3) [m].
