@@ -222,9 +222,10 @@ def test_folded_element():
         Tetrahedra(bent, elem, 0, CPU)
 
 
-def test_factor_at_a_turned_shape():
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+def test_factor_at_a_turned_shape(law):
     """A skin that has only turned has the compliance of rest, turned with it."""
-    model = block("neo_hookean", nu=0.499)
+    model = block(law, nu=0.499)
     Q = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     f = np.random.default_rng(0).standard_normal((model.nvert, 1, 3))
     f[model.fixed] = 0

@@ -278,6 +278,22 @@ def test_mesh_sphere_equals_sphere():
     assert (np.einsum("ij,ij->i", normal, direction) > 0.998).all()  # facets lean by up to 2.3 degrees
 
 
+@pytest.mark.parametrize("size", [(1.5e-2, 2e-3, 1.5e-2), (2e-3, 1e-2, 2e-3), (1.5e-2, 8e-3, 1.5e-3)])
+def test_sharp_corners_have_an_outside(size):
+    """Around thin edges and corners of a hull, out to millimetres, the side is that of its planes."""
+    rng = np.random.default_rng(0)
+    hull = trimesh.convex.convex_hull(rng.standard_normal((24, 3)) * size)
+    grid = bake_distance_grid(np.array(hull.vertices), np.array(hull.faces), cells=48)
+    ends = hull.vertices[hull.edges_unique[rng.integers(len(hull.edges_unique), size=20_000)]]
+    share = rng.choice([0.0, 0.5, 1.0], (20_000, 1))
+    spread = 10 ** rng.uniform(-6, -2.5, (20_000, 1)) * rng.standard_normal((20_000, 3))
+    points = (1 - share) * ends[:, 0] + share * ends[:, 1] + spread
+    height = (points @ hull.face_normals.T - (hull.triangles[:, 0] * hull.face_normals).sum(1)).max(1)
+    _, d, _ = evaluate("mesh", (), points, grids=[grid])
+    clear = np.abs(height) > 2e-8  # of rounding
+    assert (np.sign(d) == np.sign(height))[clear].all()
+
+
 def test_two_meshes_keep_apart():
     """Grids lie one after another in memory: the second geom sees its own."""
     small, large = (trimesh.creation.box(extents=[s] * 3) for s in (4e-3, 8e-3))

@@ -88,7 +88,7 @@ class SkinOptions:
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
     tolerance: float = 1e-3
-    max_newton: int = 30
+    max_newton: int = 60
     max_cg: int = 40
     max_work: int = 1500
     element: str | None = None
@@ -378,8 +378,8 @@ class SkinModel:
         return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > 0.45)
 
     def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
-        """The factor of the skin in a deformed shape: of its stiffness had it been made so, always positive
-        definite. On the CPU.
+        """The factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite. On
+        the CPU.
 
         Nearly incompressible rubber that has turned and strained resists volume change along other directions
         than at rest, which the factor at rest does not know: preconditioned by it, conjugate gradients need
@@ -387,12 +387,8 @@ class SkinModel:
 
         Args:
           vert_xpos: (nvert, 3) [m].
-
-        Raises:
-          ValueError: a tetrahedron is inverted there.
         """
-        there = Tetrahedra(vert_xpos, self._elem, self.law, self.device, self.modulus)
-        stiffness = there.rest_stiffness(self.material.mu, self.material.lame)
+        stiffness = self.elements.deformed(vert_xpos).rest_stiffness(self.material.mu, self.material.lame)
         return self.factor_of(self._of_free(stiffness))
 
     def factor_of(self, stiffness: sp.csc_matrix) -> SparseFactor:

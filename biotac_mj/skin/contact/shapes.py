@@ -75,7 +75,7 @@ def _bake(
 ):
     i = wp.tid()
     p = origin + spacing * wp.vec3(float(i // (ny * nz)), float((i // nz) % ny), float(i % nz))
-    query = wp.mesh_query_point_sign_normal(mesh, p, reach)
+    query = wp.mesh_query_point(mesh, p, reach)
     q = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
     value_out[i] = query.sign * wp.length(p - q)
 
@@ -208,7 +208,7 @@ def _to_triangles(grids: Grids, k: int, p: vec3):
     q = wp.vec3(
         wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3))
     )
-    query = wp.mesh_query_point_sign_normal(mesh, q, 4.0e3 * wp.float32(h))
+    query = wp.mesh_query_point_no_sign(mesh, q, 4.0e3 * wp.float32(h))
     if not query.result:
         return wp.vec4d(real(1.0), real(0.0), real(0.0), real(4.0) * h)
     a = _double(wp.mesh_get_point(mesh, 3 * query.face))
@@ -223,11 +223,13 @@ def _to_triangles(grids: Grids, k: int, p: vec3):
     if wp.min(u, wp.min(v, w)) > edge:
         d = wp.dot(mm - a, n)  # over the inside of a face: its plane, exactly
     else:
+        # rays tell the side: normals of the faces around sharp corners do not, a point out there seems deep
+        side = real(wp.mesh_query_point(mesh, q, 4.0e3 * wp.float32(h)).sign)
         away = mm - (a + v * ab + w * ac)
         d = wp.length(away)
         if d > real(1.0e-5):
-            n = real(query.sign) * away / d
-        d = real(query.sign) * d
+            n = side * away / d
+        d = side * d
     return wp.vec4d(n[0], n[1], n[2], d * real(1.0e-3))
 
 

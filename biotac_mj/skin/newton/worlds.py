@@ -33,7 +33,6 @@ wp.set_module_options({"enable_backward": False})
 # reason of a world's last step
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
-_STALLED = 12  # iterations that do not halve the error [J^1/2]: no more will
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
@@ -264,8 +263,8 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif (
-        st.iterations[w] >= st.limit[w] or st.iterations[w] - st.since[w] >= _STALLED or st.work[w] >= allowed
+    elif (  # what has not halved the error in so many iterations will hardly do so in the fewer left
+        st.iterations[w] - st.since[w] >= st.limit[w] - st.iterations[w] or st.work[w] >= allowed
     ):
         st.active[w] = 0
         st.failed[w] = 1

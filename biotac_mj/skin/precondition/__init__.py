@@ -65,11 +65,10 @@ class Preconditioner(Protocol):
         """The same for another r in the running worlds; `part` holds the square of r by chunks."""
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
-        """After a linear solve at x [nvert, nworld]: may take the factor of this shape for the rest of the
-        step."""
+        """After a linear solve at x [nvert, nworld]: may take the factor of this shape."""
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Takes the factor of the shape x, if it can, for the rest of the step."""
+        """Takes the factor of the shape x, if it can."""
 
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array

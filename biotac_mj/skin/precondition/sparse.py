@@ -9,7 +9,6 @@ identity gives
   and g).
 """
 
-import contextlib
 import typing
 from collections.abc import Callable
 
@@ -31,6 +30,7 @@ __all__ = ["SparseFactor", "SparsePreconditioner"]
 
 _CLUSTER = 4  # nodes whose rows are computed together
 _FACTOR = 25  # products of the tangent: about what a factor costs
+_INCOMPRESSIBLE = 0.45  # Poisson's ratio from which rubber counts as nearly so
 
 
 class SparseFactor:
@@ -109,8 +109,9 @@ class SparsePreconditioner:
     """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
 
     Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
-    solve takes many products gets the factor of its present shape, for this step alone, so that a step
-    remains a function of the state it starts from. Worlds share a factor: not where there are many.
+    solves have taken more products than a factor costs gets that of its present shape, again and again, for
+    this step alone, so that a step remains a function of the state it starts from; other rubber does where a
+    try has failed. Worlds share a factor: not where there are many.
     """
 
     precision = DOUBLE
@@ -135,7 +136,7 @@ class SparsePreconditioner:
         program.call(self._begin)
 
     def _begin(self):
-        self._products = 0
+        self._products = 0 if self._model.material.poissons_ratio >= _INCOMPRESSIBLE else -np.inf
         self.factor, self._rows = self._rest, self._rest_rows
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
@@ -151,24 +152,18 @@ class SparsePreconditioner:
             program.call(watch)
 
     def renew(self, program: Launcher, x: wp.array) -> None:
-        """Takes the factor of the shape x, once in a step."""
+        """Takes the factor of the shape x."""
         x = x.numpy()
-
-        def renew():
-            if self._products >= 0:
-                self._renew(x)
-
         if self._renews:
-            program.call(renew)
+            program.call(lambda: self._renew(x))
 
     @property
     def _renews(self):
-        return self._model.material.poissons_ratio > 0.45 and len(self._small) == 1
+        return len(self._small) == 1
 
     def _renew(self, x):
-        self._products = -np.inf  # once is enough until the next step
-        with contextlib.suppress(ValueError):  # a tetrahedron is inverted: no factor there
-            self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
+        self._products = 0
+        self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
 
     # --- solves ---
 

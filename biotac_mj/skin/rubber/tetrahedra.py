@@ -16,6 +16,8 @@ changes the error of a mesh, not the limit; so does CONTRACTION. With CONTRACTIO
 integration is full, as in CalculiX's C3D10. Four nodes have one point, which feels all of lam.
 """
 
+import copy
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
@@ -29,6 +31,7 @@ __all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
 
 POINTWISE = 5.0  # of mu; docs/elements.md has the error of other values
 CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/elements.md has the error
+_SQUEEZED = 0.2  # least stretch that `deformed` takes
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
@@ -107,6 +110,24 @@ class Tetrahedra:
             self.mesh.weight = wp.array(weight, dtype=real, ndim=2)
             self.mesh.volume = wp.array(weight.sum(1), dtype=real)
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
+
+    def deformed(self, vert: np.ndarray) -> "Tetrahedra":
+        """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
+        definite: made in that shape, but for what is squeezed to nothing or inside out; only turned under the
+        corotational law, which measures volume change along the axes that turn.
+
+        Args:
+          vert: (nvert, 3) [m].
+        """
+        there = copy.copy(self)
+        left, stretch, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self._elem], self._gradient))
+        left[..., 2] *= np.linalg.det(left @ right)[..., None]
+        stretch = np.maximum(stretch, _SQUEEZED)
+        if self.law == LAWS["corotational"]:
+            stretch = np.ones_like(stretch)
+        there._gradient = np.einsum("eqij,eqaj->eqai", (left / stretch[..., None, :]) @ right, self._gradient)
+        there._weight = self._weight * stretch.prod(-1)
+        return there
 
     def rest_stiffness(self, mu: float, lame: float) -> sp.csc_matrix:
         """(3 nvert, 3 nvert) [N/m] for Lame constants [Pa]: every law here has the same linearisation, but
