@@ -30,7 +30,6 @@ __all__ = ["SparseFactor", "SparsePreconditioner"]
 
 _CLUSTER = 4  # nodes whose rows are computed together
 _FACTOR = 25  # products of the tangent: about what a factor costs
-_INCOMPRESSIBLE = 0.45  # Poisson's ratio from which rubber counts as nearly so
 
 
 class SparseFactor:
@@ -110,8 +109,8 @@ class SparsePreconditioner:
 
     Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
     solves have taken more products than a factor costs gets that of its present shape, again and again, for
-    this step alone, so that a step remains a function of the state it starts from; other rubber does where a
-    try has failed. Worlds share a factor: not where there are many.
+    this step alone, so that a step remains a function of the state it starts from. Worlds share a factor: not
+    where there are many.
     """
 
     precision = DOUBLE
@@ -136,7 +135,7 @@ class SparsePreconditioner:
         program.call(self._begin)
 
     def _begin(self):
-        self._products = 0 if self._model.material.poissons_ratio >= _INCOMPRESSIBLE else -np.inf
+        self._products = 0
         self.factor, self._rows = self._rest, self._rest_rows
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
@@ -159,7 +158,7 @@ class SparsePreconditioner:
 
     @property
     def _renews(self):
-        return len(self._small) == 1
+        return self._model.material.poissons_ratio > 0.45 and len(self._small) == 1
 
     def _renew(self, x):
         self._products = 0
