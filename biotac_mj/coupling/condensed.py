@@ -14,6 +14,7 @@ from .stepper import Geom, SkinResult
 __all__ = ["CondensedStepper"]
 
 _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
+_PATIENCE = 0.4  # of two-way skins: somebody waits for the step, and the next one goes on
 
 
 class CondensedStepper(FemStepper):
@@ -45,7 +46,8 @@ class CondensedStepper(FemStepper):
 
     @functools.cached_property
     def _skin(self):
-        return CondensedSkin(self._model, self._geom_set)
+        two_way = self._config.coupling == "two-way"
+        return CondensedSkin(self._model, self._geom_set, patience=_PATIENCE if two_way else 1.0)
 
     @property
     def _search(self):

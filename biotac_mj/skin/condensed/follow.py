@@ -24,7 +24,7 @@ _SPENT = 0.05  # of the effort: so little is not worth a part
 def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
-    most = _EFFORT * max(skin.nouter, _SMALL)
+    most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
     motion = skin.pose(memory, pos, mat)
     if np.abs(motion).max(initial=0.0) <= _PART:

@@ -112,14 +112,15 @@ class CondensedSkin:
       model: SkinModel on the CPU, quasi-static.
       geoms: GeomSet of one world.
       cache: whether to keep the compliance on disk (see `compliance`).
+      patience: share of the effort that a hard step may cost before it ends short of its poses.
 
     Raises:
       ValueError: what the tier cannot do, see `refusals`.
     """
 
-    def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True):
+    def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 1.0):
         refuse(model.rubber_options, model.options, model.has_liquid, model.device.is_cuda)
-        self.model, self.geoms = model, geoms
+        self.model, self.geoms, self.patience = model, geoms, patience
         self.correction = correction(model.material.law)
         g = model.geometry
         free = np.zeros(model.nvert, bool)
