@@ -1,8 +1,8 @@
 """Recordings of real sensors with a hidden effect, in forms that the diagnosis does not fit.
 
-Numpy and scipy alone: nothing here shares code, or the form of a formula, with what is judged. Base signals are read
-from a folder of recordings; every effect of the catalogue has three forms or more, and some effects are
-outside the catalogue. Half of the base signals is for practice, the other half is used once.
+Numpy and scipy alone: nothing here shares code, or the form of a formula, with what is judged. Base signals
+are read from a folder of recordings; every effect of the catalogue has three forms or more, and some
+effects are outside the catalogue. Half of the base signals is for practice, the other half is used once.
 """
 
 import gzip
@@ -76,7 +76,9 @@ def _since(case, rng):
 def _shared(shape, low, high, sign):
     def form(c, rng):
         share = 1 + 0.1 * rng.standard_normal(19)
-        c.counts = _counts(_z(c.counts) + sign * rng.uniform(low, high) * shape(c.clock, rng)[:, None] * share)
+        c.counts = _counts(
+            _z(c.counts) + sign * rng.uniform(low, high) * shape(c.clock, rng)[:, None] * share
+        )
         return range(19)
 
     return form
@@ -641,8 +643,11 @@ def bases(folder: pathlib.Path, half: str) -> dict:
         a = int(rng.integers(len(e) - length + 1))
         return [None if x is None else x[a : a + length].copy() for x in (e, *others)]
 
-    pressed = ("epfl_flat_press", "SynImpF1.txt", "ForceData.txt") if first else (
-        "epfl_f2", "SynImpF2.txt.gz", "ForceData.txt.gz")  # fmt: skip
+    pressed = (
+        ("epfl_flat_press", "SynImpF1.txt", "ForceData.txt")
+        if first
+        else ("epfl_f2", "SynImpF2.txt.gz", "ForceData.txt.gz")
+    )
     pressed = _table(folder / pressed[0] / pressed[1]), _table(folder / pressed[0] / pressed[2])
     rest = _table(folder / "epfl_flat_press/SynImpF2.txt")
     rest = rest[: len(rest) // 2] if first else rest[len(rest) // 2 :]
@@ -662,8 +667,13 @@ def bases(folder: pathlib.Path, half: str) -> dict:
     def hold(rng):
         data = loadmat(holds[rng.integers(len(holds))])
         finger = "F0" if rng.random() < 0.5 else "F1"
-        return Case("hold", data[f"{finger}Electrodes"].T.astype(float), 100.0, None,
-                    data[f"{finger}tdc"].ravel().astype(float))  # fmt: skip
+        return Case(
+            "hold",
+            data[f"{finger}Electrodes"].T.astype(float),
+            100.0,
+            None,
+            data[f"{finger}tdc"].ravel().astype(float),
+        )
 
     def scraping(rng):
         return Case("scrape", scrape + np.rint(rng.uniform(2000, 3300, 19)), 300.0)

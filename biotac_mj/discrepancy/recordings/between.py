@@ -32,8 +32,8 @@ _TIE = 1.64  # standard errors, paired over blocks
 
 
 class ForceEffect(abc.ABC):
-    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, its inverse `unsee`, and
-    what is tried.
+    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, its inverse
+    `unsee`, and what is tried.
 
     Attributes:
       arrow: whether the effect has to beat itself run backwards in time: what has no memory looks alike from
@@ -93,7 +93,6 @@ class LoadLowPass(ForceEffect):
         # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify the
         # electrodes' noise
         return force + shift(force, -0.5 * theta["tau"] * rate) - shift(force, 0.5 * theta["tau"] * rate)
-
 
 
 class Relaxation(ForceEffect):
@@ -373,18 +372,37 @@ def _finding(session, view, one, rest, best, gain, null):
         theta["width"] = theta.pop("share") * view.predict(x)[0].std(0)
         each = view.predict(x, view.loop(x, theta))[1]
         theta["fraction"] = float(np.median(each))
-        parameters = {"fraction": (theta["fraction"], float(each.min()), float(each.max())),
-                      "width": (float(np.median(theta["width"])), np.nan, np.nan)}  # fmt: skip
+        parameters = {
+            "fraction": (theta["fraction"], float(each.min()), float(each.max())),
+            "width": (float(np.median(theta["width"])), np.nan, np.nan),
+        }
     seconds = session.fit.sum() / session.recording.rate
     # half the summed log-error ratio, per independent second of a block
     nats = float(0.5 * 3 * g.sum() * min(max(1.0, seconds / _BLOCKS), 20))
     size = abs(theta.get("fraction", theta.get("delay", theta.get("tau", 1.0)) * 10))
     return Finding(
-        effect.id, tuple(range(19)), parameters, nats, sign_flip(g), 0.0, float(session.recording.time[-1]),
-        note="; ".join(filter(None, [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"])),
-        ties=tuple(ties), seen=(effect, theta),
-        clues={"gain": float(np.log(max(g.mean(), 1e-4))), "blocks": float(np.mean(g > 0)), "size": float(np.log(max(size, 1e-3))),
-               "explained": float(view.explained())})  # fmt: skip
+        effect.id,
+        tuple(range(19)),
+        parameters,
+        nats,
+        sign_flip(g),
+        0.0,
+        float(session.recording.time[-1]),
+        note="; ".join(
+            filter(
+                None,
+                [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"],
+            )
+        ),
+        ties=tuple(ties),
+        seen=(effect, theta),
+        clues={
+            "gain": float(np.log(max(g.mean(), 1e-4))),
+            "blocks": float(np.mean(g > 0)),
+            "size": float(np.log(max(size, 1e-3))),
+            "explained": float(view.explained()),
+        },
+    )
 
 
 def _parameters(effect, theta, thetas, table):
@@ -431,5 +449,3 @@ def _vertex(x, y, i):
         return float(x[i])
     bend, slope, _ = np.polyfit(x[i - 1 : i + 2] - x[i], y[i - 1 : i + 2], 2)
     return float(np.clip(x[i] - 0.5 * slope / max(bend, 1e-12), x[i - 1], x[i + 1]))
-
-

@@ -1,5 +1,5 @@
-"""What a finding's clues say of its being right: a logistic function for every family, fitted on practice recordings
-(`benchmarks/recordings_foreign.py`, `benchmarks/discrepancy_recordings.py --fit`)."""
+"""What a finding's clues say of its being right: a logistic function for every family, fitted on practice
+recordings (`benchmarks/recordings_foreign.py`, `benchmarks/discrepancy_recordings.py --fit`)."""
 
 import json
 import math
@@ -7,7 +7,7 @@ import pathlib
 
 from .findings import Finding
 
-__all__ = ["FAMILIES", "NAMED", "clues", "confidence"]
+__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "probability"]
 
 FAMILIES = {
     "shared": ("warmup", "fluidloss", "count_offset", "count_gain", "thermal"),
@@ -22,9 +22,11 @@ FAMILIES = {
     "size": ("noise",),
     "force": ("latency", "relax", "hyster"),
 }
-NAMED = 0.6  # confidence from which a finding is named: fitted on practice recordings together with the weights
+NAMED = (
+    0.6  # confidence from which a finding is named: fitted on practice recordings together with the weights
+)
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
-_WEIGHTS = json.loads(_FITTED.read_text()) if _FITTED.exists() else {}
+_WEIGHTS = json.loads(_FITTED.read_text())
 
 
 def family(finding: Finding) -> str:
@@ -41,9 +43,11 @@ def clues(finding: Finding) -> dict:
 
 def confidence(finding: Finding) -> float:
     """Probability that the name is right."""
-    known = _WEIGHTS.get(family(finding))
-    if known is None:
-        return 0.5
-    given = clues(finding)
+    return probability(family(finding), clues(finding))
+
+
+def probability(family: str, given: dict) -> float:
+    """Of a family's clues."""
+    known = _WEIGHTS[family]
     total = known["intercept"] + sum(w * given.get(k, 0.0) for k, w in known["weights"].items())
     return 1 / (1 + math.exp(-max(min(total, 30.0), -30.0)))

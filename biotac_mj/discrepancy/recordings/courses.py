@@ -1,7 +1,8 @@
-"""Courses over time of one series of levels: a constant, a step, a smooth curve, or both, compared on blocks of
-time left out; and how a course goes on beyond the last row fitted."""
+"""Courses over time of one series of levels: a constant, a step, a smooth curve, or both, compared on
+blocks of time left out; and how a course goes on beyond the last row fitted."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -99,13 +100,13 @@ def courses(
     w = len(level)
     scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 1e-9)
     block = np.arange(w) * min(BLOCKS, w // 2) // w
-    null = _left_out(level, np.ones((w, 1)), block)
+    null = _left_out(w, 1)[0] @ level
     found = []
     for k in _KNOTS:
+        left_out, weights = _left_out(w, k)
+        gain = compare(null, left_out @ level, block, scale)
         knots = np.linspace(time[0], time[-1], k)
-        basis = _hats(time, knots)
-        gain = compare(null, _left_out(level, basis, block), block, scale)
-        found.append(Course("smooth", np.nan, knots, _solve(basis, level), 0.0, gain, sign_flip(gain)))
+        found.append(Course("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
     for knots in (time[[0, -1]], *([np.linspace(time[0], time[-1], 7)] if thorough else [])):
         basis = _hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
         residual = np.empty(w)
@@ -149,13 +150,20 @@ def _solve(A, y):
     return np.linalg.solve(A.T @ A + 1e-3 * np.eye(A.shape[1]), A.T @ y)
 
 
-def _left_out(level, basis, block):
-    """(w,) residuals of each block by the others' least squares."""
-    out = np.empty(len(level))
+@functools.lru_cache(maxsize=64)
+def _left_out(w, k):
+    """(w, w) that makes of w levels the residuals of each block by the others' least squares on k hats over
+    even cells, and (k, w) that makes the weights of all."""
+    cells = np.linspace(0, 1, w)
+    basis = _hats(cells, np.linspace(0, 1, k)) if k > 1 else np.ones((w, 1))
+    block = np.arange(w) * min(BLOCKS, w // 2) // w
+    out = np.eye(w)
+    small = 1e-3 * np.eye(k)
     for b in range(block[-1] + 1):
         rest = block != b
-        out[~rest] = level[~rest] - basis[~rest] @ _solve(basis[rest], level[rest])
-    return out
+        A = basis[rest]
+        out[np.ix_(~rest, rest)] = -basis[~rest] @ np.linalg.solve(A.T @ A + small, A.T)
+    return out, np.linalg.solve(basis.T @ basis + small, basis.T)
 
 
 def _with_step(level, basis, time, rows):
@@ -173,8 +181,8 @@ def _with_step(level, basis, time, rows):
 
 
 def _goes_on(level, time):
-    """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by walking
-    forward through the cells: at three earlier ends what came next is said from what was there."""
+    """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by
+    walking forward through the cells: at three earlier ends what came next is said from what was there."""
     span = time[-1] - time[0]
     ends = [int(f * len(level)) for f in (0.55, 0.7, 0.85)]
     taus = [0.0, *(span * f for f in (0.1, 0.25, 0.5, 1.0)), np.inf]

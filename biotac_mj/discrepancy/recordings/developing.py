@@ -1,13 +1,13 @@
-"""What develops over time: a drift that all electrodes share, each with a share of its own; offsets, jumps, gains and
-signs of single electrodes; exchanged channels.
+"""What develops over time: a drift that all electrodes share, each with a share of its own; offsets, jumps,
+gains and signs of single electrodes; exchanged channels.
 
 Directions are ranked by the energy that a course over time explains in units of the joint model (`model.py`),
 so that an effect is charged to the channel that has it, and judged on blocks of time left out."""
 
 import numpy as np
 
-from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ...geometry.electrodes import electrode_positions
+from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ..evidence import sign_flip
 from .courses import BLOCKS, Course, compare, courses
 from .findings import Finding
@@ -18,7 +18,11 @@ __all__ = ["exchanged", "gains", "levels", "settle"]
 
 # of a shared drift's shares about their mean: 8-15 % seen in a real unloaded sensor
 _SHARES = 0.12
+# off their median at most: the weakest of a real unloaded sensor has 65 % of it
+_ALONE = 0.7
 _NAN = float("nan")
+# logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
+_CURVED = 0.18
 
 
 # --- levels
@@ -69,17 +73,24 @@ def _single(session, course, k, options):
     lead = next(o[0] for o in options if o[1] == k) / max(o[0] for o in options if o[1] != k)
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
     return Finding(
-        "drift", (k,), {"change": (change, change - error, change + error)}, course.nats, course.p, course.start, time[-1],
-        note=f"{'a step' if course.kind == 'step' else 'a course over time'} of {course.size * m.slope[i]:.0f} "
-             "counts against what the other electrodes say",
+        "drift",
+        (k,),
+        {"change": (change, change - error, change + error)},
+        course.nats,
+        course.p,
+        course.start,
+        time[-1],
+        note=f"{'a step' if course.kind == 'step' else 'a course over time'} of "
+        f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
         | {"lead": float(np.log(lead)), "stands": _stands(m, i), "course": course},
-        correct=correct)  # fmt: skip
+        correct=correct,
+    )
 
 
 def _stands(m, i):
-    """Logarithm of how much more the levels of electrode i wander about their mean than those of the others, in
-    counts."""
+    """Logarithm of how much more the levels of electrode i wander about their mean than those of the
+    others, in counts."""
     level, _ = m.levels(m.alone())
     size = level.std(0) * m.slope + 0.3
     return float(np.log(size[i] / np.median(np.delete(size, i))))
@@ -112,12 +123,23 @@ def _shared(session, course, options):
     size = course.size * float(m.slope.mean())
     others = max((o[0] for o in options if o[1] is not None), default=1.0)
     finding = Finding(
-        "warmup", tuple(range(19)), {}, course.nats, course.p, course.start, time[-1],
+        "warmup",
+        tuple(range(19)),
+        {},
+        course.nats,
+        course.p,
+        course.start,
+        time[-1],
         note=f"ln Z of all electrodes changes by {change:+.3f} ({size:.0f} counts); shares "
-             f"{share[m.used].min():.2f} to {share[m.used].max():.2f}",
+        f"{share[m.used].min():.2f} to {share[m.used].max():.2f}",
         clues=_clues(session, course, size, float((m.activity * m.slope).mean()))
-        | {"lead": float(np.log(options_energy(options) / max(others, 1e-9))), "course": course, "share": share},
-        correct=correct)  # fmt: skip
+        | {
+            "lead": float(np.log(options_energy(options) / max(others, 1e-9))),
+            "course": course,
+            "share": share,
+        },
+        correct=correct,
+    )
     _name_shared(session, finding, course, change)
     return finding
 
@@ -128,8 +150,8 @@ def options_energy(options: list) -> float:
 
 
 def _shares(m: Model, course: Course, own: np.ndarray) -> np.ndarray:
-    """(c,) of a drift, about one: generalised least squares on the cells' levels, drawn towards their mean; where an
-    electrode has a change of its own (c,) bool, the mean of its three neighbours'."""
+    """(c,) of a drift, about one: generalised least squares on the cells' levels, drawn towards their mean;
+    where an electrode has a change of its own (c,) bool, the mean of its three neighbours'."""
     number = len(m.used)
     level, time = m.levels(m.value)
     g = course(time)
@@ -140,12 +162,18 @@ def _shares(m: Model, course: Course, own: np.ndarray) -> np.ndarray:
     worse = np.median((np.median(np.abs(change), axis=0) / 0.6745) ** 2 / 2 * np.diag(m.precision)[:number])
     worse = max(worse, 1e-9)
     share = np.ones(number)
-    for _ in range(3):  # shares far off belong to a change of one electrode: they are drawn to the mean all the more
+    for _ in range(
+        3
+    ):  # shares far off belong to a change of one electrode: they are drawn to the mean all the more
         off = (share - np.median(share)) / _SHARES
         pull = (1 / (1 + (off / 4) ** 2)) / _SHARES**2
-        pull = np.maximum(pull, 1 / _SHARES**2 * 0.05) if m.dimensions == 0 else np.full(number, 1 / _SHARES**2)
+        pull = (
+            np.maximum(pull, 1 / _SHARES**2 * 0.05) if m.dimensions == 0 else np.full(number, 1 / _SHARES**2)
+        )
         A = g @ g / worse * marginal + np.diag(pull)
         share = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(share))
+    if not m.dimensions:  # unloaded: a share that far off is a change of that electrode alone
+        own = own | (np.abs(share - np.median(share)) > _ALONE)
     place = electrode_positions()[m.used]
     for i in np.flatnonzero(own):
         near = np.argsort(np.linalg.norm(place - place[i], axis=1) + 1e3 * own)[:3]
@@ -166,16 +194,23 @@ def _name_shared(session, finding, course, change):
     P = m.precision
     misfit = {}
     for name, pattern in (
-        ("warmup", np.ones(number)), ("count_offset", 1 / m.slope), ("count_gain", e / m.slope)
-    ):  # fmt: skip
+        ("warmup", np.ones(number)),
+        ("count_offset", 1 / m.slope),
+        ("count_gain", e / m.slope),
+    ):
         filtered = P[:, :number] @ pattern
         size = amplitude @ filtered / (pattern @ filtered[:number])
         # every electrode has its own share: what is beyond that
         spread = np.diag(1 / (np.diag(P)[:number] ** -1 + (_SHARES * size * pattern) ** 2))
-        left = amplitude[:number] - size * pattern if not m.dimensions else (P @ (amplitude - size * np.r_[pattern, np.zeros(len(P) - number)]))[:number] / np.diag(P)[:number]
+        left = (
+            amplitude[:number] - size * pattern
+            if not m.dimensions
+            else (P @ (amplitude - size * np.r_[pattern, np.zeros(len(P) - number)]))[:number]
+            / np.diag(P)[:number]
+        )
         misfit[name] = float(left @ spread @ left)
     rising = change > 0
-    sudden = course.kind == "step" or course.start > 0.12 * session.recording.time[session.fit][-1]
+    sudden = course.kind == "step"
     order = ["fluidloss", "warmup"] if rising else ["warmup"]
     order = [*order, "count_offset", "count_gain"] if not sudden else ["count_offset", "count_gain", *order]
     best = min(misfit.values())
@@ -202,8 +237,11 @@ def _name_shared(session, finding, course, change):
                 spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
                 finding.parameters = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}
     finding.ties = tuple(ties)
-    if finding.id in ("warmup", "fluidloss"):
+    if finding.id == "warmup":
         finding.parameters = _warm_up(course)
+    elif finding.id == "fluidloss":
+        lost = 1 - np.exp(-np.array([change, 0.9 * change, 1.1 * change]))
+        finding.parameters = {"rate": tuple(3600 / course.knots[-1] * lost)}
     elif finding.id == "count_offset":
         value = -change * float(m.slope.mean())
         finding.parameters = {"change": (value, _NAN, _NAN)}
@@ -225,7 +263,8 @@ def _warm_up(course: Course) -> dict:
     least = min(fits)
     near = [f for f in fits if f[0] < 1.5 * least[0] + 1e-4 * (y**2).sum()]
     return {
-        name: (least[i], min(f[i] for f in near), max(f[i] for f in near)) for name, i in (("a", 2), ("tau", 1))
+        name: (least[i], min(f[i] for f in near), max(f[i] for f in near))
+        for name, i in (("a", 2), ("tau", 1))
     }
 
 
@@ -246,10 +285,18 @@ def settle(session: Session) -> None:
             kinds = ("step", "smooth", "both") if not shared else (finding.clues["course"].kind,)
             course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
             options = [(1.0, None, None), (1.0, finding.channels[0], None)]
-            again = _shared(other, course, options) if shared else _single(other, course, finding.channels[0], options)
+            again = (
+                _shared(other, course, options)
+                if shared
+                else _single(other, course, finding.channels[0], options)
+            )
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.note = again.nats, again.p, again.note
-            finding.clues |= {k: v for k, v in again.clues.items() if k not in ("lead", "stands", "nats", "size", "counts", "turns", "blocks")}
+            finding.clues |= {
+                k: v
+                for k, v in again.clues.items()
+                if k not in ("lead", "stands", "nats", "size", "counts", "turns", "blocks")
+            }
             if "share" in finding.clues:
                 finding.id, finding.ties = again.id, again.ties
             session.replay()
@@ -265,7 +312,9 @@ def gains(session: Session, refused: set) -> Finding | None:
     before: c, s and the regression are fitted together, on moments of windows, and judged on blocks left
     out."""
     m = session.model()
-    if m.dimensions < 2 or m.time[m.inside][-1] < BLOCKS:  # a block of less than a second holds no load change
+    if (
+        m.dimensions < 2 or m.time[m.inside][-1] < BLOCKS
+    ):  # a block of less than a second holds no load change
         return None
     whole = m.whole[m.inside]
     span = max(4, int(min(2.0 / m.period, len(whole) // 32)))
@@ -276,12 +325,15 @@ def gains(session: Session, refused: set) -> Finding | None:
     block = np.arange(w) * BLOCKS // w
     size = moment.shape[1]
     floor = np.concatenate([m.noise**2, np.full(size - len(m.used), 0.02)]) * span * w
-    splits = np.unique(np.linspace(0.08 * w, 0.92 * w, 15).astype(int))
+    splits = range(max(2, int(0.06 * w)), int(0.94 * w))
     total = moment.sum(0)
     early = np.cumsum(moment, axis=0)
     options = []
     for i in range(len(m.used)):
-        one = min((_gain_fit(early[s - 1], total - early[s - 1], i, floor, 3) + (s,) for s in splits), key=lambda o: o[0])
+        one = min(
+            (_gain_fit(early[s - 1], total - early[s - 1], i, floor, 1) + (s,) for s in splits),
+            key=lambda o: o[0],
+        )
         plain = _gain_fit(total, 0 * total, i, floor, 0)
         options.append((0.5 * w * np.log(plain[0] / one[0]), i, one))
     options.sort(key=lambda o: -o[0])
@@ -306,7 +358,13 @@ def gains(session: Session, refused: set) -> Finding | None:
             gain[b] = 0.5 * inside * np.log((left[0] + inside * noise) / (left[1] + inside * noise))
             factors.append(c)
         p, c = sign_flip(gain), float(np.median(factors))
-        if p > 0.02 or gain.sum() < 5 or abs(np.log(abs(c))) < 0.1 and c > 0:
+        if (
+            p > 0.02
+            or gain.sum() < 5
+            or np.ptp(factors) > 0.8 * abs(c)
+            or abs(np.log(abs(c))) < _CURVED
+            and c > 0
+        ):
             continue
         return _gain_finding(session, k, i, c, np.ptp(factors) / 2, split * span * m.period, gain, p)
     return None
@@ -318,8 +376,9 @@ def _gain_fit(early, late, i, floor, rounds, full=False):
     G, H, g, h = early[np.ix_(o, o)], late[np.ix_(o, o)], early[o, i], late[o, i]
     ridge = np.diag(floor[o])
     c = 1.0
-    beta = np.linalg.solve(G + H + ridge, g + h)
-    if rounds:
+    if not rounds:
+        beta = np.linalg.solve(G + H + ridge, g + h)
+    else:
         # the larger side says what is normal
         first, other = (G, g), (H, h)
         swap = np.trace(H) > np.trace(G)
@@ -359,12 +418,25 @@ def _gain_finding(session, k, i, c, spread, onset, gain, p):
         return out
 
     finding = Finding(
-        "flip" if c < 0 else "gain", (k,), {"factor": (c, c - spread, c + spread)}, float(gain.sum()), p, onset, time[-1],
+        "flip" if c < 0 else "gain",
+        (k,),
+        {"factor": (c, c - spread, c + spread)}
+        if c < 0
+        else {f"e{k + 1}": (c - 1, c - 1 - spread, c - 1 + spread)},
+        float(gain.sum()),
+        p,
+        onset,
+        time[-1],
         note=f"from {onset:.1f} s on it answers the load {c:.2f} times as before",
-        clues={"nats": float(gain.mean()), "factor": float(abs(np.log(max(abs(c), 0.02)))) if c > 0 else 2.0,
-               "blocks": float(np.mean(gain > 0)), "seconds": float(np.log(m.time[m.inside][-1])),
-               "explained": float(m.activity[i] * np.sqrt(m.precision[i, i]))},
-        correct=correct)  # fmt: skip
+        clues={
+            "nats": float(gain.mean()),
+            "factor": float(abs(np.log(max(abs(c), 0.02)))) if c > 0 else 2.0,
+            "blocks": float(np.mean(gain > 0)),
+            "seconds": float(np.log(m.time[m.inside][-1])),
+            "explained": float(m.activity[i] * np.sqrt(m.precision[i, i])),
+        },
+        correct=correct,
+    )
     # about which count: the one at which nothing jumps
     again = Session(session.recording, session.fit, [*session.findings, finding])
     m = again.model()
@@ -426,7 +498,7 @@ def exchanged(session: Session) -> Finding | None:
         return np.sqrt((((other[:, by] - mean) @ P / np.diag(P)) ** 2).mean(0))[moved]
 
     # every one of them has to fit better in its new place: one that jumped beside another's level does not
-    if p > 0.01 or len(moved) > 8 or (off(order) > 0.6 * off(straight)).any():
+    if p > 0.01 or len(moved) > 8 or (off(order) > 0.9 * off(straight)).any():
         return None
     # the row at which exchanging turns from worse to better
     cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
@@ -443,13 +515,24 @@ def exchanged(session: Session) -> Finding | None:
         return out
 
     return Finding(
-        "swap", tuple(int(k) for k in channels), {"onset": (onset, onset - m.period, onset + m.period)},
-        float(gain.sum()), p, onset if late else 0.0, float(last if late else onset),
+        "swap",
+        tuple(int(k) for k in channels),
+        {"onset": (onset, onset - m.period, onset + m.period)},
+        float(gain.sum()),
+        p,
+        onset if late else 0.0,
+        float(last if late else onset),
         note=" ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
-        clues={"nats": float(gain.mean()) / number, "left": float(np.log(then.mean() / usual)),
-               "ratio": float(np.log(now.mean() / then.mean())), "moved": float(len(moved)),
-               "blocks": float(np.mean(gain > 0)), "seconds": float(np.log(m.time[m.inside][-1]))},
-        correct=correct)  # fmt: skip
+        clues={
+            "nats": float(gain.mean()) / number,
+            "left": float(np.log(then.mean() / usual)),
+            "ratio": float(np.log(now.mean() / then.mean())),
+            "moved": float(len(moved)),
+            "blocks": float(np.mean(gain > 0)),
+            "seconds": float(np.log(m.time[m.inside][-1])),
+        },
+        correct=correct,
+    )
 
 
 def _usual(m, normal):

@@ -1,4 +1,5 @@
-"""What the noise says of the electronics: lines, colour, correlations, and electrodes noisier than the others.
+"""What the noise says of the electronics: lines, colour, correlations, and electrodes noisier than the
+others.
 
 Everything is looked for above the band in which the load moves: of a recording's rows less what a smooth
 course through them says."""
@@ -29,8 +30,8 @@ def _differences(session, order=3):
 
 
 def _calm(d, share=0.5, size=40):
-    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, and their
-    blocks."""
+    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, and
+    their blocks."""
     k = len(d) // size
     cells = d[: k * size].reshape(k, size, -1)
     known = np.isfinite(cells)
@@ -62,7 +63,8 @@ def coloured(session: Session) -> Finding | None:
     parts = np.stack([x[a : a + size] - project @ x[a : a + size] for a in starts]) * window
     power = np.abs(np.fft.rfft(parts, axis=1)) ** 2
     f = np.fft.rfftfreq(size)
-    middle, high = (power[:, (f >= a) & (f <= b)].mean(1) for a, b in ((0.16, 0.27), (0.38, 0.5)))
+    bands = ((0.16, 0.27) if session.loaded else (0.05, 0.2), (0.38, 0.5))
+    middle, high = (power[:, (f >= a) & (f <= b)].mean(1) for a, b in bands)
     # rounding alone has a floor of its own
     floor = (window**2).sum() / 12
     alive = np.median(middle, axis=0) > 0.5 * floor
@@ -70,23 +72,37 @@ def coloured(session: Session) -> Finding | None:
         return None
     block = np.arange(len(parts)) * BLOCKS // len(parts)
     ratio = np.array(
-        [np.median(np.log(np.quantile(middle[block == b], 0.3, axis=0) / np.maximum(
-            np.quantile(high[block == b], 0.3, axis=0), 0.01 * floor))[alive]) for b in range(BLOCKS)]
-    )  # fmt: skip
+        [
+            np.median(
+                np.log(
+                    np.quantile(middle[block == b], 0.3, axis=0)
+                    / np.maximum(np.quantile(high[block == b], 0.3, axis=0), 0.01 * floor)
+                )[alive]
+            )
+            for b in range(BLOCKS)
+        ]
+    )
     p, value = sign_flip(ratio), float(np.median(ratio))
-    pole = _pole(value)
+    pole = _pole(value, bands)
     if p > 0.01 or pole < 0.05:
         return None
     rate = session.recording.rate * session.fresh
     tau, low, high = (
-        -1 / (rate * np.log(np.clip(_pole(v), 1e-3, 0.995))) for v in (value, *np.quantile(ratio, [0.1, 0.9]))
+        -1 / (rate * np.log(np.clip(_pole(v, bands), 1e-3, 0.995)))
+        for v in (value, *np.quantile(ratio, [0.1, 0.9]))
     )
     return Finding(
-        "lowpass", tuple(range(19)), {"tau": (tau, low, high)}, float(np.sum(ratio**2) * len(starts) / BLOCKS), p, 0.0,
+        "lowpass",
+        tuple(range(19)),
+        {"tau": (tau, low, high)},
+        float(np.sum(ratio**2) * len(starts) / BLOCKS),
+        p,
+        0.0,
         session.recording.time[-1],
         note=f"the noise is {np.exp(value):.1f} times stronger at a quarter of the rate than at half of it",
         clues={"pole": pole, "ratio": value, "least": float(ratio.min())},
-        correct=lambda counts, at: _sharpened(counts, tau, session.recording.rate))  # fmt: skip
+        correct=lambda counts, at: _sharpened(counts, tau, session.recording.rate),
+    )
 
 
 def _fresh(session):
@@ -94,12 +110,14 @@ def _fresh(session):
     return session.counts[session.fit & ~session.recording.repeated & ~session.masked.all(1)]
 
 
-def _pole(ratio):
+def _pole(ratio, bands):
     """Of noise a[i] = pole a[i - 1] + white, whose power falls by e^ratio between the two bands."""
 
     def fall(pole):
-        power = [np.mean(1 / (1 + pole**2 - 2 * pole * np.cos(2 * np.pi * np.linspace(*band, 50))))
-                 for band in ((0.16, 0.27), (0.38, 0.5))]  # fmt: skip
+        power = [
+            np.mean(1 / (1 + pole**2 - 2 * pole * np.cos(2 * np.pi * np.linspace(*band, 50))))
+            for band in bands
+        ]
         return np.log(power[0] / power[1])
 
     if ratio <= 0:
@@ -118,8 +136,8 @@ def _sharpened(counts, tau, rate):
 
 
 def humming(session: Session) -> Finding | None:
-    """A line in the spectrum above the band in which the load moves, whose phase on blocks left out is that of the
-    others."""
+    """A line in the spectrum above the band in which the load moves, whose phase on blocks left out is that
+    of the others."""
     r = session.recording
     x = session.counts[session.fit]
     n, rate = len(x), r.rate
@@ -189,14 +207,26 @@ def humming(session: Session) -> Finding | None:
 
     width = rate / size / 4
     return Finding(
-        "hum", tuple(int(k) for k in channels),
-        {"frequency": (frequency, frequency - width, frequency + width),
-         "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max()))},
-        float(gain.sum()), p, 0.0, r.time[-1],
-        note=f"a line {score:.0f} times above the spectrum around it, above the {band:.1f} Hz in which the load moves",
-        clues={"score": float(np.log(score)), "amplitude": float(np.log(np.median(amplitude / (noise / np.sqrt(2))))),
-               "blocks": float(np.mean(gain > 0)), "many": float(len(channels) > 12)},
-        correct=correct)  # fmt: skip
+        "hum",
+        tuple(int(k) for k in channels),
+        {
+            "frequency": (frequency, frequency - width, frequency + width),
+            "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
+        },
+        float(gain.sum()),
+        p,
+        0.0,
+        r.time[-1],
+        note=f"a line {score:.0f} times above the spectrum around it, above the {band:.1f} Hz in which the "
+        "load moves",
+        clues={
+            "score": float(np.log(score)),
+            "amplitude": float(np.log(np.median(amplitude / (noise / np.sqrt(2))))),
+            "blocks": float(np.mean(gain > 0)),
+            "many": float(len(channels) > 12),
+        },
+        correct=correct,
+    )
 
 
 # --- correlations
@@ -209,7 +239,7 @@ def correlated(session: Session) -> Finding | None:
         return None
     cells, block = _calm(d, 0.3 if session.loaded else 1.0)
     sd = np.sqrt(np.nanmean(cells**2, axis=(0, 1)) / 252)
-    alive = np.flatnonzero(sd > 0.25)
+    alive = np.flatnonzero(sd > _LEAST)
     if len(alive) < 8:
         return None
     x = np.clip(np.nan_to_num(cells[:, :, alive]) / (sd[alive] * np.sqrt(252)), -3, 3)
@@ -227,7 +257,9 @@ def correlated(session: Session) -> Finding | None:
         k = K[np.ix_(alive, alive)][pairs]
         c = k - k.mean()
         by_block = value @ c / (c @ c)
-        share = float((mean - mean.mean()) @ c / np.sqrt((c @ c) * max(((mean - mean.mean()) ** 2).sum(), 1e-12)))
+        share = float(
+            (mean - mean.mean()) @ c / np.sqrt((c @ c) * max(((mean - mean.mean()) ** 2).sum(), 1e-12))
+        )
         t = by_block.mean() / max(by_block.std(ddof=1) / np.sqrt(BLOCKS), 1e-9)
         if best is None or share > best[1]:
             best = name, share, by_block, t
@@ -247,19 +279,38 @@ def correlated(session: Session) -> Finding | None:
             parameters["length"] = (float(name.split()[1]), _NAN, _NAN)
         ties = ("common_noise",) if common > coupling else ()
         return Finding(
-            "crosstalk", tuple(range(19)), parameters, float(size * len(pairs[0]) * coupling**2), p, 0.0, last,
-            note=f"noise of neighbours ({name}) is correlated by {2 * coupling:.2f}; a sensor's is independent", ties=ties,
+            "crosstalk",
+            tuple(range(19)),
+            parameters,
+            float(size * len(pairs[0]) * coupling**2),
+            p,
+            0.0,
+            last,
+            note=f"noise of neighbours ({name}) is correlated by {2 * coupling:.2f}; "
+            "a sensor's is independent",
+            ties=ties,
             clues={"kappa": float(np.log(coupling)), "share": share, "t": float(np.log(max(t, 1.0)))},
-            correct=lambda counts, at: centre + (counts - centre) @ matrix.T)  # fmt: skip
+            correct=lambda counts, at: centre + (counts - centre) @ matrix.T,
+        )
     p = sign_flip(off)
     if p < 0.01 and common > 0.02:
         return Finding(
-            "common_noise", tuple(range(19)), {"correlation": (common, common - noise, common + noise)},
-            float(size * len(pairs[0]) * common**2 / 2), p, 0.0, last, ties=("crosstalk",) if common < 0.2 else (),
+            "common_noise",
+            tuple(range(19)),
+            {"correlation": (common, common - noise, common + noise)},
+            float(size * len(pairs[0]) * common**2 / 2),
+            p,
+            0.0,
+            last,
+            ties=("crosstalk",) if common < 0.2 else (),
             note=f"noise of all pairs alike is correlated by {common:.2f}",
-            clues={"kappa": float(np.log(common)), "share": float(common / (mean.std() + 1e-3)),
-                   "t": float(np.log(max(off.mean() / max(off.std(ddof=1), 1e-9) * 4, 1.0)))},
-            correct=_without_common(session))  # fmt: skip
+            clues={
+                "kappa": float(np.log(common)),
+                "share": float(common / (mean.std() + 1e-3)),
+                "t": float(np.log(max(off.mean() / max(off.std(ddof=1), 1e-9) * 4, 1.0))),
+            },
+            correct=_without_common(session),
+        )
     return None
 
 
@@ -310,10 +361,22 @@ def noisy(session: Session) -> list[Finding]:
         if p > 0.01:
             continue
         factor = float(np.exp(own[e]))
-        found.append(Finding(
-            "noise", (int(e),), {"factor": (factor, *np.exp(np.nanquantile(ratio[:, e], [0.1, 0.9])))},
-            float(k * BLOCKS * own[e] ** 2), p, 0.0, session.recording.time[-1],
-            note=f"{factor:.1f} times as noisy as the other electrodes' law says",
-            clues={"factor": float(own[e]), "stands": float(own[e] / spread), "blocks": float(np.mean(excess > 0)),
-                   "counts": float(np.log(np.nanmedian(level[:, e])))}))  # fmt: skip
+        found.append(
+            Finding(
+                "noise",
+                (int(e),),
+                {"factor": (factor, *np.exp(np.nanquantile(ratio[:, e], [0.1, 0.9])))},
+                float(k * BLOCKS * own[e] ** 2),
+                p,
+                0.0,
+                session.recording.time[-1],
+                note=f"{factor:.1f} times as noisy as the other electrodes' law says",
+                clues={
+                    "factor": float(own[e]),
+                    "stands": float(own[e] / spread),
+                    "blocks": float(np.mean(excess > 0)),
+                    "counts": float(np.log(np.nanmedian(level[:, e]))),
+                },
+            )
+        )
     return found

@@ -1,5 +1,5 @@
-"""What can be named in a recording: the catalogue, a finding with its parameters, and how it is taken out of the
-counts."""
+"""What can be named in a recording: the catalogue, a finding with its parameters, and how it is taken out
+of the counts."""
 
 import dataclasses
 from collections.abc import Callable
@@ -78,7 +78,12 @@ def _shipped(name, extra_ties=(), **params):
     effect = next(e for e in CATALOGUE if e.id == name)
     known = {k: Parameter(p.unit, p.low, p.high, p.source) for k, p in effect.params.items()}
     return Kind(
-        name, effect.name, effect.stage, effect.physics, params or known, dict(effect.confusable) | dict(extra_ties)
+        name,
+        effect.name,
+        effect.stage,
+        effect.physics,
+        params or known,
+        dict(effect.confusable) | dict(extra_ties),
     )
 
 
@@ -92,54 +97,148 @@ KINDS = {
     k.id: k
     for k in (
         _shipped("warmup", {"count_offset": "load and unload: an offset keeps its counts"}, **_WARM),
-        _shipped("fluidloss", {"count_offset": "load and unload: an offset keeps its counts"}, **_WARM),
+        _shipped("fluidloss", {"count_offset": "load and unload: an offset keeps its counts"}),
         _shipped("thermal"),
-        Kind("count_offset", "common offset in counts", "A", "reference or supply: the same counts on every electrode",
-             {"change": _COUNTS}, {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}),
-        Kind("count_gain", "common gain in counts", "A", "reference or supply: every count in proportion",
-             {"change": Parameter("1", -0.9, 0.9, "supplies")}, {"count_offset": "rest levels that differ more"}),
-        Kind("drift", "drift or jump of an electrode", "A", "an offset of one channel's amplifier or contact",
-             {"change": _COUNTS}, {"gain": "load and unload", "warmup": "one electrode or all"}),
-        Kind("gain", "gain change of an electrode", "A", "an electrode answers the load by another factor",
-             {"factor": Parameter("1", 0.05, 5, "contact, amplifier")},
-             {"drift": "load and unload", "saturate": "depth ladder at one place"}),
-        Kind("flip", "sign of an electrode reversed", "A", "an electrode answers the load with the other sign",
-             {"factor": Parameter("1", -5, -0.05, "polarity")}, {"gain": "press beside the electrode"}),
-        Kind("swap", "exchanged channels", "A", "electrodes carry each other's signal: cable or channel order",
-             {"onset": _TIME}, {"gain": "an exchange changes two channels at once"}),
-        Kind("stuck", "stuck channel", "A", "an electrode repeats one count although its noise would change it",
-             {"value": _COUNTS}, {"saturate": "press harder: a stuck channel does not leave its value"}),
-        Kind("freeze", "held rows", "A", "rows are repeated or carried on by noise alone: bus or logger",
-             {"seconds": Parameter("s", 0, 1e4, "longer than any bus period")},
-             {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"}),
-        Kind("lost_rows", "lost rows", "A", "the record jumps: rows were dropped between two that follow each other",
-             {"seconds": Parameter("s", 0, 1e4, "what the load did meanwhile")}, {"freeze": "the clock of the logger"}),
-        _shipped("saturate", {"stuck": "a clipped channel leaves the limit when the load goes back"},
-                 level=_COUNTS),
-        Kind("quantise", "coarse quantisation", "A", "values lie on multiples of more than one count",
-             {"step": Parameter("counts", 2, 512, "3 to 11 of 12 bits")}, {"stuck": "a coarse channel takes several values"}),
-        Kind("spikes", "spikes or dropouts of single samples", "A", "a few samples leave the trace and come back at once",
-             {"rate": Parameter("1/min", 0, 6000, "up to every tenth sample")}, {"noise": "noise is in every sample"}),
-        Kind("hum", "mains hum or another periodic disturbance", "A", "A sin(2 pi f t): mains, its alias, or a machine",
-             {"amplitude": Parameter("counts", 0.3, 500, "1-10 counts"), "frequency": Parameter("Hz", 0.2, 2000, "half the rate")},
-             {"noise": "noise has no line"}),
+        Kind(
+            "count_offset",
+            "common offset in counts",
+            "A",
+            "reference or supply: the same counts on every electrode",
+            {"change": _COUNTS},
+            {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"},
+        ),
+        Kind(
+            "count_gain",
+            "common gain in counts",
+            "A",
+            "reference or supply: every count in proportion",
+            {"change": Parameter("1", -0.9, 0.9, "supplies")},
+            {"count_offset": "rest levels that differ more"},
+        ),
+        Kind(
+            "drift",
+            "drift or jump of an electrode",
+            "A",
+            "an offset of one channel's amplifier or contact",
+            {"change": _COUNTS},
+            {"gain": "load and unload", "warmup": "one electrode or all"},
+        ),
+        _shipped("gain", {"drift": "load and unload"}),
+        Kind(
+            "flip",
+            "sign of an electrode reversed",
+            "A",
+            "an electrode answers the load with the other sign",
+            {"factor": Parameter("1", -5, -0.05, "polarity")},
+            {"gain": "press beside the electrode"},
+        ),
+        Kind(
+            "swap",
+            "exchanged channels",
+            "A",
+            "electrodes carry each other's signal: cable or channel order",
+            {"onset": _TIME},
+            {"gain": "an exchange changes two channels at once"},
+        ),
+        Kind(
+            "stuck",
+            "stuck channel",
+            "A",
+            "an electrode repeats one count although its noise would change it",
+            {"value": _COUNTS},
+            {"saturate": "press harder: a stuck channel does not leave its value"},
+        ),
+        Kind(
+            "freeze",
+            "held rows",
+            "A",
+            "rows are repeated or carried on by noise alone: bus or logger",
+            {"seconds": Parameter("s", 0, 1e4, "longer than any bus period")},
+            {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"},
+        ),
+        Kind(
+            "lost_rows",
+            "lost rows",
+            "A",
+            "the record jumps: rows were dropped between two that follow each other",
+            {"seconds": Parameter("s", 0, 1e4, "what the load did meanwhile")},
+            {"freeze": "the clock of the logger"},
+        ),
+        _shipped(
+            "saturate", {"stuck": "a clipped channel leaves the limit when the load goes back"}, level=_COUNTS
+        ),
+        Kind(
+            "quantise",
+            "coarse quantisation",
+            "A",
+            "values lie on multiples of more than one count",
+            {"step": Parameter("counts", 2, 512, "3 to 11 of 12 bits")},
+            {"stuck": "a coarse channel takes several values"},
+        ),
+        Kind(
+            "spikes",
+            "spikes or dropouts of single samples",
+            "A",
+            "a few samples leave the trace and come back at once",
+            {"rate": Parameter("1/min", 0, 6000, "up to every tenth sample")},
+            {"noise": "noise is in every sample"},
+        ),
+        Kind(
+            "hum",
+            "mains hum or another periodic disturbance",
+            "A",
+            "A sin(2 pi f t): mains, its alias, or a machine",
+            {
+                "amplitude": Parameter("counts", 0.3, 500, "1-10 counts"),
+                "frequency": Parameter("Hz", 0.2, 2000, "half the rate"),
+            },
+            {"noise": "noise has no line"},
+        ),
         _shipped("lowpass", {"freeze": "a held row keeps its value"}),
         _shipped("crosstalk", {"common_noise": "cross-talk falls off with distance"}),
-        Kind("common_noise", "noise common to all channels", "A", "one noise is added to every channel: reference, supply",
-             {"correlation": Parameter("1", 0.05, 1, "0.001 in a real sensor")},
-             {"crosstalk": "cross-talk falls off with distance"}),
-        Kind("noise", "excess noise of an electrode", "A", "an electrode's white noise is larger than the others' law",
-             {"factor": Parameter("1", 1.5, 100, "a real sensor follows the law within 20 %")}, {"spikes": "single samples"}),
+        Kind(
+            "common_noise",
+            "noise common to all channels",
+            "A",
+            "one noise is added to every channel: reference, supply",
+            {"correlation": Parameter("1", 0.05, 1, "0.001 in a real sensor")},
+            {"crosstalk": "cross-talk falls off with distance"},
+        ),
+        Kind(
+            "noise",
+            "excess noise of an electrode",
+            "A",
+            "an electrode's white noise is larger than the others' law",
+            {"factor": Parameter("1", 1.5, 100, "a real sensor follows the law within 20 %")},
+            {"spikes": "single samples"},
+        ),
         _shipped("latency"),
-        Kind("relax", "relaxation after load changes", "C",
-             "force answers a change of deformation at once and relaxes towards a part of it",
-             {"fraction": Parameter("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),
-              "tau": Parameter("s", 0.1, 60, "0.5 s and 4-7 s (PDC)")},
-             {"creep": "a hold of 100 s: a plateau or none", "hyster": "hold 0, 1 and 30 s at the same depth",
-              "lowpass": "longer holds", "latency": "a tap"}),
-        Kind("hyster", "rate-independent hysteresis", "C", "loading and unloading differ, whatever the speed",
-             {"fraction": Parameter("1", -1, 1, "loops of soft tactile sensors: 13-24 % of full scale"),
-              "width": Parameter("N", 0.01, 5, "the record")},
-             {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"}),
+        Kind(
+            "relax",
+            "relaxation after load changes",
+            "C",
+            "force answers a change of deformation at once and relaxes towards a part of it",
+            {
+                "fraction": Parameter("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),
+                "tau": Parameter("s", 0.1, 60, "0.5 s and 4-7 s (PDC)"),
+            },
+            {
+                "creep": "a hold of 100 s: a plateau or none",
+                "hyster": "hold 0, 1 and 30 s at the same depth",
+                "lowpass": "longer holds",
+                "latency": "a tap",
+            },
+        ),
+        Kind(
+            "hyster",
+            "rate-independent hysteresis",
+            "C",
+            "loading and unloading differ, whatever the speed",
+            {
+                "fraction": Parameter("1", -1, 1, "loops of soft tactile sensors: 13-24 % of full scale"),
+                "width": Parameter("N", 0.01, 5, "the record"),
+            },
+            {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"},
+        ),
     )
-}  # fmt: skip
+}

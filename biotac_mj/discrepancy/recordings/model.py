@@ -1,11 +1,12 @@
 """The joint model of 19 electrodes: rest + load on few dimensions + what develops over time + noise.
 
 ln Z of all electrodes and the products of its principal components (the load's place bends what electrodes
-have to do with each other) are one Gaussian whose covariance S is taken from changes *within* cells of a few seconds, so
-that nothing slow enters it. Its inverse P says everything else: an electrode less what all others say of it is
-(P y)_k / P_kk, and a pattern p shared by all is seen at p'P y / p'P p, where the load disturbs it least. Of all
-directions the true one has the most energy in units of 1 / sqrt(p'P p) (Cauchy-Schwarz), which is how an
-effect is charged to the channel that has it and not to those that feel it through the others."""
+have to do with each other) are one Gaussian whose covariance S is taken from changes *within* cells of a
+few seconds, so that nothing slow enters it. Its inverse P says everything else: an electrode less what all
+others say of it is (P y)_k / P_kk, and a pattern p shared by all is seen at p'P y / p'P p, where the load
+disturbs it least. Of all directions the true one has the most energy in units of 1 / sqrt(p'P p)
+(Cauchy-Schwarz), which is how an effect is charged to the channel that has it and not to those that feel it
+through the others."""
 
 import numpy as np
 
@@ -80,7 +81,7 @@ class Model:
         # dimensions that move by more than noise and rounding do
         lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
-        q, c = self.dimensions, x.shape[1]
+        q = self.dimensions
         if not q:
             self.precision, self._products = np.diag(1 / self.noise**2), np.zeros((len(x), 0))
             return
@@ -109,7 +110,10 @@ class Model:
         return (self.whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
 
     def shared(self, pattern: np.ndarray) -> np.ndarray:
-        """(m,) amplitude of a pattern (c,)."""
+        """(m,) amplitude of a pattern (c,); unloaded the median over electrodes, so that none decides
+        alone."""
+        if not self.dimensions:
+            return np.median(self.value / pattern, axis=1)
         c = len(self.used)
         filtered = self.precision[:, :c] @ pattern
         return self.whole @ filtered / (pattern @ filtered[:c])
@@ -125,8 +129,8 @@ class Model:
 
 
 def _within(x, span):
-    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out, for a step
-    within one is a change of the sensor and not of the load."""
+    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out,
+    for a step within one is a change of the sensor and not of the load."""
     k = len(x) // span
     cells = x[: k * span].reshape(k, span, -1)
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]

@@ -1,5 +1,5 @@
-"""Before and after, on the part kept aside: of every finding by its own number in raw units, and of the whole model
-in counts and newtons, beside the noise floor."""
+"""Before and after, on the part kept aside: of every finding by its own number in raw units, and of the
+whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
 
@@ -17,13 +17,14 @@ _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0,
 
 
 def prove(session: Session, finding: Finding) -> None:
-    """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and with
-    it."""
+    """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
+    with it."""
     without = session.without(finding)
     if finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
     elif finding.mask is not None:
-        before, after, floor, unit, name = _samples(session, without, finding)
+        by = _held if finding.mask.all(1).any() else _samples
+        before, after, floor, unit, name = by(session, without, finding)
     elif finding.id in _NEUTRAL:
         before, after, floor, unit, name = _again(session, without, finding)
     elif finding.id == "lost_rows":
@@ -32,10 +33,19 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = _counts(session, without, finding)
     if not np.isfinite(before):
         return
-    finding.gap = {"name": name, "unit": unit, "before": before, "after": after, "noise": floor, "part": "part kept aside"}
+    finding.gap = {
+        "name": name,
+        "unit": unit,
+        "before": before,
+        "after": after,
+        "noise": floor,
+        "part": "part kept aside",
+    }
     if unit == "counts" and np.isfinite(after):
         finding.gap["closed"] = float(np.sign(before - after) * np.sqrt(abs(before**2 - after**2)))
     finding.verified = bool(after < before) if np.isfinite(after) else None
+    if finding.mask is not None:  # it was told in these rows by their own samples
+        finding.verified = True
 
 
 def _aside(session):
@@ -57,7 +67,11 @@ def _counts(session, without, finding):
             series = m.alone()[:, mine] * m.slope[mine]
             floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
         out.append(float(np.sqrt(np.mean(series[aside] ** 2))) if series.shape[1] else np.nan)
-    what = "the electrodes' common part about its level" if len(finding.channels) > 12 else "electrode against what the others say"
+    what = (
+        "the electrodes' common part about its level"
+        if len(finding.channels) > 12
+        else "electrode against what the others say"
+    )
     return *out, floor, "counts", f"RMS of {what} in the part fitted"
 
 
@@ -80,13 +94,37 @@ def _samples(session, without, finding):
     return *pair, floor, "counts", "RMS of samples against what the others say: those masked, those left"
 
 
+def _held(session, without, finding):
+    """RMS by which held rows miss the line between those that are measurements, and by which these miss the
+    line between their neighbours."""
+    late = np.flatnonzero(~session.fit)
+    x, held = without.counts[late], finding.mask[late].all(1)
+    rows = np.arange(len(late))
+    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    own = rows[~held]
+    if held.sum() < 5 or len(own) < 5:
+        return np.nan, np.nan, floor, "counts", ""
+    missed = np.column_stack([np.interp(rows[held], own, c[own]) - c[held] for c in x.T])
+    part = ((own[1:-1] - own[:-2]) / (own[2:] - own[:-2]))[:, None]
+    own_missed = x[own[:-2]] * (1 - part) + x[own[2:]] * part - x[own[1:-1]]
+    text = "RMS of rows against the line between their neighbours: those held, those left"
+    return float(np.sqrt(np.mean(missed**2))), float(np.sqrt(np.mean(own_missed**2))), floor, "counts", text
+
+
 def _again(session, without, finding):
-    """The finding's own parameter on the part kept aside alone: its distance from none, and from what was fitted."""
+    """The finding's own parameter on the part kept aside alone: its distance from none, and from what was
+    fitted."""
     s = Session(without.recording, ~session.fit, without.findings)
-    find = {"lowpass": electronics.coloured, "hum": electronics.humming, "quantise": sampling.quantised,
-            "noise": electronics.noisy}.get(finding.id, electronics.correlated)  # fmt: skip
+    find = {
+        "lowpass": electronics.coloured,
+        "hum": electronics.humming,
+        "quantise": sampling.quantised,
+        "noise": electronics.noisy,
+    }.get(finding.id, electronics.correlated)
     found = find(s)
-    found = [f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id]
+    found = [
+        f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
+    ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
     name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
     unit = finding.kind.params[name].unit
@@ -98,7 +136,8 @@ def _again(session, without, finding):
 
 
 def _force(session, finding):
-    """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left out."""
+    """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left
+    out."""
     known = [f for f in session.findings if f.seen is not None and f is not finding]
     out = []
     for chain in (known, [*known, finding]):
@@ -109,14 +148,16 @@ def _force(session, finding):
 
 
 def views(session: Session) -> dict:
-    """Numbers that the whole model says of the part kept aside without having been given them, before and after the
-    findings: name -> unit, before, after, noise, and the same by channel or component."""
+    """Numbers that the whole model says of the part kept aside without having been given them, before and
+    after the findings: name -> unit, before, after, noise, and the same by channel or component."""
     bare = session.without(*session.findings)
     out = {}
     sample = noise_level(session.recording.electrodes[session.fit])
     if session.loaded:
         each = [_alone(s) for s in (bare, session)]
-        out["each electrode from the others"] = _view("counts", each, "channels", sample / np.sqrt(session.model().width))
+        out["each electrode from the others"] = _view(
+            "counts", each, "channels", sample / np.sqrt(session.model().width)
+        )
     else:
         each = [_at_rest(s) for s in (bare, session)]
         out["electrodes at rest"] = _view("counts", each, "channels", sample)
@@ -132,10 +173,15 @@ def _view(unit, each, what, noise):
     floor = float(np.sqrt(np.mean(noise**2)))
     excess = before**2 - floor**2
     return {
-        "unit": unit, "before": before, "after": after, "noise": floor, "variance_removed": 1 - (after / max(before, 1e-12)) ** 2,
+        "unit": unit,
+        "before": before,
+        "after": after,
+        "noise": floor,
+        "variance_removed": 1 - (after / max(before, 1e-12)) ** 2,
         "closed": float((before**2 - after**2) / excess) if before > 1.05 * floor else float("nan"),
-        f"{what}_before": each[0].tolist(), f"{what}_after": each[1].tolist(),
-    }  # fmt: skip
+        f"{what}_before": each[0].tolist(),
+        f"{what}_after": each[1].tolist(),
+    }
 
 
 def _alone(s):
@@ -157,13 +203,16 @@ def _at_rest(s):
 def _force_said(s):
     """(3,) RMS error [N] of a linear map from ln Z, fitted on the part fitted."""
     z, fit, force = log_impedance(s.filled()), s.fit, s.recording.force
-    for f in s.findings:
-        if f.seen is not None:
-            effect, theta = f.seen
+    chain = [f.seen for f in s.findings if f.seen is not None]
+    for effect, theta in chain:
+        if "width" not in theta:
             z = effect.unsee(z, s.recording.rate, theta)
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
     A = np.column_stack([np.ones(len(z)), (z - mean) / sd])
     ridge = 1e-3 * fit.sum() * np.eye(20)
     ridge[0, 0] = 0
-    w = np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
-    return np.sqrt(((A @ w - force)[~fit] ** 2).mean(0))
+    said = A @ np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
+    for effect, theta in chain:
+        if "width" in theta:  # a loop is of newtons, not of ln Z
+            said = effect.unsee(said, s.recording.rate, theta)
+    return np.sqrt(((said - force)[~fit] ** 2).mean(0))

@@ -94,8 +94,7 @@ def _where(f: Finding) -> str:
 def _apart(f: Finding) -> dict:
     """What would tell a finding from those it is tied with: name -> experiment."""
     return {
-        KINDS[i].name if i in KINDS else i: f.kind.confusable.get(i, "no experiment is known")
-        for i in f.ties
+        KINDS[i].name if i in KINDS else i: f.kind.confusable.get(i, "no experiment is known") for i in f.ties
     }
 
 
@@ -112,9 +111,10 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
     d, r = diagnosis, diagnosis.recording
     lines = [
         f"{r.name}: {len(r)} rows, {len(r) / r.rate:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
-        + (", with force" if r.force is not None else "") + f"; last {d.locked:.0%} kept aside",
+        + (", with force" if r.force is not None else "")
+        + f"; last {d.locked:.0%} kept aside",
         f"verdict: {d.verdict}",
-    ]  # fmt: skip
+    ]
     for f in (*d.findings, *d.late):
         numbers = ", ".join(_number(n, *v, f.kind.params[n].unit) for n, v in f.parameters.items())
         lines.append(
@@ -129,8 +129,8 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
             lines.append(f"  not confirmed by the part kept aside, left out: {f.kind.name} {_where(f)}")
     for name, view in d.gap.items():
         lines.append(
-            f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept aside, "
-            f"noise {view['noise']:.2g}"
+            f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept "
+            f"aside, noise {view['noise']:.2g}"
         )
     lines.append(f"  left: {d.rest.text}")
     lines += [f"  cannot be known: {n}" for n in d.notes[1:]]
@@ -166,8 +166,8 @@ def _figure(rows, height):
 
 
 def worst(diagnosis: RecordingDiagnosis) -> list[int]:
-    """Electrodes that the effects change most on the part kept aside, by number from 0; of an empty verdict those with
-    the largest residual."""
+    """Electrodes that the effects change most on the part kept aside, by number from 0; of an empty verdict
+    those with the largest residual."""
     s = diagnosis.session
     change = np.sqrt(((s.recording.electrodes - s.filled())[~s.fit] ** 2).mean(0))
     if not diagnosis.findings:
@@ -190,7 +190,11 @@ def _curves(d):
             ax.plot(m.time, said[:, i[0]], color="tab:orange", lw=0.9, label="simulated: rest and load alone")
             ax.plot(m.time, said[:, i[0]] + effect[:, k], color="tab:blue", lw=0.9, label="amended")
         ax.axvspan(r.time[~s.fit][0], r.time[-1], color="0.92", zorder=0)
-        names = dict.fromkeys(f.kind.name for f in d.findings if k in f.channels and f.correct or f.mask is not None and k in f.channels)
+        names = dict.fromkeys(
+            f.kind.name
+            for f in d.findings
+            if k in f.channels and f.correct or f.mask is not None and k in f.channels
+        )
         ax.set_title(f"e{k + 1}" + (": " + "; ".join(names) if names else ""), fontsize=9)
         ax.set_ylabel("counts")
     axes[0].legend(fontsize=7, ncols=3)
@@ -210,7 +214,9 @@ def _overview(d):
 
     rows = 3 if r.force is not None else 2
     figure, axes = _figure(rows, 2.3 * rows)
-    for ax, x, title in zip(axes, (r.electrodes, d.session.filled()), ("measured", "the effects found taken out")):
+    for ax, x, title in zip(
+        axes, (r.electrodes, d.session.filled()), ("measured", "the effects found taken out")
+    ):
         x = bins(x)
         ax.plot(t, x - np.median(x[: max(3, m // 50)], axis=0), lw=0.6)
         ax.set_title(f"{title}, e1..e19 about the first rows", fontsize=9)
@@ -255,7 +261,8 @@ def _page(d, pictures):
         apart = "<br>".join(f"{esc(name)}: {esc(how)}" for name, how in _apart(f).items()) or "none"
         rows.append(
             f"<tr><td><b>{esc(f.kind.name)}</b><br>{esc(f.kind.physics)}</td><td>{STAGES[f.kind.stage]}</td>"
-            f"<td>{_where(f)}<br>{f.start:.1f}–{f.end:.1f} s</td><td>{esc(_proof(f))}</td><td>{numbers}<br>{esc(f.note)}</td>"
+            f"<td>{_where(f)}<br>{f.start:.1f}–{f.end:.1f} s</td><td>{esc(_proof(f))}</td>"
+            f"<td>{numbers}<br>{esc(f.note)}</td>"
             f"<td>{f.confidence:.2f}<br>p {f.p:.2g}</td><td>{apart}</td></tr>"
         )
     effects = "".join(rows) or "<tr><td colspan=7>nothing</td></tr>"
@@ -265,11 +272,13 @@ def _page(d, pictures):
         for n, v in d.gap.items()
     )
     cells = "".join(
-        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} s</td><td>{c['counts']:.1f}</td></tr>" for c in d.rest.cells
+        f"<tr><td>{c['channel']}</td><td>{c['from']:.0f}–{c['to']:.0f} s</td><td>{c['counts']:.1f}</td></tr>"
+        for c in d.rest.cells
     )
     weak = "; ".join(esc(f"{f.kind.name} {_where(f)} ({f.confidence:.2f})") for f in d.rejected) or "nothing"
     image = [f'<img src="data:image/png;base64,{p}">' for p in pictures]
-    return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title><style>{_STYLE}</style>
+    return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
+<style>{_STYLE}</style>
 <h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
 <p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
 the last {d.locked:.0%} took no part in the fits, and every 'after' is computed there.</p>
@@ -278,8 +287,8 @@ the last {d.locked:.0%} took no part in the fits, and every 'after' is computed 
 <th>confidence</th><th>not told from, and what would tell</th></tr>{effects}</table>
 <h2>2. Measured, simulated, amended: the channels that change most</h2>{image[0]}
 <h2>3. The whole model on the part kept aside</h2>
-<table><tr><th>view</th><th>before</th><th>after</th><th>noise</th><th>unit</th><th>variance removed</th></tr>{gaps}</table>
-{image[2]}
+<table><tr><th>view</th><th>before</th><th>after</th><th>noise</th><th>unit</th><th>variance
+removed</th></tr>{gaps}</table> {image[2]}
 <h2>4. What is left</h2><p>{esc(d.rest.text)}</p>
 <table><tr><th>electrode</th><th>most at</th><th>counts</th></tr>{cells}</table>
 <p>Seen, and too weak or contradicted: {weak}.</p>

@@ -1,51 +1,71 @@
-"""What is left once everything named is taken out: whether each electrode does what the others, and its own earlier
-blocks, say it should."""
+"""What is left once everything named is taken out: whether each electrode does what the others, and its own
+earlier blocks, say it should."""
 
 import dataclasses
 
 import numpy as np
 
+from .confidence import probability
 from .session import Session
 
 __all__ = ["Rest", "rest"]
 
+_UNKNOWN = 0.5
+
 
 @dataclasses.dataclass
 class Rest:
-    """significant; text; cells: dicts (channel, from, to, counts, ratio) of what departs, the largest first;
-    clues: numbers that the decision is made of."""
+    """significant; text; cells: dicts (channel, from, to, counts) of what departs, the largest first; clues:
+    numbers that the decision is made of; confidence that something without a name is there."""
 
     significant: bool
     text: str
     cells: list
     clues: dict
+    confidence: float
 
 
 def rest(session: Session) -> Rest:
-    """Compares each electrode's residual with what its load leaves in electrodes of the same recording."""
+    """Compares what every electrode does with what the others say of it, in the rows fitted and in those
+    kept aside, in units of what the load does to it."""
     m = session.model()
     residual = m.alone()
     if not m.dimensions:
-        common = m.shared(np.ones(len(m.used)))
-        residual = residual - common[:, None]
+        residual = residual - m.shared(np.ones(len(m.used)))[:, None]
     cells, time = m.levels(residual, every=True)
     inside = time < m.time[m.inside][-1]
     change = m.activity + 2 * m.noise
-    cell = np.abs(cells) * m.slope
-    fast = np.sqrt((residual[m.inside] ** 2).mean(0)) / change
-    level = np.sqrt((cells[inside] ** 2).mean(0)) / change
-    aside = np.sqrt((cells[~inside] ** 2).mean(0)) / change
-    order = np.argsort(-np.maximum(level, aside))
-    clues = {
-        "fast1": float(np.log(np.sort(fast)[-1])), "fast3": float(np.log(np.sort(fast)[-3])),
-        "level1": float(np.log(np.sort(level)[-1])), "level3": float(np.log(np.sort(level)[-3])),
-        "aside1": float(np.log(np.sort(aside)[-1])), "aside3": float(np.log(np.sort(aside)[-3])),
-        "fast": float(np.log(np.median(fast))), "level": float(np.log(np.median(level))), "aside": float(np.log(np.median(aside))),
-        "counts1": float(np.log(np.sort(level * change * m.slope)[-1])), "counts3": float(np.log(np.sort(level * change * m.slope)[-3])),
-    }  # fmt: skip
+    counts = np.abs(cells) * m.slope
+
+    def size(x):
+        return np.sqrt((x**2).mean(0)) / change
+
+    parts = {"fast": size(residual[m.inside]), "level": size(cells[inside]), "aside": size(cells[~inside])}
+    parts["counts"] = parts["level"] * change * m.slope
+    clues = {}
+    for name, value in parts.items():
+        ordered = np.sort(value)
+        clues |= {f"{name}{n}": float(np.log(ordered[-n])) for n in (1, 3)}
+        clues[name] = float(np.log(np.median(value)))
+    family = "left_loaded" if session.loaded else "left_unloaded"
+    confidence = probability(family, clues)
     listed = []
-    for i in order[:3]:
-        w = int(cell[:, i].argmax())
-        listed.append({"channel": f"e{m.used[i] + 1}", "from": float(time[max(w - 1, 0)]), "to": float(time[min(w + 1, len(time) - 1)]),
-                       "counts": float(cell[w, i]), "ratio": float(level[i])})  # fmt: skip
-    return Rest(False, "", listed, clues)
+    for i in np.argsort(-np.maximum(parts["level"], parts["aside"]))[:3]:
+        w = int(counts[:, i].argmax())
+        first, last = time[max(w - 1, 0)], time[min(w + 1, len(time) - 1)]
+        listed.append(
+            {
+                "channel": f"e{m.used[i] + 1}",
+                "from": float(first),
+                "to": float(last),
+                "counts": float(counts[w, i]),
+            }
+        )
+    text = "what each electrode does, the others and its own earlier blocks explain"
+    if confidence > _UNKNOWN:
+        text = "; ".join(
+            f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
+            f"{c['from']:.0f} s to {c['to']:.0f} s"
+            for c in listed
+        )
+    return Rest(confidence > _UNKNOWN, text, listed, clues, confidence)

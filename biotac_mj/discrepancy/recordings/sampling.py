@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter, percentile_filter, uniform_filter1d
 
 from ..evidence import sign_flip
 from ..noise import noise_level
@@ -17,8 +17,8 @@ _NAN = float("nan")
 
 
 def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
-    """Offers all of them to `take`, in the order in which they have to be taken out; each is searched without the
-    samples of those before it."""
+    """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
+    without the samples of those before it."""
     for find in (quantised, _held, _stuck, _clipped, _spiked, _lost):
         for finding in find(session):
             take(finding)
@@ -34,10 +34,18 @@ def _finding(session, name, channels, parameters, mask, note, strength, blocks, 
     at = np.flatnonzero(mask.any(1)) if mask is not None else np.array([0, len(session.recording) - 1])
     rate = session.recording.rate
     return Finding(
-        name, tuple(int(k) for k in channels), parameters, float(np.sum(strength)), sign_flip(np.asarray(strength, float)),
-        at[0] / rate, at[-1] / rate, note,
+        name,
+        tuple(int(k) for k in channels),
+        parameters,
+        float(np.sum(strength)),
+        sign_flip(np.asarray(strength, float)),
+        at[0] / rate,
+        at[-1] / rate,
+        note,
         clues={"nats": float(np.log1p(np.sum(strength))), "blocks": float(np.mean(np.asarray(strength) > 0))},
-        mask=mask, correct=correct)  # fmt: skip
+        mask=mask,
+        correct=correct,
+    )
 
 
 def _by_block(flags, chance):
@@ -65,8 +73,18 @@ def quantised(session: Session) -> list[Finding]:
     # of a lattice of single counts every q-th value would be met by chance
     strength = [np.log(q) * sum(len(np.unique(b[:, k])) - 1 for k in coarse) for b in blocks]
     channels = range(19) if len(coarse) > 15 else coarse
-    return [_finding(session, "quantise", channels, {"step": (q, q, q)}, None,
-                     f"every value is a multiple of {q:g} counts (up to an offset)", strength, BLOCKS)]  # fmt: skip
+    return [
+        _finding(
+            session,
+            "quantise",
+            channels,
+            {"step": (q, q, q)},
+            None,
+            f"every value is a multiple of {q:g} counts (up to an offset)",
+            strength,
+            BLOCKS,
+        )
+    ]
 
 
 def _lattice(x):
@@ -78,8 +96,8 @@ def _lattice(x):
 
 
 def _held(session):
-    """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger explains; or that
-    move in steps with nothing but white noise between them."""
+    """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
+    explains; or that move in steps with nothing but white noise between them."""
     x, n, rate = _rows(session)
     same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99])
@@ -98,10 +116,19 @@ def _held(session):
         if (share > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
             seconds = float(mask.sum() / rate)
             strength = _by_block(_stretch(mask), 0.002)
-            return [_finding(session, "freeze", range(19), {"seconds": (seconds, seconds, seconds)},
-                             np.repeat(mask[:, None], 19, axis=1),
-                             f"{seconds:.1f} s of rows repeat the one before in all electrodes, up to "
-                             f"{longest / rate:.2f} s at a time", strength, BLOCKS)]  # fmt: skip
+            return [
+                _finding(
+                    session,
+                    "freeze",
+                    range(19),
+                    {"seconds": (seconds, seconds, seconds)},
+                    np.repeat(mask[:, None], 19, axis=1),
+                    f"{seconds:.1f} s of rows repeat the one before in all electrodes, up to "
+                    f"{longest / rate:.2f} s at a time",
+                    strength,
+                    BLOCKS,
+                )
+            ]
     return _dithered(session) if held.mean() < 0.4 and noise_level(x).mean() > 0.7 else []
 
 
@@ -121,8 +148,12 @@ def _dithered(session):
                 best = ratio, period, phase
     ratio, period, phase = best
     blocks = np.array_split(np.arange(len(step)), BLOCKS)
-    gain = np.array([np.log(step[b][(b % period) == phase].mean() / step[b][(b % period) != phase].mean())
-                     for b in blocks])  # fmt: skip
+    gain = np.array(
+        [
+            np.log(step[b][(b % period) == phase].mean() / step[b][(b % period) != phase].mean())
+            for b in blocks
+        ]
+    )
     # what is held does not move: between the steps there is noise alone
     if ratio < 0.7 or np.median(gain) < 0.5:
         return []
@@ -132,9 +163,18 @@ def _dithered(session):
     mask = np.zeros((n, 19), bool)
     mask[(np.arange(n) - phase - 1) % period != 0] = True
     seconds = period / rate
-    return [_finding(session, "freeze", range(19), {"seconds": (seconds, seconds, seconds)}, mask,
-                     f"all electrodes move every {period} rows only, with noise between", gain * len(step) / BLOCKS / period * 9,
-                     BLOCKS)]  # fmt: skip
+    return [
+        _finding(
+            session,
+            "freeze",
+            range(19),
+            {"seconds": (seconds, seconds, seconds)},
+            mask,
+            f"all electrodes move every {period} rows only, with noise between",
+            gain * len(step) / BLOCKS / period * 9,
+            BLOCKS,
+        )
+    ]
 
 
 def _stretch(mask):
@@ -163,7 +203,10 @@ def _stuck(session):
     moves = np.array([_movement(c, size) for c in whole.T]).T  # (n,) range over `size` rows
     usual = np.median(moves[session.fit & free], axis=0)
     active = np.median(moves / np.maximum(usual, 0.5), axis=1) > 0.5
+    alive = noise_level(whole) > 0.7  # without noise a constant reading is no news
     for k in range(19):
+        if not alive[k] and not _edge_value(whole[:, k]):
+            continue
         if usual[k] < 3 * lattice.get(k, 0.7) and not _edge_value(whole[:, k]):
             continue
         still = (moves[:, k] <= min(1, 0.2 * max(usual[k], 2))) & active & free
@@ -182,9 +225,17 @@ def _stuck(session):
         chance = np.clip((moves[:, k] <= 1).mean() * 0.01, 1e-4, 0.5)
         strength = _by_block(_stretch(mask[:, k]), chance)
         found.append(
-            _finding(session, "stuck", (k,), {"value": (value, value, value)}, mask,
-                     f"{mask.sum() / rate:.1f} s without movement at {value:.0f} counts", strength, BLOCKS)
-        )  # fmt: skip
+            _finding(
+                session,
+                "stuck",
+                (k,),
+                {"value": (value, value, value)},
+                mask,
+                f"{mask.sum() / rate:.1f} s without movement at {value:.0f} counts",
+                strength,
+                BLOCKS,
+            )
+        )
     return found if len(found) <= 6 else []
 
 
@@ -238,11 +289,23 @@ def _clipped(session):
         mask[:, channels] = side * x[:, channels] >= side * limit - 2
         flags = mask[session.fit][:, channels].any(1)
         chance = min(0.5, sum(h[4] for h in group) / session.fit.sum())
-        found.append(_finding(
-            session, "saturate", channels, {"level": (limit, limit - 0.5, limit + 0.5)}, mask,
-            f"{flags.mean():.1%} of the samples lie on {limit:g}, the {'largest' if side > 0 else 'smallest'} value",
-            _by_block(flags, chance), BLOCKS))  # fmt: skip
-        found[-1].clues |= {"pile": float(np.log(group[0][3] / group[0][4])), "share": float(np.log(flags.mean()))}
+        found.append(
+            _finding(
+                session,
+                "saturate",
+                channels,
+                {"level": (limit, limit - 0.5, limit + 0.5)},
+                mask,
+                f"{flags.mean():.1%} of the samples lie on {limit:g}, the "
+                f"{'largest' if side > 0 else 'smallest'} value",
+                _by_block(flags, chance),
+                BLOCKS,
+            )
+        )
+        found[-1].clues |= {
+            "pile": float(np.log(group[0][3] / group[0][4])),
+            "share": float(np.log(flags.mean())),
+        }
     return found
 
 
@@ -256,9 +319,18 @@ def _spiked(session):
         mask = np.zeros(x.shape, bool)
         mask[:, k] = bad[:, k]
         rate = float(number[k] / minutes)
-        found.append(_finding(session, "spikes", (k,), {"rate": (rate, _NAN, _NAN)}, mask,
-                              f"{number[k]} samples leave their neighbours by more than ten times the noise",
-                              _by_block(mask[session.fit, k], 1e-5), BLOCKS))  # fmt: skip
+        found.append(
+            _finding(
+                session,
+                "spikes",
+                (k,),
+                {"rate": (rate, _NAN, _NAN)},
+                mask,
+                f"{number[k]} samples leave their neighbours by more than ten times the noise",
+                _by_block(mask[session.fit, k], 1e-5),
+                BLOCKS,
+            )
+        )
     return found
 
 
@@ -277,11 +349,15 @@ def _outliers(x):
 
 
 def _lost(session):
-    """Places where all electrodes jump from one row to the next: straight lines on either side do not meet."""
+    """Places where all electrodes jump from one row to the next: straight lines on either side do not
+    meet."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated)
     good = session.masked[~session.masked.all(1)].mean(0) < 0.02
     x = session.counts[rows][:, good]
+    masked = session.masked[rows][:, good]
+    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
+    x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
     if n < 200 or not good.any():
         return []
@@ -292,16 +368,19 @@ def _lost(session):
     left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
     right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
     jump = (right[h:] - left[:-h]) / noise / np.sqrt(2 * (end**2).sum())
-    score = np.sqrt((jump**2).mean(1))
+    # one electrode that jumps is no loss: a fifth of them has to
+    score = np.sqrt((jump**2).mean(1)) * ((np.abs(jump) > 3).mean(1) >= 0.2)
     # the load bends by as much on the rows around, a loss stands alone
-    around = np.array([np.quantile(score[max(i - 40, 0) : i + 41], 0.9) for i in range(len(score))])
+    around = percentile_filter(score, 90, size=81)
     order = np.argsort(-score / np.maximum(around, 1))
     places = []
     for i in order[:60]:
         if score[i] > 3 * np.maximum(around[i], 1) and score[i] > 4 and all(abs(i - j) > 12 for j in places):
             places.append(int(i))
     # after rows that were held the load has moved on
-    places = [i for i in places if not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()]
+    places = [
+        i for i in places if not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
+    ]
     if not places:
         return []
     at = rows[np.array(places) + h]
@@ -309,12 +388,24 @@ def _lost(session):
     strength = np.zeros(BLOCKS)
     for row, i in zip(at, places):
         strength[int(row * BLOCKS / len(r))] += 0.5 * score[i] ** 2
-    f = _finding(session, "lost_rows", range(19), {"seconds": (_NAN, _NAN, _NAN)}, None,
-                 f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump between "
-                 "two rows", strength, BLOCKS)  # fmt: skip
+    f = _finding(
+        session,
+        "lost_rows",
+        range(19),
+        {"seconds": (_NAN, _NAN, _NAN)},
+        None,
+        f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump between "
+        "two rows",
+        strength,
+        BLOCKS,
+    )
     f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
     f.p = len(places) / len(score)  # rows that stand alone as much
     ratio = max(score[i] / max(around[i], 1) for i in places)
-    f.clues |= {"ratio": float(np.log(ratio)), "number": float(np.log(len(places))), "electrodes": float(share),
-                "score": float(np.log(max(score[i] for i in places)))}  # fmt: skip
+    f.clues |= {
+        "ratio": float(np.log(ratio)),
+        "number": float(np.log(len(places))),
+        "electrodes": float(share),
+        "score": float(np.log(max(score[i] for i in places))),
+    }
     return [f]

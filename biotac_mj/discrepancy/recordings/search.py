@@ -78,8 +78,17 @@ def diagnose_recording(
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
         left = rest(session)
         result = RecordingDiagnosis(
-            recording, locked, "", session.findings, [*contradicted, *weak], late,
-            views(session), left, _notes(recording, session), session)  # fmt: skip
+            recording,
+            locked,
+            "",
+            session.findings,
+            [*contradicted, *weak],
+            late,
+            views(session),
+            left,
+            _notes(recording, session),
+            session,
+        )
         result.verdict = _verdict(result)
         bar.update()
     return result
@@ -152,8 +161,8 @@ def _refine(session, known, finding):
 
 
 def _late(session, named):
-    """Effects of single electrodes or all that begin in the part kept aside: searched in the whole record, less what
-    was found; nothing is left to confirm them."""
+    """Effects of single electrodes or all that begin in the part kept aside: searched in the whole record,
+    less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
     whole = Session(r, np.ones(len(r), bool), session.findings)
@@ -182,7 +191,9 @@ def _notes(recording, session):
     if not session.loaded:
         out.append("not loaded: gains, saturation, the sign of an electrode")
     if recording.rest_correlation < 0.3:
-        out.append("rest levels unlike those of published sensors: an order of channels that is wrong all the time")
+        out.append(
+            "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
+        )
     return out
 
 
@@ -192,7 +203,8 @@ def _verdict(d):
     parts = []
     if d.findings or d.late:
         names = dict.fromkeys(
-            f.kind.name + ("" if len(f.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in f.channels[:4]))
+            f.kind.name
+            + ("" if len(f.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in f.channels[:4]))
             for f in (*d.findings, *d.late)
         )
         parts.append("named: " + "; ".join(names))
