@@ -18,7 +18,8 @@ FAMILIES = {
     "lost": ("lost_rows",),
     "line": ("hum",),
     "colour": ("lowpass",),
-    "pairs": ("crosstalk", "common_noise"),
+    "pairs": ("crosstalk",),
+    "common": ("common_noise",),
     "size": ("noise",),
     "force": ("latency", "relax", "hyster"),
 }

@@ -125,7 +125,7 @@ def courses(
     found.sort(key=lambda c: -c.nats)
     if thorough:
         best = found[0]
-        best.tail = _goes_on(level - best.jump * (time > best.onset), time)
+        best.tail = _goes_on(level, time) if best.kind == "smooth" else (0.0, 0.0)
     return found
 
 

@@ -292,11 +292,7 @@ def settle(session: Session) -> None:
             )
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.note = again.nats, again.p, again.note
-            finding.clues |= {
-                k: v
-                for k, v in again.clues.items()
-                if k not in ("lead", "stands", "nats", "size", "counts", "turns", "blocks")
-            }
+            finding.clues |= {k: v for k, v in again.clues.items() if k != "lead"}
             if "share" in finding.clues:
                 finding.id, finding.ties = again.id, again.ties
             session.replay()
@@ -505,12 +501,14 @@ def exchanged(session: Session) -> Finding | None:
     total = np.cumsum(cost)
     edge = int(np.argmin(total) if late else np.argmax(total))
     onset = float(m.time[edge] + m.period / 2)
+    # which side is right nothing says: the channels were in order first
+    order = order if late else np.argsort(order)
     channels, source = m.used[moved], m.used[order[moved]]
     last = session.recording.time[-1]
 
     def correct(counts, at):
         out = counts.copy()
-        rows = at > onset if late else at <= onset
+        rows = at > onset
         out[np.ix_(rows, channels)] = counts[np.ix_(rows, source)]
         return out
 
@@ -520,8 +518,8 @@ def exchanged(session: Session) -> Finding | None:
         {"onset": (onset, onset - m.period, onset + m.period)},
         float(gain.sum()),
         p,
-        onset if late else 0.0,
-        float(last if late else onset),
+        onset,
+        float(last),
         note=" ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
         clues={
             "nats": float(gain.mean()) / number,

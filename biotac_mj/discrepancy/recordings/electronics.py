@@ -6,7 +6,6 @@ course through them says."""
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.signal import lfilter
 
 from ...geometry.electrodes import electrode_positions
 from ...sensor.channels import electrode_noise
@@ -101,7 +100,6 @@ def coloured(session: Session) -> Finding | None:
         session.recording.time[-1],
         note=f"the noise is {np.exp(value):.1f} times stronger at a quarter of the rate than at half of it",
         clues={"pole": pole, "ratio": value, "least": float(ratio.min())},
-        correct=lambda counts, at: _sharpened(counts, tau, session.recording.rate),
     )
 
 
@@ -123,13 +121,6 @@ def _pole(ratio, bands):
     if ratio <= 0:
         return 0.0
     return 0.99 if ratio >= fall(0.99) else brentq(lambda a: fall(a) - ratio, 0.0, 0.99)
-
-
-def _sharpened(counts, tau, rate):
-    """Counts before a low-pass: u = v + tau dv/dt, the derivative over the filter's own time."""
-    a = np.exp(-1 / (tau * rate))
-    smooth = lfilter([1 - a], [1, -a], counts[::-1], axis=0, zi=a * counts[-1:])[0][::-1]
-    return smooth  # the same filter from the other side: what was late is on time, noise is not magnified
 
 
 # --- lines

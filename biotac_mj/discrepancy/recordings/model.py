@@ -18,6 +18,7 @@ __all__ = ["Model", "slope_of"]
 _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
 _WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
+_LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
 _DIMENSIONS = 8  # of the load at most
 
 
@@ -53,7 +54,8 @@ class Model:
         self.slope = slope_of(counts[rows][:, self.used])
         x = log_impedance(counts[: m * self.width, self.used]).reshape(m, self.width, -1)
         weight = good[: m * self.width, self.used].reshape(x.shape)
-        self.known = weight.any(1)
+        self.known = weight.mean(1) > 0.5
+        self.known |= weight.any(1) & (good[: m * self.width].any(1).reshape(m, -1).mean(1) < 0.5)[:, None]
         x = np.where(self.known, (x * weight).sum(1) / np.maximum(weight.sum(1), 1), np.nan)
         self.mean = np.nanmean(x[self.inside], axis=0)
         x = x - self.mean
@@ -76,11 +78,13 @@ class Model:
         span = max(4, span)
         x = self.value
         centred = x - x.mean(1, keepdims=True)
-        within = _within(x[self.inside], span)
+        within = _within(x[self.inside], span, self.known[self.inside])
         self.activity = np.sqrt((within**2).mean(0))
         # dimensions that move by more than noise and rounding do
         lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
+        if self.inside.sum() * self.period < _LEAST:
+            self.dimensions = 0
         q = self.dimensions
         if not q:
             self.precision, self._products = np.diag(1 / self.noise**2), np.zeros((len(x), 0))
@@ -94,7 +98,7 @@ class Model:
         self._products = score[:, i] * score[:, j]
         self._products -= self._products[self.inside].mean(0)
         whole = np.concatenate([x, self._products], axis=1)
-        within = _within(whole[self.inside], span)
+        within = _within(whole[self.inside], span, self.known[self.inside])
         covariance = within.T @ within / len(within)
         floor = np.concatenate([self.noise**2, 0.02 * np.ones(len(i))])
         self.precision = np.linalg.inv(covariance + np.diag(floor))
@@ -128,13 +132,18 @@ class Model:
         return cells.mean(1), self.time[: w * size].reshape(w, size).mean(1)
 
 
-def _within(x, span):
-    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out,
-    for a step within one is a change of the sensor and not of the load."""
+def _within(x, span, known):
+    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out, for
+    a step within one is a change of the sensor and not of the load, and those with holes (m, c) while enough
+    are left."""
     k = len(x) // span
     cells = x[: k * span].reshape(k, span, -1)
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
     cells = (cells - basis @ (basis.T @ cells)) * np.sqrt(span / (span - 2))
     energy = (cells / np.maximum(np.sqrt((cells**2).mean((0, 1))), 1e-12)) ** 2
     energy = energy.mean(1).max(1)
-    return cells[energy <= np.quantile(energy, 0.96)].reshape(-1, x.shape[1])
+    keep = energy <= np.quantile(energy, 0.96)
+    whole = known[: k * span].reshape(k, -1).all(1)
+    if (keep & whole).sum() * span > 2 * x.shape[1]:
+        keep &= whole
+    return cells[keep].reshape(-1, x.shape[1])

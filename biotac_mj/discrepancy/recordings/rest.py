@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 
 from .confidence import probability
+from .findings import Finding
 from .session import Session
 
 __all__ = ["Rest", "rest"]
@@ -25,7 +26,7 @@ class Rest:
     confidence: float
 
 
-def rest(session: Session) -> Rest:
+def rest(session: Session, weak: list[Finding]) -> Rest:
     """Compares what every electrode does with what the others say of it, in the rows fitted and in those
     kept aside, in units of what the load does to it."""
     m = session.model()
@@ -47,6 +48,12 @@ def rest(session: Session) -> Rest:
         ordered = np.sort(value)
         clues |= {f"{name}{n}": float(np.log(ordered[-n])) for n in (1, 3)}
         clues[name] = float(np.log(np.median(value)))
+    # what was seen and could not be named
+    seen = [f.clues for f in weak if len(f.channels) == 1 and "nats" in f.clues and f.p < 0.02]
+    clues["seen"] = max((c["nats"] for c in seen), default=0.0)
+    clues["number"] = float(np.log1p(len(seen)))
+    clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
+    clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     family = "left_loaded" if session.loaded else "left_unloaded"
     confidence = probability(family, clues)
     listed = []

@@ -115,7 +115,7 @@ def _held(session):
         longest = length[long].max() if long.any() else 0
         if (share > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
             seconds = float(mask.sum() / rate)
-            strength = _by_block(_stretch(mask), 0.002)
+            strength = _by_block(mask[mask], 0.002)  # each part of the rows held, however few
             return [
                 _finding(
                     session,
@@ -359,9 +359,9 @@ def _lost(session):
     before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
     x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
-    if n < 200 or not good.any():
+    noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
+    if np.median(noise) < 0.7 or not session.loaded:  # at rest nothing is missed
         return []
-    noise = noise_level(x)
     # ends of least-squares lines of h rows on the left and on the right of every gap between rows
     line = np.vander(np.arange(h), 2)
     end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)

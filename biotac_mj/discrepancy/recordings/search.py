@@ -76,7 +76,7 @@ def diagnose_recording(
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
-        left = rest(session)
+        left = rest(session, weak)
         result = RecordingDiagnosis(
             recording,
             locked,
@@ -96,8 +96,18 @@ def diagnose_recording(
 
 def _search(session, weak, named, bar):
     def take(finding):
+        alone = "course" in finding.clues and len(finding.channels) == 1
+        if alone and finding.p < _P:  # judged as it is beside all others
+            session.accept(finding)
+            settle(session)
+            finding.confidence = confidence(finding)
+            if finding.confidence >= named:
+                return True
+            session.findings.remove(finding)
+            session.replay()
+            settle(session)
         finding.confidence = confidence(finding)
-        if finding.confidence >= named and finding.p < _P:
+        if finding.confidence >= named and finding.p < _P and not alone:
             session.accept(finding)
             return True
         weak.append(finding)
@@ -127,9 +137,8 @@ def _search(session, weak, named, bar):
             if finding is None:
                 break
             mine = (None,) if len(finding.channels) > 12 else finding.channels
-            if find is gains and any(f.channels == finding.channels for f in session.findings):
-                refused.add(mine)
-            elif not _more_of_the_same(session, finding) and not take(finding):
+            again = find is gains and any(f.channels == finding.channels for f in session.findings)
+            if again or _more_of_the_same(session, finding) or not take(finding):
                 refused.add(mine)
         if find is levels:
             settle(session)
