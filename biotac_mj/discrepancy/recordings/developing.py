@@ -232,10 +232,20 @@ def _name_shared(session, finding, course, change):
             scale = max(1.4826 * np.median(np.abs(np.diff(series))) / np.sqrt(2), 1e-9)
             gain = compare(null, out, block, scale)
             slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
-            if gain.sum() > 0.5 * finding.nats and sign_flip(gain) < 0.02:
+            told = sign_flip(gain) < 0.02
+            if told and gain.sum() <= 0.5 * finding.nats:
+                ties = [*ties, "thermal"]
+            elif told:
                 ties, finding.id = [finding.id, *ties], "thermal"
                 spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
                 finding.parameters = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}
+                share, heat = finding.clues["share"], temperature_from_counts(tdc)
+
+                def by_temperature(counts, at):
+                    warmer = np.interp(at, clock, heat) - heat[0]
+                    return counts_from_log_impedance(log_impedance(counts) - np.outer(slope * warmer, share))
+
+                finding.correct = by_temperature
     finding.ties = tuple(ties)
     if finding.id == "warmup":
         finding.parameters = _warm_up(course)

@@ -345,7 +345,7 @@ def noisy(session: Session) -> list[Finding]:
     spread = 1.4826 * np.nanmedian(np.abs(own - np.nanmedian(own))) + 0.05
     found = []
     for e in np.argsort(-own)[:4]:
-        if not own[e] > max(np.log(1.6), 4 * spread) or np.nanmedian(level[:, e]) < _LEAST:
+        if not own[e] > max(np.log(1.6), 3 * spread) or np.nanmedian(level[:, e]) < _LEAST:
             continue
         excess = np.nan_to_num(ratio[:, e] - np.log(1.3))
         p = sign_flip(excess)

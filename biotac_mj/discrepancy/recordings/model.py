@@ -19,6 +19,7 @@ _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
 _WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
 _LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
+_MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
 _DIMENSIONS = 8  # of the load at most
 
 
@@ -83,7 +84,9 @@ class Model:
         # dimensions that move by more than noise and rounding do
         lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
-        if self.inside.sum() * self.period < _LEAST:
+        # a load moves electrodes by tens of counts within seconds; noise, filtered or not, does not
+        moved = np.median(np.sort(self.activity * self.slope)[-6:])
+        if self.inside.sum() * self.period < _LEAST or moved < _MOVED:
             self.dimensions = 0
         q = self.dimensions
         if not q:
