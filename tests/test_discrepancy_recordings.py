@@ -306,7 +306,7 @@ def test_electronics_show_in_the_noise():
     assert ids(d) == ["crosstalk"] and abs(d.findings[0].parameters["kappa"][0] - 0.15) < 0.04
     assert ids(diagnose_recording(Recording(8 * np.rint(noisy(e, rng) / 8)))) == ["quantise"]
     loud = noisy(e, rng)
-    loud[:, 3] = np.rint(loud[:, 3] + 20 * rng.standard_normal(len(e)))
+    loud[:, 3] = np.rint(loud[:, 3] + 40 * rng.standard_normal(len(e)))
     d = diagnose_recording(Recording(loud))
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 

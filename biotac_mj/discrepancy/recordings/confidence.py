@@ -24,9 +24,8 @@ FAMILIES = {
     "size": ("noise",),
     "force": ("latency", "relax", "hyster"),
 }
-NAMED = (
-    0.6  # confidence from which a finding is named: fitted on practice recordings together with the weights
-)
+# confidence from which a finding is named: right names and missed ones on practice recordings
+NAMED = 0.6
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 

@@ -468,6 +468,8 @@ def exchanged(session: Session) -> Finding | None:
     Gaussian of the other side, one after another, so that cycles are found as well."""
     m = session.model()
     x, number = m.value[m.inside], len(m.used)
+    if not m.dimensions:  # what all do alike, a warm-up, is no order
+        x = x - m.shared(np.ones(number))[m.inside][:, None]
     n, best = len(x), None
     if m.dimensions and m.time[m.inside][-1] < BLOCKS:
         return None

@@ -111,19 +111,22 @@ class Model:
         """(m, c + products)"""
         return np.concatenate([self.value, self._products], axis=1)
 
-    def alone(self) -> np.ndarray:
-        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: about its own mean."""
+    def alone(self, value: np.ndarray | None = None) -> np.ndarray:
+        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: about its own mean.
+        value: (m, c) other levels than the model's own."""
         c = len(self.used)
-        return (self.whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
+        whole = self.whole if value is None else np.concatenate([value, self._products], axis=1)
+        return (whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
 
-    def shared(self, pattern: np.ndarray) -> np.ndarray:
+    def shared(self, pattern: np.ndarray, value: np.ndarray | None = None) -> np.ndarray:
         """(m,) amplitude of a pattern (c,); unloaded the median over electrodes, so that none decides
         alone."""
+        value = self.value if value is None else value
         if not self.dimensions:
-            return np.median(self.value / pattern, axis=1)
-        c = len(self.used)
-        filtered = self.precision[:, :c] @ pattern
-        return self.whole @ filtered / (pattern @ filtered[:c])
+            return np.median(value / pattern, axis=1)
+        filtered = self.precision[:, : len(self.used)] @ pattern
+        whole = np.concatenate([value, self._products], axis=1)
+        return whole @ filtered / (pattern @ filtered[: len(self.used)])
 
     def levels(self, series: np.ndarray, every: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Means (w, ...) of a series (m, ...) over cells, of the bins fitted or of all, and the cells' times

@@ -56,15 +56,18 @@ def _aside(session):
 
 def _counts(session, without, finding):
     """RMS of the finding's electrodes about what the others, or for a shared effect their own level, say."""
-    out, floor = [], np.nan
-    for s in (without, session):
-        m, aside = _aside(s)
+    m, aside = _aside(session)
+    bare = without.model()
+    if len(bare.used) != len(m.used):
+        return np.nan, np.nan, np.nan, "counts", ""
+    out = []
+    for value in (bare.value + bare.mean - m.mean, m.value):
         if len(finding.channels) > 12:
-            series = m.shared(np.ones(len(m.used)))[:, None] * m.slope.mean()
+            series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
             floor = float(np.sqrt(np.mean((m.noise * m.slope) ** 2) / len(m.used)))
         else:
             mine = np.flatnonzero(np.isin(m.used, finding.channels))
-            series = m.alone()[:, mine] * m.slope[mine]
+            series = m.alone(value)[:, mine] * m.slope[mine]
             floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
         out.append(float(np.sqrt(np.mean(series[aside] ** 2))) if series.shape[1] else np.nan)
     what = (

@@ -7,6 +7,7 @@ import numpy as np
 
 from .confidence import probability
 from .findings import Finding
+from .recording import MIN_ROWS
 from .session import Session
 
 __all__ = ["Rest", "rest"]
@@ -56,6 +57,8 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     family = "left_loaded" if session.loaded else "left_unloaded"
     confidence = probability(family, clues)
+    if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
+        confidence = 0.0
     listed = []
     for i in np.argsort(-np.maximum(parts["level"], parts["aside"]))[:3]:
         w = int(counts[:, i].argmax())
