@@ -494,6 +494,13 @@ def exchanged(session: Session) -> Finding | None:
         return ((d @ P) * d).sum(1) / number
 
     straight = np.arange(number)
+    # the row at which exchanging turns from worse to better, and what lies on its side
+    cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
+    total = np.cumsum(cost)
+    edge = int(np.argmin(total) if late else np.argmax(total))
+    normal, other = (x[:edge], x[edge + 1 :]) if late else (x[edge + 1 :], x[:edge])
+    if min(len(normal), len(other)) < 10:
+        return None
     usual = float(np.mean(misfit(normal, straight)))
     block = np.arange(len(other)) * min(BLOCKS, len(other)) // len(other)
     number_of = np.bincount(block)
@@ -508,10 +515,6 @@ def exchanged(session: Session) -> Finding | None:
     # every one of them has to fit better in its new place: one that jumped beside another's level does not
     if p > 0.01 or len(moved) > 8 or (off(order) > 0.9 * off(straight)).any():
         return None
-    # the row at which exchanging turns from worse to better
-    cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
-    total = np.cumsum(cost)
-    edge = int(np.argmin(total) if late else np.argmax(total))
     onset = float(m.time[edge] + m.period / 2)
     # which side is right nothing says: the channels were in order first
     order = order if late else np.argsort(order)

@@ -96,8 +96,21 @@ _WARM = {
 KINDS = {
     k.id: k
     for k in (
-        _shipped("warmup", {"count_offset": "load and unload: an offset keeps its counts"}, **_WARM),
-        _shipped("fluidloss", {"count_offset": "load and unload: an offset keeps its counts"}),
+        _shipped(
+            "warmup",
+            {
+                "count_offset": "load and unload: an offset keeps its counts",
+                "count_gain": "rest levels that differ more",
+            },
+            **_WARM,
+        ),
+        _shipped(
+            "fluidloss",
+            {
+                "count_offset": "load and unload: an offset keeps its counts",
+                "count_gain": "rest levels that differ more",
+            },
+        ),
         _shipped("thermal"),
         Kind(
             "count_offset",

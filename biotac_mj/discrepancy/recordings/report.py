@@ -184,10 +184,16 @@ def _curves(d):
     measured = r.electrodes[: len(m.time) * m.width].reshape(len(m.time), m.width, 19).mean(1)
     figure, axes = _figure(len(shown), 2.4 * len(shown))
     for ax, k in zip(axes, shown):
-        ax.plot(m.time, measured[:, k], color="0.35", lw=1.4, label="measured")
+        ax.plot(m.time, measured[:, k], color="0.6", lw=2.6, label="measured")
         i = np.flatnonzero(m.used == k)
         if len(i):
-            ax.plot(m.time, said[:, i[0]], color="tab:orange", lw=0.9, label="simulated: rest and load alone")
+            ax.plot(
+                m.time,
+                said[:, i[0]],
+                color="tab:orange",
+                lw=0.9,
+                label="simulated: rest and load, as the others say it",
+            )
             ax.plot(m.time, said[:, i[0]] + effect[:, k], color="tab:blue", lw=0.9, label="amended")
         ax.axvspan(r.time[~s.fit][0], r.time[-1], color="0.92", zorder=0)
         names = dict.fromkeys(
