@@ -47,6 +47,8 @@ def levels(session: Session, refused: set) -> Finding | None:
         course = courses(level, time, thorough=True)[0]
         if course.p > 0.02 or course.nats < 6 or energy < 30:
             continue
+        if k is not None and course.kind == "smooth" and not m.parted:
+            continue  # in so short a time an electrode creeps with the load as well
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)

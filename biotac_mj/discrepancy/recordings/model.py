@@ -86,7 +86,7 @@ class Model:
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
         # a load moves electrodes by tens of counts within seconds; noise, filtered or not, does not
         moved = np.median(np.sort(self.activity * self.slope)[-6:])
-        if self.inside.sum() * self.period < _LEAST or moved < _MOVED:
+        if not self.parted or moved < _MOVED:
             self.dimensions = 0
         q = self.dimensions
         if not q:
@@ -105,6 +105,11 @@ class Model:
         covariance = within.T @ within / len(within)
         floor = np.concatenate([self.noise**2, 0.02 * np.ones(len(i))])
         self.precision = np.linalg.inv(covariance + np.diag(floor))
+
+    @property
+    def parted(self) -> bool:
+        """Whether the rows fitted are long enough to tell load from drift."""
+        return bool(self.inside.sum() * self.period >= _LEAST)
 
     @property
     def whole(self) -> np.ndarray:

@@ -197,6 +197,8 @@ def _notes(recording, session):
         out.append("no force: latency, relaxation and hysteresis between force and electrodes")
     if recording.tdc is None:
         out.append("no TDC: whether a warm-up is the liquid's temperature")
+    if not session.model().parted:
+        out.append("too short to tell a load from a drift: slow changes of single electrodes")
     if not session.loaded:
         out.append("not loaded: gains, saturation, the sign of an electrode")
     if recording.rest_correlation < 0.3:
