@@ -229,7 +229,9 @@ def correlated(session: Session) -> Finding | None:
     if len(d) < 40 * BLOCKS // 2:
         return None
     cells, block = _calm(d, 0.3 if session.loaded else 1.0)
-    sd = np.sqrt(np.nanmean(cells**2, axis=(0, 1)) / 252)
+    known = np.isfinite(cells)
+    power = np.where(known, cells**2, 0).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1)
+    sd = np.sqrt(power / 252)
     alive = np.flatnonzero(sd > _LEAST)
     if len(alive) < 8:
         return None
@@ -335,19 +337,19 @@ def noisy(session: Session) -> list[Finding]:
     if k < 30 or any(f.id == "quantise" for f in session.findings):
         return []
     cells = np.abs(d[: k * BLOCKS].reshape(BLOCKS, k, 19))
-    with np.errstate(invalid="ignore"):
-        # a quarter of the samples moves least: no load in them
-        level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
-    law = electrode_noise(np.nanmedian(session.counts[session.fit], axis=0))
+    cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
+    # a quarter of the samples moves least: no load in them
+    level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
+    law = electrode_noise(np.median(session.counts[session.fit], axis=0))
     ratio = np.log(np.maximum(level, 0.3) / law)
-    ratio -= np.nanmedian(ratio, axis=1, keepdims=True)
-    own = np.nanmedian(ratio, axis=0)
-    spread = 1.4826 * np.nanmedian(np.abs(own - np.nanmedian(own))) + 0.05
+    ratio -= np.median(ratio, axis=1, keepdims=True)
+    own = np.median(ratio, axis=0)
+    spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
     found = []
     for e in np.argsort(-own)[:4]:
-        if not own[e] > max(np.log(1.6), 3 * spread) or np.nanmedian(level[:, e]) < _LEAST:
+        if not own[e] > max(np.log(1.6), 3 * spread) or np.median(level[:, e]) < _LEAST:
             continue
-        excess = np.nan_to_num(ratio[:, e] - np.log(1.3))
+        excess = ratio[:, e] - np.log(1.3)
         p = sign_flip(excess)
         if p > 0.01:
             continue
@@ -356,7 +358,7 @@ def noisy(session: Session) -> list[Finding]:
             Finding(
                 "noise",
                 (int(e),),
-                {"factor": (factor, *np.exp(np.nanquantile(ratio[:, e], [0.1, 0.9])))},
+                {"factor": (factor, *np.exp(np.quantile(ratio[:, e], [0.1, 0.9])))},
                 float(k * BLOCKS * own[e] ** 2),
                 p,
                 0.0,
@@ -366,7 +368,7 @@ def noisy(session: Session) -> list[Finding]:
                     "factor": float(own[e]),
                     "stands": float(own[e] / spread),
                     "blocks": float(np.mean(excess > 0)),
-                    "counts": float(np.log(np.nanmedian(level[:, e]))),
+                    "counts": float(np.log(np.median(level[:, e]))),
                 },
             )
         )
