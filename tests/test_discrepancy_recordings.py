@@ -453,8 +453,8 @@ def test_the_real_unloaded_sensor_warms_up_and_nothing_else():
 def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert {"warmup", "latency"} <= set(ids(d)) and d.locked == 0.3
-    view = d.gap["each electrode from the others"]
-    assert view["after"] < view["before"]
+    for view in d.gap.values():
+        assert view["after"] < view["before"]
 
 
 @real
