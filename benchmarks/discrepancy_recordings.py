@@ -1,190 +1,315 @@
-"""Plain recordings with a hidden effect: what `biotac diagnose --electrodes` names, over many recordings of
-our own making.
+"""Recordings of real sensors with hidden effects: what `biotac diagnose --electrodes` names.
 
-    python benchmarks/discrepancy_recordings.py --count 2 --null 10 --seeds practice --json
-    out/recordings.json
+    python benchmarks/discrepancy_recordings.py DATA --half practice --json out/practice.json
+    python benchmarks/discrepancy_recordings.py --fit out/practice.json
 
-The recordings are made by `discrepancy_recordings_generator.py`. A run goes on where its JSON ends.
+DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights from
+practice; the other half is run once, afterwards (--half blind). A run goes on where its JSON ends.
 """
 
 import argparse
-import collections
 import hashlib
 import json
 import pathlib
-import tempfile
 import time
 
 import numpy as np
-from discrepancy_recordings_generator import ALSO, NATURAL, OUTSIDE, SEEDS, hide
+import recordings_foreign as foreign
 
-__all__ = ["diagnose", "right", "score", "table"]
-
-
-def right(effect, truth):
-    """Whether an effect of a verdict is the hidden one, on its channel."""
-    wanted = ALSO.get(truth["effect"], {truth["effect"]})
-    if not (effect["id"] in wanted or wanted & set(effect["ties"])):
-        return False
-    single = truth["effect"] in ("drift", "jump", "gain", "stuck", "noise", "spikes", "saturate", "swap")
-    return bool(not single or {f"e{k + 1}" for k in truth["channels"]} & set(effect["channels"]))
+__all__ = ["code_hash", "fit", "judge", "table"]
 
 
-def score(verdict, truth):
-    """hit, extra ids, whether the gap or the effect's own number shrank."""
-    named = [e["id"] for e in verdict["effects"]]
-    natural = NATURAL.get(truth["base"], set())
-    wanted = ALSO.get(truth["effect"], {truth["effect"]})
-    ok = [e for e in verdict["effects"] if right(e, truth)]
-    extra = [i for i in named if i not in natural and i not in wanted]
-    if truth["effect"] == "none":
-        return (
-            (not extra and (bool(natural) or verdict["verdict"] == "no significant disagreement")),
-            extra,
-            True,
+def right(effect: dict, case) -> str | None:
+    """The hidden effect that a named one is, on its channel; "natural" for what the base has by itself."""
+    ids = {effect["id"], *effect["ties"]}
+    for name, channels in zip(case.truth, case.channels):
+        if foreign.ACCEPTED[name] & ids and (
+            name not in foreign.SINGLE or {f"e{k + 1}" for k in channels} & set(effect["channels"])
+        ):
+            return name
+    return "natural" if foreign.NATURAL[case.base] & {effect["id"]} else None
+
+
+def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
+    """Runs one case and scores it."""
+    from biotac_mj.discrepancy import Recording, diagnose_recording
+    from biotac_mj.discrepancy.recordings.confidence import clues, family
+    from biotac_mj.discrepancy.recordings.report import verdict_dict
+
+    began = time.process_time()
+    recording = Recording(case.counts, case.force, case.tdc, case.rate)
+    d = diagnose_recording(recording, **({"named": 0.35} if practice else {}))
+    verdict = verdict_dict(d)
+    named = []
+    for f, e in zip([*d.findings, *d.late], verdict["effects"]):
+        named.append(
+            {
+                "id": e["id"],
+                "ties": e["ties"],
+                "channels": e["channels"],
+                "confidence": e["confidence"],
+                "confirmed": e["confirmed"],
+                "right": right(e, case),
+                "family": family(f),
+                "clues": clues(f),
+            }
         )
-    if truth["effect"] in OUTSIDE:
-        return "unknown" in verdict["verdict"], extra, True
-    shrunk = any(
-        e["gap"] and e["gap"].get("before") is not None and e["gap"]["after"] < e["gap"]["before"] for e in ok
+    weak = [
+        {
+            "id": f.id,
+            "family": family(f),
+            "clues": clues(f),
+            "confidence": f.confidence,
+            "right": right({"id": f.id, "ties": f.ties, "channels": [f"e{k + 1}" for k in f.channels]}, case),
+        }
+        for f in d.rejected
+    ]
+    return {
+        "base": case.base,
+        "force": case.force is not None,
+        "truth": case.truth,
+        "forms": case.forms,
+        "channels": case.channels,
+        "rows": len(case.counts),
+        "seconds": time.process_time() - began,
+        "verdict": verdict["verdict"],
+        "named": named,
+        "weak": weak,
+        "unknown": d.rest.significant,
+        "rest": d.rest.clues,
+        "closed": closed(d, case, clean),
+        "views": {k: (v["before"], v["after"]) for k, v in d.gap.items()},
+    }
+
+
+# what cannot be had back: noise that was added, digits that were dropped
+GONE = {"noise", "quantise", "lost"}
+SHARED = {"warmup", "fluidloss", "count_offset", "thermal"}
+
+
+def closed(diagnosis, case, clean: np.ndarray) -> float | None:
+    """Share of the hidden change of the counts, on the part kept aside, that the right findings take out.
+
+    A shared drift is taken out together with the one that the sensor has by itself, so the clean counts are
+    amended alike before they are compared.
+    """
+    if not case.truth or len(clean) != len(case.counts) or GONE & set(case.truth):
+        return None
+    rows, rate = ~diagnosis.session.fit, case.rate
+    hidden = np.sqrt(np.mean((case.counts - clean)[rows] ** 2))
+    if hidden < 1e-9:
+        return None
+
+    def amended(d):
+        mine = [f for f in d.findings if _named(f, case) not in (None, "natural")]
+        if SHARED & set(case.truth):
+            mine += [
+                f for f in d.findings if len(f.channels) > 12 and f.correct is not None and f not in mine
+            ]
+        out = d.session.without(*(f for f in d.findings if f not in mine)).filled()
+        for f in mine:
+            if f.seen is not None and "delay" in f.seen[1]:
+                out = f.seen[0].unsee(out, rate, f.seen[1])
+        return out
+
+    if SHARED & set(case.truth):
+        from biotac_mj.discrepancy import Recording, diagnose_recording
+
+        clean = amended(
+            diagnose_recording(Recording(np.clip(np.rint(clean), 0, 4095), case.force, case.tdc, rate))
+        )
+    return float(1 - np.sqrt(np.mean((amended(diagnosis) - clean)[rows] ** 2)) / hidden)
+
+
+def _named(finding, case):
+    return right(
+        {"id": finding.id, "ties": finding.ties, "channels": [f"e{k + 1}" for k in finding.channels]}, case
     )
-    return bool(ok), extra, shrunk
+
+
+def code_hash() -> str:
+    """Of everything that decides a verdict."""
+    folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
+    files = [folder / "evidence.py", folder / "noise.py", *sorted((folder / "recordings").rglob("*.*"))]
+    return hashlib.sha256(
+        b"".join(f.read_bytes() for f in files if f.suffix in (".py", ".json"))
+    ).hexdigest()[:12]
+
+
+def table(rows: list) -> str:
+    """The scores in words."""
+    names = [n for r in rows for n in r["named"] if n["right"] != "natural"]
+    none = [r for r in rows if not r["truth"]]
+    outside = [r for r in rows if set(r["truth"]) & foreign.OUTSIDE]
+    single = [r for r in rows if len(r["truth"]) == 1 and r not in outside]
+    pairs = [r for r in rows if len(r["truth"]) == 2]
+
+    def first(r):
+        return any(n["right"] == r["truth"][0] for n in r["named"])
+
+    def say(text, hits, total):
+        return f"{text:<56}{hits:>4} of {total:<4}{hits / max(total, 1):>6.0%}"
+
+    lines = [
+        say("names that are right", sum(n["right"] is not None for n in names), len(names)),
+        say("single effects named", sum(first(r) for r in single), len(single)),
+        say(
+            "  and nothing else",
+            sum(first(r) and all(n["right"] for n in r["named"]) for r in single),
+            len(single),
+        ),
+        say(
+            "falsely named where nothing is hidden",
+            sum(any(n["right"] is None for n in r["named"]) for r in none),
+            len(none),
+        ),
+        say("  or called unknown", sum(r["unknown"] for r in none), len(none)),
+        say("outside the catalogue: unknown", sum(r["unknown"] for r in outside), len(outside)),
+        say(
+            "  and nothing wrong named",
+            sum(r["unknown"] and all(n["right"] for n in r["named"]) for r in outside),
+            len(outside),
+        ),
+        say(
+            "pairs: both named",
+            sum(len({n["right"] for n in r["named"]} & set(r["truth"])) == 2 for r in pairs),
+            len(pairs),
+        ),
+        say(
+            "  one of them",
+            sum(bool({n["right"] for n in r["named"]} & set(r["truth"])) for r in pairs),
+            len(pairs),
+        ),
+    ]
+    shares = [r["closed"] for r in single if r["closed"] is not None and first(r)]
+    lines.append(
+        f"gap closed on the part kept aside, named ones: median {np.median(shares):.0%}, quartiles "
+        f"{np.quantile(shares, 0.25):.0%} {np.quantile(shares, 0.75):.0%}, {len(shares)} cases"
+    )
+    shares = [r["closed"] for r in single if r["closed"] is not None]
+    lines.append(f"  all: median {np.median(shares):.0%}, {len(shares)} cases")
+    seconds = [r["seconds"] for r in rows]
+    lines.append(f"processor time: median {np.median(seconds):.1f} s, most {max(seconds):.1f} s")
+    for effect in dict.fromkeys(e for r in rows for e in r["truth"]):
+        mine = [r for r in rows if r["truth"] == [effect]]
+        wrong = [
+            f"{n['id']} {n['channels'][0]}" if len(n["channels"]) < 12 else n["id"]
+            for r in mine
+            for n in r["named"]
+            if n["right"] is None
+        ]
+        missed = [f"{r['base']}{r['forms']}{'?' if r['unknown'] else ''}" for r in mine if not first(r)]
+        lines.append(
+            f"{effect:<14}{sum(first(r) for r in mine)} of {len(mine)}  "
+            f"wrong: {', '.join(wrong)}  missed: {', '.join(missed)}"
+        )
+    wrong = [
+        f"{r['base']}: {n['id']} {n['channels'][:1]}" for r in none for n in r["named"] if n["right"] is None
+    ]
+    lines += ["none: " + ", ".join(wrong), "confidence   names  right"]
+    everything = [n for r in rows for n in r["named"]]
+    edges = [0.6, 0.75, 0.85, 0.92, 0.97, 1.01]
+    for a, b in zip(edges[:-1], edges[1:]):
+        mine = [n for n in everything if a <= n["confidence"] < b]
+        if mine:
+            said = np.mean([n["confidence"] for n in mine])
+            lines.append(
+                f"{said:<13.2f}{len(mine):>5}{np.mean([n['right'] is not None for n in mine]):>7.0%}"
+            )
+    return "\n".join(lines)
+
+
+# clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
+CLUES = {
+    "shared": {"nats": 1, "size": 1, "lead": 1},
+    "one": {"nats": 1, "stands": 1, "counts": 1, "turns": -1, "lead": 1},
+    "answer": {"nats": 1, "factor": 1, "seconds": 1},
+    "order": {"nats": 1, "ratio": 1, "left": -1},
+    "samples": {"blocks": 1},
+    "limit": {"nats": 1, "blocks": 1},
+    "lost": {"ratio": 1, "score": 1},
+    "line": {"score": 1, "amplitude": 1},
+    "colour": {"ratio": 1},
+    "pairs": {"share": 1, "kappa": 1},
+    "common": {"share": 1, "kappa": 1},
+    "size": {"factor": 1, "stands": 1},
+    "force": {"gain": 1, "size": 1},
+    "left_loaded": {"fast3": 1, "level1": 1, "aside3": 1},
+    "left_unloaded": {"counts1": 1, "counts3": 1},
+}
+
+
+def fit(rows: list) -> dict:
+    """Weights of the confidence's logistic functions, by family: ridge on standardised clues, signs kept."""
+    from scipy.optimize import minimize
+
+    out = {}
+    everything = [n for r in rows for n in (*r["named"], *r["weak"])]
+    for family, signs in CLUES.items():
+        mine = [n for n in everything if n["family"] == family]
+        if family.startswith("left"):  # effects without a name, against recordings without an effect
+            mine = [
+                {"clues": r["rest"], "right": "outside" if r["truth"] else None}
+                for r in rows
+                if (r["base"] == "pressed") == (family == "left_loaded")
+                and (not r["truth"] or set(r["truth"]) & foreign.OUTSIDE)
+            ]
+        if not mine:
+            continue
+        x = np.array([[n["clues"].get(k, 0.0) for k in signs] for n in mine])
+        y = np.array([n["right"] is not None for n in mine], float)
+        mean, sd = x.mean(0), np.maximum(x.std(0), 0.1)
+        z = (x - mean) / sd
+
+        def loss(w, z=z, y=y, signs=signs):
+            t = w[0] + z @ w[1:]
+            return np.sum(np.logaddexp(0, t) - y * t) + 0.1 * np.sum(
+                (w[1:] - np.array([*signs.values()])) ** 2
+            )
+
+        bounds = [(None, None), *((0, None) if s > 0 else (None, 0) for s in signs.values())]
+        w = minimize(loss, np.zeros(1 + len(signs)), method="L-BFGS-B", bounds=bounds).x
+        out[family] = {
+            "intercept": float(w[0] - (w[1:] / sd) @ mean),
+            "weights": dict(zip(signs, (w[1:] / sd).tolist())),
+            "cases": len(mine),
+            "right": int(y.sum()),
+        }
+    return out
 
 
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    args.add_argument("--count", type=int, default=3)
-    args.add_argument("--null", type=int, help="recordings without effect on each base, default: count")
-    args.add_argument("--seeds", choices=SEEDS, default="development")
+    args.add_argument("data", nargs="?")
+    args.add_argument("--half", choices=("practice", "blind"), default="practice")
+    args.add_argument(
+        "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
+    )
     args.add_argument("--only", nargs="*")
-    args.add_argument("--base")
     args.add_argument("--json")
-    args.add_argument("--verbose", action="store_true")
+    args.add_argument("--fit", metavar="JSON")
     args = args.parse_args(argv)
-    rows = []
-    path = pathlib.Path(args.json) if args.json else None
-    if path and path.exists():
-        rows = json.loads(path.read_text())["cases"]
-    done = {(r["seeds"], r["case"]) for r in rows}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, make in hide(args.count, args.seeds, args.only, args.base, args.null):
-            if (args.seeds, name) in done:
-                continue
-            rows.append({"case": name, "seeds": args.seeds, **diagnose(make, pathlib.Path(folder))})
-            r = rows[-1]
-            if args.verbose or not r["hit"] or r["extra"]:
-                mark = "ok  " if r["hit"] else "MISS"
-                print(
-                    f"{mark} {name} {r['channels'][:3]} {r['rate']:g} Hz extra {r['extra']}: "
-                    f"{r['verdict'][:230]}",
-                    flush=True,
-                )
-            if path:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                part = path.with_suffix(".part")
-                part.write_text(json.dumps({"code": code_hash(), "cases": rows}, indent=1))
-                part.replace(path)
+    if args.fit:
+        path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
+        path.write_text(
+            json.dumps(fit(json.loads(pathlib.Path(args.fit).read_text())["cases"]), indent=1) + "\n"
+        )
+        return
+    path = pathlib.Path(args.json)
+    rows = json.loads(path.read_text())["cases"] if path.exists() else []
+    done = {tuple(r["key"]) for r in rows}
+    sources = foreign.bases(args.data, args.half)
+    cases = foreign.plan(args.half, *map(int, args.counts.split(",")))
+    # in mixed order, so that a run that was stopped holds some of each
+    for base, effects, seed in (cases[i] for i in np.random.default_rng(0).permutation(len(cases))):
+        key = (base, "+".join(effects), seed)
+        if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
+            continue
+        case, clean = foreign.make(args.half, sources, base, effects, seed)
+        rows.append({"key": key, **judge(case, clean, args.half == "practice")})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))
-
-
-def diagnose(make, folder):
-    """Runs one case as a user would, through text files, and scores it."""
-    from biotac_mj.discrepancy import diagnose_recording, read_recording
-    from biotac_mj.discrepancy.recordings.report import verdict_dict
-
-    e, force, rate, truth = make()
-    paths = folder / "e.txt", folder / "f.txt"
-    np.savetxt(paths[0], e, fmt="%d")
-    if force is not None:
-        np.savetxt(paths[1], force, fmt="%.5f")
-    began = time.process_time()
-    verdict = verdict_dict(
-        diagnose_recording(read_recording(paths[0], None if force is None else paths[1], None, rate))
-    )
-    hit, extra, shrunk = score(verdict, truth)
-    natural = NATURAL.get(truth["base"], set())
-    named = [
-        {
-            "id": f["id"],
-            "nats": f["nats"],
-            "ties": f["ties"],
-            "confirmed": f["confirmed"],
-            "confidence": f["confidence"],
-            "natural": f["id"] in natural and f["id"] != truth["effect"],
-            "right": right(f, truth),
-        }
-        for f in verdict["effects"]
-    ]
-    views = {k: (v["before"], v["after"]) for k, v in verdict["gap"].items()}
-    return {
-        **truth,
-        "force": force is not None,
-        "rate": rate,
-        "rows": len(e),
-        "seconds": time.process_time() - began,
-        "hit": bool(hit),
-        "extra": extra,
-        "shrunk": bool(shrunk),
-        "verdict": verdict["verdict"],
-        "named": named,
-        "views": views,
-    }
-
-
-def code_hash():
-    """Of everything that decides a verdict: written beside the results, so that a frozen run can be told."""
-    folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    files = [folder / "evidence.py", folder / "noise.py", *sorted((folder / "recordings").rglob("*.py"))]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
-
-
-def table(rows):
-    """Rows by base: without effect, inside and outside the catalogue."""
-    heads = (
-        ("no effect", 11),
-        ("false", 7),
-        ("hidden", 8),
-        ("right", 7),
-        ("with extras", 13),
-        ("outside", 9),
-        ("unknown", 9),
-        ("worse view", 12),
-    )
-    lines = [f"{'base':<30}" + "".join(f"{head:>{width}}" for head, width in heads)]
-    groups = collections.defaultdict(list)
-    for r in rows:
-        groups[r["base"] + (" with force" if r["force"] else "")].append(r)
-    for base, members in [*groups.items(), ("all", rows)]:
-        none = [r for r in members if r["effect"] == "none"]
-        outside = [r for r in members if r["effect"] in OUTSIDE]
-        inside = [r for r in members if r["effect"] != "none" and r["effect"] not in OUTSIDE]
-        worse = sum(any(after > 1.02 * before for before, after in r["views"].values()) for r in members)
-        counts = (
-            len(none),
-            sum(bool(r["extra"]) for r in none),
-            len(inside),
-            sum(r["hit"] for r in inside),
-            sum(bool(r["extra"]) for r in inside),
-            len(outside),
-            sum(r["hit"] for r in outside),
-            worse,
-        )
-        lines.append(f"{base:<30}" + "".join(f"{value:>{width}}" for value, (_, width) in zip(counts, heads)))
-    lines.append("")
-    for effect in dict.fromkeys(r["effect"] for r in rows):
-        mine = [r for r in rows if r["effect"] == effect]
-        wrong = collections.Counter(i for r in mine for i in r["extra"])
-        lines.append(
-            f"{effect:<14}{sum(r['hit'] for r in mine):>4} of "
-            f"{len(mine):<4}{', '.join(f'{k} {v}' for k, v in wrong.items())}"
-        )
-    lines += ["", f"{'confidence':<14}names, right"]
-    for value in sorted({round(f["confidence"], 3) for r in rows for f in r["named"]}):
-        told = [
-            f["right"] or f["natural"] for r in rows for f in r["named"] if round(f["confidence"], 3) == value
-        ]
-        lines.append(f"{value:<14}{len(told):>4}{sum(told):>7}")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ _HOME = {
     "CATALOGUE": "..effects.catalogue",
     "Effect": "..effects.effect",
     "Param": "..effects.effect",
-    "RecordedEffect": ".recordings.effects.effect",
     "Recording": ".recordings.recording",
     "Report": ".trajectories.workflow",
     "Simulator": ".trajectories.simulator",

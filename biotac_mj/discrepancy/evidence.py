@@ -1,5 +1,7 @@
 """Tests whose unit is the block of time or the trajectory, never the sample."""
 
+import functools
+
 import numpy as np
 
 __all__ = ["benjamini_hochberg", "max_t", "sign_flip", "wilson"]
@@ -10,12 +12,17 @@ def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
     them."""
     gain = np.asarray(gain, float)
     n = len(gain)
+    return float(np.mean(_signs(n, draws, seed) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+
+
+@functools.lru_cache(maxsize=8)
+def _signs(n, draws, seed):
+    """(draws, n) of -1 and 1, all there are up to 12."""
     if n <= 12:
-        sign = 1 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
-    else:
-        sign = np.random.default_rng(seed).choice([-1, 1], (draws, n))
-        sign[0] = 1  # the data themselves: p is never zero
-    return float(np.mean((sign * gain).mean(1) >= gain.mean() - 1e-15))
+        return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
+    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, n))
+    sign[0] = 1  # the data themselves: p is never zero
+    return sign
 
 
 def max_t(statistic: np.ndarray, draws: int = 2000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

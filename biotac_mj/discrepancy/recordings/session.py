@@ -1,109 +1,81 @@
 """What the search on a plain recording knows: the recording less what was found so far."""
 
-import typing
-
 import numpy as np
 
-from .load_search import ForceView
+from .findings import Finding
+from .model import Model
 from .recording import Recording
-from .timeline import Timeline
-
-if typing.TYPE_CHECKING:
-    from .effects.effect import Finding
 
 __all__ = ["Session"]
 
 
 class Session:
-    """What the search knows. `counts` is the recording less what was found so far.
+    """The recording less what was found.
 
     Attributes:
-      recording; fit: (n,) bool, rows that may be used; counts (n, 19); masked (n, 19) bool; findings.
+      recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
+      findings; unnamed: (channels, counts, from, to, text) of what is there and has no name.
     """
 
-    def __init__(self, recording: Recording, fit: np.ndarray):
+    def __init__(self, recording: Recording, fit: np.ndarray, findings: tuple | list = ()):
         self.recording, self.fit = recording, fit
-        self.counts = recording.electrodes.copy()
-        self.masked = np.zeros(self.counts.shape, bool)
-        self.findings = []
-        self.force = recording.force  # as the electrodes follow it
-        self._timelines = {}
-        self._view = None
-        self.unnamed = []  # what was seen and given up: texts
-        self.events = {}  # (electrode, second) -> counts: left the others and came back, no effect
+        self.findings, self.unnamed = list(findings), []
+        self.fresh = 1 - recording.repeated.mean()
+        self.replay()
 
-    def give_up(self, findings: "list[Finding]", text: str) -> None:
-        """Takes findings back: what they describe belongs to something that has no name here."""
-        keep = [f for f in self.findings if f not in findings]
-        self.findings, self.counts, self.force = [], self.recording.electrodes.copy(), self.recording.force
-        self._timelines, self._view = {}, None
-        self.unnamed.append(text)
-        for finding in keep:
-            self.accept(finding)
+    def replay(self) -> None:
+        """Counts and mask from the recording and the findings."""
+        r = self.recording
+        self.counts, self.masked = r.electrodes.copy(), np.zeros(r.electrodes.shape, bool)
+        for finding in self.findings:
+            self._take_out(finding)
+        self._model = None
 
-    def force_view(self) -> ForceView | None:
-        """ForceView of the corrected counts, or None where force and electrodes are not related."""
-        if self.force is None or self.force[self.fit].std(0).max() < 0.02:
-            return None
-        if self._view is None:
-            view = self.force_view_of(self.fit)
-            self._view = view if view is not None and view.explained() > 0.3 else False
-        return self._view or None
-
-    def force_view_of(self, rows: np.ndarray) -> ForceView | None:
-        """ForceView of contiguous rows (n,) bool with what was found between force and electrodes, or None
-        with too few electrodes."""
-        usable = np.flatnonzero(~(self.masked[rows].mean(0) > 0.02))
-        chain = [(f.effect, f.theta) for f in self.findings if hasattr(f.effect, "see")]
-        return (
-            ForceView(self.counts, self.recording.force, rows, usable, self.recording.rate, chain)
-            if len(usable) >= 6
-            else None
-        )
-
-    def timeline(self, rows: slice | None = None, counts: np.ndarray | None = None) -> Timeline:
-        """Bins of the rows to fit, or of others (a slice, contiguous)."""
-        if counts is not None:
-            return self._make(self._slice(self.fit) if rows is None else rows, counts)
-        rows = self._slice(self.fit) if rows is None else rows
-        key = rows.start, rows.stop
-        if key not in self._timelines:
-            self._timelines[key] = self._make(rows, self.counts)
-        return self._timelines[key]
-
-    @property
-    def known_jumps(self) -> list[float]:
-        """Times [s] of the jumps found so far, swaps among them."""
-        steps = [
-            f
-            for f in self.findings
-            if f.id == "swap" or f.theta.get("kind") in ("step", "pulse") or f.id == "gain"
-        ]
-        return [t for f in steps for t in (f.start, f.end) if 0 < t < self.recording.time[-1]]
-
-    def accept(self, finding: "Finding") -> None:
-        """Takes a finding out of the counts."""
+    def accept(self, finding: Finding) -> None:
         self.findings.append(finding)
         self._take_out(finding)
+        self._model = None
+
+    def without(self, *left_out: Finding) -> "Session":
+        """A session in which some findings are not taken out."""
+        return Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
+
+    def model(self) -> Model:
+        """The joint model of the corrected counts."""
+        if self._model is None:
+            self._model = Model(self.counts, ~self.masked, self.fit, self.recording.rate, self.fresh)
+        return self._model
+
+    @property
+    def loaded(self) -> bool:
+        return self.model().dimensions >= 2
+
+    def filled(self) -> np.ndarray:
+        """(n, 19) counts without the effects; samples that are no measurement as the other electrodes say
+        them."""
+        from ...sensor.channels import counts_from_log_impedance
+
+        if not self.masked.any():
+            return self.counts
+        m, out = self.model(), self.counts.copy()
+        said = m.value + m.mean - np.where(m.known, 0, m.alone() if m.dimensions else 0)
+        time, rows = self.recording.time, np.arange(len(self.counts))
+        for k in np.flatnonzero(self.masked.any(0)):
+            hole = self.masked[:, k]
+            if hole.all():
+                continue
+            out[hole, k] = np.interp(rows[hole], rows[~hole], self.counts[~hole, k])
+            # longer than a few bins the line says less than the others do, where they are measurements
+            edge = np.flatnonzero(np.diff(np.concatenate([[False], hole, [False]])))
+            place = np.flatnonzero(m.used == k)
+            for first, last in zip(edge[::2], edge[1::2]):
+                if last - first > 3 * m.width and len(place) and not self.masked[first:last].all(1).any():
+                    z = np.interp(time[first:last], m.time, said[:, place[0]])
+                    out[first:last, k] = counts_from_log_impedance(z)
+        return out
 
     def _take_out(self, finding):
-        mask = finding.effect.mask(self.counts, self.recording.time, finding)
-        if mask is not None:
-            self.masked |= mask
-        if hasattr(finding.effect, "see"):
-            self.force = finding.effect.see(self.force, self.recording.rate, finding.theta)
-        else:
+        if finding.mask is not None:
+            self.masked |= finding.mask
+        if finding.correct is not None:
             self.counts = finding.correct(self.counts, self.recording.time)
-        self._timelines, self._view = {}, None
-
-    def _make(self, rows, counts):
-        r = self.recording
-        part = Recording(counts[rows], None, None, r.rate, r.rate_source, r.name)
-        line = Timeline(part, masked=self.masked[rows])
-        line.time = line.time + (rows.start or 0) / r.rate
-        return line
-
-    @staticmethod
-    def _slice(mask):
-        where = np.flatnonzero(mask)
-        return slice(int(where[0]), int(where[-1]) + 1)

@@ -1,41 +1,173 @@
-"""Which effects act between force and electrodes: all are compared on the same measured force, and the best
-evidence wins.
+"""What lies between force and electrodes: latency, low-pass, relaxation after load changes, hysteresis.
 
 The force sensor's reading is regressed on what the electrodes say (ln Z and squares and products of its six
-principal components; they know the place of the contact, force alone does not), ridge, cross-validated by
-contiguous blocks of time. An effect acts on the electrodes' side of the regression, so that it never changes
-what has to be explained, and adds at most one number per component. Both sides are smoothed alike, by 20 ms,
-which takes the electrodes' noise out of the comparison. Memory has a direction in time: an effect must beat
-itself run backwards."""
+principal components; they know the place of the contact, force alone does not), ridge, on blocks of time left
+out. An effect acts on the electrodes' side of the regression, so that it never changes what has to be
+explained, and adds at most one number per component. Both sides are smoothed alike, by 20 ms, which takes the
+electrodes' noise out of the comparison. Memory has a direction in time: an effect must beat itself run
+backwards."""
 
+import abc
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from ...sensor.channels import log_impedance
 from ..evidence import sign_flip
-from .effects.effect import Finding
-from .effects.loads import ForceEffect, Hysteresis, Latency, LoadLowPass, Relaxation, play
+from .findings import KINDS, Finding
+from .session import Session
 
-__all__ = ["BETWEEN", "ForceView", "find_between"]
+__all__ = ["BETWEEN", "ForceEffect", "ForceView", "find_between", "force_view", "lagged"]
 
-# one of each at most: what a law a little different leaves is no effect
-_KINS = ([Latency(), LoadLowPass()], [Relaxation(), Hysteresis()])
-BETWEEN = [effect for kin in _KINS for effect in kin]
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
 _RIDGE = 1e-4
 _ROWS = 4000
-# least mean fall of a block's log mean square error
-_GAIN = {"latency": 0.03, "lowpass": 0.03, "relax": 0.06, "hyster": 0.06}
-_FURTHER = 1.5  # times that beside another effect
 _P = 0.02
 # of the other's gain that a second effect needs: what a law a little different leaves is no effect
 _REMAINDER = 0.1
-_LEAST = 0.06  # fraction of a relaxation or a loop
 _TIE = 1.64  # standard errors, paired over blocks
+
+
+class ForceEffect(abc.ABC):
+    """Subclasses write `see(force, rate, theta)`, the force that the electrodes follow, its inverse
+    `unsee`, and what is tried.
+
+    Attributes:
+      arrow: whether the effect has to beat itself run backwards in time: what has no memory looks alike from
+        both ends.
+      linear: parameter that `unsee` is linear in, or None.
+    """
+
+    id = ""
+    arrow = True
+    linear: str | None = None
+
+    @abc.abstractmethod
+    def tried(self, rate: float, seconds: float) -> list:
+        """Parameters (dicts) to try on a record of `seconds` at `rate` [Hz]."""
+
+    @abc.abstractmethod
+    def see(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        """(n, m) force that the electrodes follow [N]."""
+
+    @abc.abstractmethod
+    def unsee(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        """(n, m) force that a sensor would have said from what the electrodes followed [N]: the inverse of
+        `see`."""
+
+    def note(self, theta: dict) -> str:
+        """What was seen, in words."""
+        return ""
+
+
+class Latency(ForceEffect):
+    id = "latency"
+    arrow = False  # run backwards it is a delay of the other sign, which is tried as well
+
+    def tried(self, rate: float, seconds: float) -> list:
+        fine = max(1, round(0.01 * rate))
+        near, far = np.arange(-5, 11) * fine, np.unique(np.geomspace(12 * fine, 0.6 * rate, 8).astype(int))
+        rows = np.unique(np.concatenate([-far[far < 0.3 * rate], near, far]))
+        return [{"delay": d / rate} for d in rows if d]
+
+    def see(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return shift(force, theta["delay"] * rate)
+
+    def unsee(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return shift(force, -theta["delay"] * rate)
+
+
+class LoadLowPass(ForceEffect):
+    id = "lowpass"
+
+    def tried(self, rate: float, seconds: float) -> list:
+        return [{"tau": t} for t in np.geomspace(0.007, 0.4, 12) if t > 0.4 / rate]
+
+    def see(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return lagged(force, theta["tau"], rate)
+
+    def unsee(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify the
+        # electrodes' noise
+        return force + shift(force, -0.5 * theta["tau"] * rate) - shift(force, 0.5 * theta["tau"] * rate)
+
+
+class Relaxation(ForceEffect):
+    id = "relax"
+    linear = "fraction"
+
+    def tried(self, rate: float, seconds: float) -> list:
+        fractions = (-0.25, -0.1, 0.08, 0.16, 0.3, 0.5)
+        return [
+            {"fraction": g, "tau": t}
+            for t in (0.3, 0.5, 0.9, 1.6, 2.8, 5, 9, 16)
+            if t < seconds / 8
+            for g in fractions
+        ]
+
+    def see(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        g, tau = theta["fraction"], theta["tau"]
+        return force - g / (1 + g) * (force - lagged(force, tau * (1 + g), rate))
+
+    def unsee(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return force + theta["fraction"] * (force - lagged(force, theta["tau"], rate))
+
+    def note(self, theta: dict) -> str:
+        return (
+            f"force {'overshoots' if theta['fraction'] > 0 else 'lags'} what the electrodes say and "
+            "comes back"
+        )
+
+
+class Hysteresis(ForceEffect):
+    id = "hyster"
+
+    def tried(self, rate: float, seconds: float) -> list:
+        # widths in standard deviations; the fraction is fitted
+        return [{"share": share} for share in (0.15, 0.3, 0.6, 1.2)]
+
+    def see(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return force - theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
+
+    def unsee(self, force: np.ndarray, rate: float, theta: dict) -> np.ndarray:
+        return force + theta["fraction"] * play(lagged(force, 3 / rate, rate), theta["width"])
+
+    def note(self, theta: dict) -> str:
+        return "the loop between loading and unloading does not depend on speed"
+
+
+def shift(x: np.ndarray, delay: float) -> np.ndarray:
+    """x (n, m) delayed by a fractional number of rows; the ends hold."""
+    n = len(x)
+    at = np.clip(np.arange(n) - delay, 0, n - 1)
+    low = np.minimum(at.astype(int), n - 2)
+    part = (at - low)[:, None]
+    return x[low] * (1 - part) + x[low + 1] * part
+
+
+def lagged(x: np.ndarray, tau: float, rate: float) -> np.ndarray:
+    """First-order low-pass of (n, m) with time constant tau [s], at rest before the first row."""
+    a = np.exp(-1 / max(tau * rate, 1e-9))
+    return lfilter([1 - a], [1, -a], x, axis=0, zi=a * x[:1])[0]
+
+
+def play(x: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """(n, m) elastic part of a play operator: follows x up to +-width (m,), then slips."""
+    out = np.empty_like(x)
+    z = np.zeros(x.shape[1])
+    previous = x[0]
+    for i, now in enumerate(x):
+        z = np.clip(z + now - previous, -width, width)
+        out[i], previous = z, now
+    return out
+
+
+_KINS = ([Latency(), LoadLowPass()], [Relaxation(), Hysteresis()])
+# one of each at most: what a law a little different leaves is no effect
+BETWEEN = [effect for kin in _KINS for effect in kin]
 
 
 class ForceView:
@@ -97,21 +229,12 @@ class ForceView:
         x = self.x
         for effect, theta in chain:
             if not isinstance(effect, Hysteresis):
-                x = _sided(effect.unsee, x, self.rate, self._here(theta))
+                x = _sided(effect.unsee, x, self.rate, theta)
         x, loops = x[:: self.step], np.zeros((3, len(self.target), 0))
         for effect, theta in chain:
             if isinstance(effect, Hysteresis):
                 loops = np.concatenate([loops, self.loop(x, theta).T[:, :, None]], axis=2)
         return x, loops
-
-    def _here(self, theta):
-        """Times of a theta counted from the view's first row."""
-        begin = self.rows[0] / self.rate
-        return (
-            theta | {"start": max(theta["start"] - begin, 0.0), "end": theta["end"] - begin}
-            if "start" in theta
-            else theta
-        )
 
     def loop(self, x: np.ndarray, theta: dict) -> np.ndarray:
         """(rows, 3) elastic part of a play operator on what the electrodes say of the force."""
@@ -167,10 +290,20 @@ class ForceView:
         return out
 
 
-def find_between(session: Any) -> list:
+def force_view(session: Session, rows: np.ndarray, known: Sequence[Finding] = ()) -> ForceView | None:
+    """ForceView of contiguous rows (n,) bool, None where force and electrodes are not related."""
+    r = session.recording
+    usable = np.flatnonzero(session.masked[rows].mean(0) < 0.02)
+    if r.force is None or len(usable) < 6 or r.force[rows].std(0).max() < 0.02:
+        return None
+    chain = [f.seen for f in known if f.seen is not None]
+    return ForceView(session.counts, r.force, rows, usable, r.rate, chain)
+
+
+def find_between(session: Session) -> list[Finding]:
     """Findings between force and electrodes: the set of effects that predicts the force best on blocks left
     out, each one needed in it."""
-    view = session.force_view()
+    view = force_view(session, session.fit)
     if view is None:
         return []
     seconds = len(view.rows) / view.rate
@@ -196,14 +329,13 @@ def find_between(session: Any) -> list:
     null = view.errors().mean()
 
     def choose(effects, chain):
-        """The effect of some that predicts best beside a chain, if its evidence is enough: list of none or
-        one."""
+        """The effect of some that predicts best beside a chain: list of none or one."""
         without, options = view.errors(chain).mean(1), []
         least = _REMAINDER * (null - without.mean())
         for effect in effects:
             theta, score, _ = best(effect, chain)
             g = gain(effect, theta, score, chain, without)
-            if _enough(effect, g, bool(chain)) and g.mean() > least:
+            if sign_flip(g) < _P and g.mean() > max(least, 0):
                 options.append((score.mean(), effect, theta))
         return [min(options, key=lambda o: o[0])[1:]] if options else []
 
@@ -213,26 +345,21 @@ def find_between(session: Any) -> list:
     mine, others = _KINS if first[0][0] in _KINS[0] else _KINS[::-1]
     second = choose(others, first)
     chain = [*choose(mine, second), *second] if second else first
-    found = [_finding(session, view, c, [o for o in chain if o is not c], best, gain) for c in chain]
-    return [f for f in found if abs(f.theta.get("fraction", 1.0)) >= _LEAST]
+    return [_finding(session, view, c, [o for o in chain if o is not c], best, gain, null) for c in chain]
 
 
-def _enough(effect, gain, beside):
-    return gain.mean() > _GAIN[effect.id] * (_FURTHER if beside else 1) and sign_flip(gain) < _P
-
-
-def _finding(session, view, one, rest, best, gain):
+def _finding(session, view, one, rest, best, gain, null):
     effect = one[0]
     theta, score, table = best(effect, rest)
     without = view.errors(rest).mean(1)
     g = gain(effect, theta, score, rest, without)
-    ties = []
+    ties = ["creep"] if effect.id == "relax" else []  # a plateau takes longer than these holds
     for other in next(kin for kin in _KINS if effect in kin):
         if other is not effect:
             rival, said, _ = best(other, rest)
             lead = said - score
             close = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
-            if close and _enough(other, gain(other, rival, said, rest, without), bool(rest)):
+            if close and sign_flip(gain(other, rival, said, rest, without)) < _P:
                 ties.append(other.id)
     thetas = effect.tried(view.rate, len(view.rows) / view.rate)
     parameters, theta = _parameters(effect, theta, thetas, table)
@@ -245,29 +372,37 @@ def _finding(session, view, one, rest, best, gain):
         theta["width"] = theta.pop("share") * view.predict(x)[0].std(0)
         each = view.predict(x, view.loop(x, theta))[1]
         theta["fraction"] = float(np.median(each))
-        parameters = {"fraction": (theta["fraction"], float(each.min()), float(each.max())),
-                      "width": (float(np.median(theta["width"])), np.nan, np.nan)}  # fmt: skip
+        parameters = {
+            "fraction": (theta["fraction"], float(each.min()), float(each.max())),
+            "width": (float(np.median(theta["width"])), np.nan, np.nan),
+        }
     seconds = session.fit.sum() / session.recording.rate
     # half the summed log-error ratio, per independent second of a block
     nats = float(0.5 * 3 * g.sum() * min(max(1.0, seconds / _BLOCKS), 20))
-    note = "; ".join(
-        filter(
-            None,
-            [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"],
-        )
+    size = abs(theta.get("fraction", theta.get("delay", theta.get("tau", 1.0)) * 10))
+    return Finding(
+        effect.id,
+        tuple(range(19)),
+        parameters,
+        nats,
+        sign_flip(g),
+        0.0,
+        float(session.recording.time[-1]),
+        note="; ".join(
+            filter(
+                None,
+                [effect.note(theta), f"errors of the force fall in {np.mean(g > 0):.0%} of {_BLOCKS} blocks"],
+            )
+        ),
+        ties=tuple(ties),
+        seen=(effect, theta),
+        clues={
+            "gain": float(np.log(max(g.mean(), 1e-4))),
+            "blocks": float(np.mean(g > 0)),
+            "size": float(np.log(max(size, 1e-3))),
+            "explained": float(view.explained()),
+        },
     )
-    last = float(session.recording.time[-1])
-    found = Finding(
-        effect, tuple(range(19)), theta, parameters, nats, 0.0, last, sign_flip(g), tuple(ties), note
-    )
-    if isinstance(effect, Latency):
-        _in_a_stretch(
-            found,
-            np.array([t["delay"] * view.rate for t in thetas]),
-            table,
-            session.recording.time[view.rows],
-        )
-    return found
 
 
 def _parameters(effect, theta, thetas, table):
@@ -276,7 +411,7 @@ def _parameters(effect, theta, thetas, table):
     rng = np.random.default_rng(0)
     draws = [table[:, rng.integers(0, _BLOCKS, _BLOCKS)].mean(1) for _ in range(200)]
     out = {}
-    for name in [k for k in theta if k in effect.params]:
+    for name in [k for k in theta if k in KINDS[effect.id].params and k != "width"]:
         values = np.array([t[name] for t in thetas])
         value = _profiled(values, table.mean(1))
         low, high = np.quantile([_profiled(values, d) for d in draws], [0.025, 0.975])
@@ -314,64 +449,3 @@ def _vertex(x, y, i):
         return float(x[i])
     bend, slope, _ = np.polyfit(x[i - 1 : i + 2] - x[i], y[i - 1 : i + 2], 2)
     return float(np.clip(x[i] - 0.5 * slope / max(bend, 1e-12), x[i - 1], x[i + 1]))
-
-
-def _in_a_stretch(found, delays, table, time):
-    """Narrows a latency to the stretch of blocks in which it acts, if its delay [rows] differs outside."""
-    part = _segment(delays, table)
-    if part is None:
-        return
-    a, b, inside, outside = part
-    edges = time[np.minimum(np.arange(_BLOCKS + 1) * len(time) // _BLOCKS, len(time) - 1)]
-    rate = (len(time) - 1) / (time[-1] - time[0])
-    found.theta.update(
-        delay=inside / rate, start=edges[a], end=edges[b] if b < _BLOCKS else np.inf, otherwise=outside / rate
-    )
-    found.start, found.end = float(edges[a]), float(edges[b])
-    found.parameters = {
-        "delay": (inside / rate, (inside - 1.5) / rate, (inside + 1.5) / rate),
-        "delay_otherwise": (outside / rate, (outside - 1.5) / rate, (outside + 1.5) / rate),
-    }
-    found.note += (
-        f"; {inside / rate * 1e3:.0f} ms from {edges[a]:.0f} s to {edges[b]:.0f} s, "
-        f"{outside / rate * 1e3:.0f} ms otherwise"
-    )
-
-
-def _segment(delays, score):
-    """A stretch of blocks whose delay differs from the others': first, last + 1, delay inside, delay outside;
-    or None."""
-    nb = score.shape[1]
-    one = score.sum(1).min()
-    best = None
-    total = np.concatenate([np.zeros((len(score), 1)), np.cumsum(score, axis=1)], axis=1)
-    for a in range(nb):
-        for b in range(a + 3, nb + 1):
-            if (a, b) == (0, nb) or nb - (b - a) < 3:
-                continue
-            inside = total[:, b] - total[:, a]
-            outside = total[:, -1] - inside
-            value = inside.min() + outside.min()
-            if best is None or value < best[0]:
-                best = value, a, b, int(inside.argmin()), int(outside.argmin())
-    if best is None:
-        return None
-    value, a, b, i, o = best
-    rows = np.zeros(nb, bool)
-    rows[a:b] = True
-    together = int(score.sum(1).argmin())
-    better = np.where(rows, score[together] - score[i], score[together] - score[o])
-    affected = better[np.abs(better) > 1e-12]
-    if (
-        abs(delays[i] - delays[o]) < 2
-        or len(affected) < 3
-        or (one - value) / nb < 0.02
-        or np.mean(affected > 0) < 0.8
-    ):
-        return None
-    if abs(delays[i]) < abs(delays[o]):  # what departs most from none is the effect
-        if a == 0:
-            return b, nb, float(delays[o]), float(delays[i])
-        if b == nb:
-            return 0, a, float(delays[o]), float(delays[i])
-    return a, b, float(delays[i]), float(delays[o])

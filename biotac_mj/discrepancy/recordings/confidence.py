@@ -1,0 +1,54 @@
+"""What a finding's clues say of its being right: a logistic function for every family, fitted on practice
+recordings (`benchmarks/recordings_foreign.py`, `benchmarks/discrepancy_recordings.py --fit`)."""
+
+import json
+import math
+import pathlib
+
+from .findings import Finding
+
+__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "probability"]
+
+FAMILIES = {
+    "shared": ("warmup", "fluidloss", "count_offset", "count_gain", "thermal"),
+    "one": ("drift",),
+    "answer": ("gain", "flip"),
+    "order": ("swap",),
+    "samples": ("stuck", "spikes", "freeze", "quantise"),
+    "limit": ("saturate",),
+    "lost": ("lost_rows",),
+    "line": ("hum",),
+    "colour": ("lowpass",),
+    "pairs": ("crosstalk",),
+    "common": ("common_noise",),
+    "size": ("noise",),
+    "force": ("latency", "relax", "hyster"),
+}
+# confidence from which a finding is named: right names and missed ones on practice recordings
+NAMED = 0.6
+_FITTED = pathlib.Path(__file__).with_name("confidence.json")
+_WEIGHTS = json.loads(_FITTED.read_text())
+
+
+def family(finding: Finding) -> str:
+    """Key of FAMILIES."""
+    if finding.seen is not None:
+        return "force"
+    return next(name for name, ids in FAMILIES.items() if finding.id in ids)
+
+
+def clues(finding: Finding) -> dict:
+    """The finding's numbers, by name."""
+    return {k: v for k, v in finding.clues.items() if isinstance(v, float)}
+
+
+def confidence(finding: Finding) -> float:
+    """Probability that the name is right."""
+    return probability(family(finding), clues(finding))
+
+
+def probability(family: str, given: dict) -> float:
+    """Of a family's clues."""
+    known = _WEIGHTS[family]
+    total = known["intercept"] + sum(w * given.get(k, 0.0) for k, w in known["weights"].items())
+    return 1 / (1 + math.exp(-max(min(total, 30.0), -30.0)))

@@ -1,0 +1,375 @@
+"""What the noise says of the electronics: lines, colour, correlations, and electrodes noisier than the
+others.
+
+Everything is looked for above the band in which the load moves: of a recording's rows less what a smooth
+course through them says."""
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ...geometry.electrodes import electrode_positions
+from ...sensor.channels import electrode_noise
+from ..evidence import sign_flip
+from .courses import BLOCKS
+from .findings import Finding
+from .session import Session
+
+__all__ = ["coloured", "correlated", "humming", "noisy"]
+
+_NAN = float("nan")
+# [counts] below which rounding is most of the noise, and its differences are neither white nor independent
+_LEAST = 0.7
+
+
+def _differences(session, order=3):
+    """Differences (n, 19) of fresh rows [counts], nan where a sample is masked, and their rows."""
+    rows = np.flatnonzero(session.fit & ~session.recording.repeated & ~session.masked.all(1))
+    x = np.where(session.masked, np.nan, session.counts)[rows]
+    return np.diff(x, n=order, axis=0), rows[order:]
+
+
+def _calm(d, share=0.5, size=40):
+    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, and
+    their blocks."""
+    k = len(d) // size
+    cells = d[: k * size].reshape(k, size, -1)
+    known = np.isfinite(cells)
+    power = np.where(known, cells**2, 0).sum(1) / np.maximum(known.sum(1), 1)
+    level = np.median(power / np.maximum(np.quantile(power, 0.1, axis=0), 0.1), axis=1)
+    block = np.arange(k) * BLOCKS // k
+    keep = np.zeros(k, bool)
+    for b in range(BLOCKS):
+        mine = np.flatnonzero(block == b)
+        if len(mine):
+            keep[mine[level[mine] <= np.quantile(level[mine], share)]] = True
+    return cells[keep], block[keep]
+
+
+# --- colour
+
+
+def coloured(session: Session) -> Finding | None:
+    """White noise that has been filtered: its spectrum falls from the band above the load's to the highest
+    frequencies, in every block."""
+    x = _fresh(session)
+    size = 64
+    if len(x) < 2 * size * BLOCKS // 3 or x.std(0).max() < 0.25:
+        return None
+    starts = np.arange(0, len(x) - size + 1, size // 2)
+    window = np.hanning(size)[:, None]
+    line = np.vander(np.linspace(-1, 1, size), 3)
+    project = line @ np.linalg.pinv(line)
+    parts = np.stack([x[a : a + size] - project @ x[a : a + size] for a in starts]) * window
+    power = np.abs(np.fft.rfft(parts, axis=1)) ** 2
+    f = np.fft.rfftfreq(size)
+    bands = ((0.16, 0.27) if session.loaded else (0.05, 0.2), (0.38, 0.5))
+    middle, high = (power[:, (f >= a) & (f <= b)].mean(1) for a, b in bands)
+    # rounding alone has a floor of its own
+    floor = (window**2).sum() / 12
+    alive = np.median(middle, axis=0) > 0.5 * floor
+    if alive.sum() < 6:
+        return None
+    block = np.arange(len(parts)) * BLOCKS // len(parts)
+    ratio = np.array(
+        [
+            np.median(
+                np.log(
+                    np.quantile(middle[block == b], 0.3, axis=0)
+                    / np.maximum(np.quantile(high[block == b], 0.3, axis=0), 0.01 * floor)
+                )[alive]
+            )
+            for b in range(BLOCKS)
+        ]
+    )
+    p, value = sign_flip(ratio), float(np.median(ratio))
+    pole = _pole(value, bands)
+    if p > 0.01 or pole < 0.05:
+        return None
+    rate = session.recording.rate * session.fresh
+    tau, low, high = (
+        -1 / (rate * np.log(np.clip(_pole(v, bands), 1e-3, 0.995)))
+        for v in (value, *np.quantile(ratio, [0.1, 0.9]))
+    )
+    return Finding(
+        "lowpass",
+        tuple(range(19)),
+        {"tau": (tau, low, high)},
+        float(np.sum(ratio**2) * len(starts) / BLOCKS),
+        p,
+        0.0,
+        session.recording.time[-1],
+        note=f"the noise is {np.exp(value):.1f} times stronger at a quarter of the rate than at half of it",
+        clues={"pole": pole, "ratio": value, "least": float(ratio.min())},
+    )
+
+
+def _fresh(session):
+    """(n, 19) counts of rows that are no repetition."""
+    return session.counts[session.fit & ~session.recording.repeated & ~session.masked.all(1)]
+
+
+def _pole(ratio, bands):
+    """Of noise a[i] = pole a[i - 1] + white, whose power falls by e^ratio between the two bands."""
+
+    def fall(pole):
+        power = [
+            np.mean(1 / (1 + pole**2 - 2 * pole * np.cos(2 * np.pi * np.linspace(*band, 50))))
+            for band in bands
+        ]
+        return np.log(power[0] / power[1])
+
+    if ratio <= 0:
+        return 0.0
+    return 0.99 if ratio >= fall(0.99) else brentq(lambda a: fall(a) - ratio, 0.0, 0.99)
+
+
+# --- lines
+
+
+def humming(session: Session) -> Finding | None:
+    """A line in the spectrum above the band in which the load moves, whose phase on blocks left out is that
+    of the others."""
+    r = session.recording
+    x = session.counts[session.fit]
+    n, rate = len(x), r.rate
+    size = int(min(n // 4, 4096))
+    if size < 128:
+        return None
+    window = np.hanning(size)
+    starts = np.arange(0, n - size + 1, size // 2)
+    parts = np.stack([x[a : a + size] - x[a : a + size].mean(0) for a in starts])
+    power = np.mean(np.abs(np.fft.rfft(parts * window[:, None], axis=1)) ** 2, axis=0)  # (f, 19)
+    f = np.fft.rfftfreq(size, 1 / rate)
+    floor = np.median(power[f > 0.3 * rate], axis=0)
+    # the load's band ends where the spectrum comes down to the floor
+    from scipy.ndimage import median_filter
+
+    smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="nearest")
+    above = np.flatnonzero(np.median(smooth / floor, axis=1) > 3)
+    band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
+    low = max(1.15 * band, 8 * rate / size, 2.0)
+    inside = (f > low) & (f < 0.49 * rate)
+    if inside.sum() < 20:
+        return None
+    ratio = power / np.maximum(smooth, 1e-9)
+    together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
+    best = None
+    for who, score in [(tuple(range(19)), together * 3), *(((k,), ratio[:, k]) for k in range(19))]:
+        i = int(np.argmax(np.where(inside, score, 0)))
+        if best is None or score[i] > best[0]:
+            best = float(score[i]), float(f[i]), who
+    score, frequency, channels = best
+    if score < 4:
+        return None
+    if len(channels) == 1:
+        near = np.abs(f - frequency) < 1.5 * rate / size
+        channels = tuple(np.flatnonzero(ratio[near].max(0) > max(4.0, 0.01 * score)))
+    y = np.diff(x[:, list(channels)], axis=0)
+    t = np.arange(n) / rate
+    fine = frequency + np.linspace(-1.5, 1.5, 301) * rate / size
+    lines = [float((np.abs(np.exp(-2j * np.pi * g * t[:-1]) @ y) ** 2).sum()) for g in fine]
+    frequency = float(fine[int(np.argmax(lines))])
+    wave = np.column_stack([np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t)])
+    step = np.diff(wave, axis=0)
+    block = np.arange(len(y)) * BLOCKS // len(y)
+    gain, local = np.empty(BLOCKS), []
+    noise = np.maximum(np.median(np.abs(y), axis=0) / 0.6745, 0.5)
+    for b in range(BLOCKS):
+        rest = block != b
+        # the phase of the neighbours: a line whose frequency wanders is still one
+        near = rest & (np.abs(block - b) <= 2)
+        w, *_ = np.linalg.lstsq(step[near], np.clip(y[near], -4 * noise, 4 * noise), rcond=None)
+        local.append(w)
+        mine = np.clip(y[~rest], -4 * noise, 4 * noise) / noise
+        left = mine - step[~rest] @ w / noise
+        gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / len(channels)
+    p = sign_flip(gain)
+    amplitude = np.median([np.hypot(*w) for w in local], axis=0)
+    if p > 0.01 or np.median(gain) < 1:
+        return None
+    weights = np.zeros((BLOCKS, 2, 19))
+    weights[:, :, list(channels)] = np.array(local)
+    centre = (np.arange(BLOCKS) + 0.5) * len(y) / BLOCKS / rate
+
+    def correct(counts, at):
+        w = np.stack([[np.interp(at, centre, weights[:, i, k]) for k in range(19)] for i in range(2)])
+        phase = 2 * np.pi * frequency * at
+        return counts - np.sin(phase)[:, None] * w[0].T - np.cos(phase)[:, None] * w[1].T
+
+    width = rate / size / 4
+    return Finding(
+        "hum",
+        tuple(int(k) for k in channels),
+        {
+            "frequency": (frequency, frequency - width, frequency + width),
+            "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
+        },
+        float(gain.sum()),
+        p,
+        0.0,
+        r.time[-1],
+        note=f"a line {score:.0f} times above the spectrum around it, above the {band:.1f} Hz in which the "
+        "load moves",
+        clues={
+            "score": float(np.log(score)),
+            "amplitude": float(np.log(np.median(amplitude / (noise / np.sqrt(2))))),
+            "blocks": float(np.mean(gain > 0)),
+            "many": float(len(channels) > 12),
+        },
+        correct=correct,
+    )
+
+
+# --- correlations
+
+
+def correlated(session: Session) -> Finding | None:
+    """Noise that electrodes have in common: with neighbours (cross-talk) or with all (reference, supply)."""
+    d, _ = _differences(session, 5)
+    if len(d) < 40 * BLOCKS // 2:
+        return None
+    cells, block = _calm(d, 0.3 if session.loaded else 1.0)
+    known = np.isfinite(cells)
+    power = np.where(known, cells**2, 0).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1)
+    sd = np.sqrt(power / 252)
+    alive = np.flatnonzero(sd > _LEAST)
+    if len(alive) < 8:
+        return None
+    x = np.clip(np.nan_to_num(cells[:, :, alive]) / (sd[alive] * np.sqrt(252)), -3, 3)
+    pairs = np.triu_indices(len(alive), 1)
+    value = []
+    for b in range(BLOCKS):
+        y = x[block == b].reshape(-1, len(alive))
+        power = np.maximum((y**2).sum(0), 1e-9)
+        value.append((y.T @ y / np.sqrt(np.outer(power, power)))[pairs])
+    value = np.array(value)  # (blocks, pairs)
+    mean = value.mean(0)
+    common = float(np.median(mean))
+    best = None
+    for name, K in _neighbours().items():
+        k = K[np.ix_(alive, alive)][pairs]
+        c = k - k.mean()
+        by_block = value @ c / (c @ c)
+        share = float(
+            (mean - mean.mean()) @ c / np.sqrt((c @ c) * max(((mean - mean.mean()) ** 2).sum(), 1e-12))
+        )
+        t = by_block.mean() / max(by_block.std(ddof=1) / np.sqrt(BLOCKS), 1e-9)
+        if best is None or share > best[1]:
+            best = name, share, by_block, t
+    name, share, by_block, t = best
+    off = np.median(value, axis=1)
+    size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
+    last = session.recording.time[-1]
+    p = sign_flip(by_block)
+    coupling = float(np.median(by_block)) / 2
+    noise = 1 / np.sqrt(size)
+    if p < 0.01 and 2 * coupling > 0.03 and share > 0.3:
+        K = _neighbours()[name]
+        matrix = np.linalg.inv(np.eye(19) + coupling * K)
+        centre = np.median(session.counts[session.fit], axis=0)
+        parameters = {"kappa": (coupling, coupling - noise, coupling + noise)}
+        if name.startswith("distance"):
+            parameters["length"] = (float(name.split()[1]), _NAN, _NAN)
+        ties = ("common_noise",) if common > coupling else ()
+        return Finding(
+            "crosstalk",
+            tuple(range(19)),
+            parameters,
+            float(size * len(pairs[0]) * coupling**2),
+            p,
+            0.0,
+            last,
+            note=f"noise of neighbours ({name}) is correlated by {2 * coupling:.2f}; "
+            "a sensor's is independent",
+            ties=ties,
+            clues={"kappa": float(np.log(coupling)), "share": share, "t": float(np.log(max(t, 1.0)))},
+            correct=lambda counts, at: centre + (counts - centre) @ matrix.T,
+        )
+    p = sign_flip(off)
+    if p < 0.01 and common > 0.02:
+        return Finding(
+            "common_noise",
+            tuple(range(19)),
+            {"correlation": (common, common - noise, common + noise)},
+            float(size * len(pairs[0]) * common**2 / 2),
+            p,
+            0.0,
+            last,
+            ties=("crosstalk",) if common < 0.2 else (),
+            note=f"noise of all pairs alike is correlated by {common:.2f}",
+            clues={
+                "kappa": float(np.log(common)),
+                "share": float(common / (mean.std() + 1e-3)),
+                "t": float(np.log(max(off.mean() / max(off.std(ddof=1), 1e-9) * 4, 1.0))),
+            },
+            correct=_without_common(session),
+        )
+    return None
+
+
+def _without_common(session):
+    """Takes out of counts what all electrodes do from one row to the next beyond what the rows around say."""
+    from scipy.ndimage import uniform_filter1d
+
+    def correct(counts, at):
+        quick = counts - uniform_filter1d(counts, 5, axis=0, mode="nearest")
+        return counts - np.median(quick, axis=1)[:, None]
+
+    return correct
+
+
+def _neighbours():
+    p = electrode_positions()
+    d = np.linalg.norm(p[:, None] - p[None], axis=2)
+    out = {f"distance {length:g} mm": np.exp(-d / length) * (1 - np.eye(19)) for length in (2, 4, 6)}
+    out = {name: K / K.max() for name, K in out.items()}
+    out["order"] = (np.abs(np.subtract.outer(np.arange(19), np.arange(19))) == 1).astype(float)
+    return out
+
+
+# --- size
+
+
+def noisy(session: Session) -> list[Finding]:
+    """Electrodes whose noise is larger than the law says that the others follow."""
+    d, _ = _differences(session)
+    k = len(d) // BLOCKS
+    if k < 30 or any(f.id == "quantise" for f in session.findings):
+        return []
+    cells = np.abs(d[: k * BLOCKS].reshape(BLOCKS, k, 19))
+    cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
+    # a quarter of the samples moves least: no load in them
+    level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
+    law = electrode_noise(np.median(session.counts[session.fit], axis=0))
+    ratio = np.log(np.maximum(level, 0.3) / law)
+    ratio -= np.median(ratio, axis=1, keepdims=True)
+    own = np.median(ratio, axis=0)
+    spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
+    found = []
+    for e in np.argsort(-own)[:4]:
+        if not own[e] > max(np.log(1.6), 3 * spread) or np.median(level[:, e]) < _LEAST:
+            continue
+        excess = ratio[:, e] - np.log(1.3)
+        p = sign_flip(excess)
+        if p > 0.01:
+            continue
+        factor = float(np.exp(own[e]))
+        found.append(
+            Finding(
+                "noise",
+                (int(e),),
+                {"factor": (factor, *np.exp(np.quantile(ratio[:, e], [0.1, 0.9])))},
+                float(k * BLOCKS * own[e] ** 2),
+                p,
+                0.0,
+                session.recording.time[-1],
+                note=f"{factor:.1f} times as noisy as the other electrodes' law says",
+                clues={
+                    "factor": float(own[e]),
+                    "stands": float(own[e] / spread),
+                    "blocks": float(np.mean(excess > 0)),
+                    "counts": float(np.log(np.median(level[:, e]))),
+                },
+            )
+        )
+    return found

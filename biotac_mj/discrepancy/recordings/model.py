@@ -1,0 +1,160 @@
+"""The joint model of 19 electrodes: rest + load on few dimensions + what develops over time + noise.
+
+ln Z of all electrodes and the products of its principal components (the load's place bends what electrodes
+have to do with each other) are one Gaussian whose covariance S is taken from changes *within* cells of a
+few seconds, so that nothing slow enters it. Its inverse P says everything else: an electrode less what all
+others say of it is (P y)_k / P_kk, and a pattern p shared by all is seen at p'P y / p'P p, where the load
+disturbs it least. Of all directions the true one has the most energy in units of 1 / sqrt(p'P p)
+(Cauchy-Schwarz), which is how an effect is charged to the channel that has it and not to those that feel it
+through the others."""
+
+import numpy as np
+
+from ...sensor.channels import FULL_SCALE, log_impedance
+from ..noise import noise_level
+
+__all__ = ["Model", "slope_of"]
+
+_BIN = 0.1  # [s]: load moves by hand, below 10 Hz
+_CELLS = 48  # of the rows fitted, whose levels are compared
+_WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
+_LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
+_MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
+_DIMENSIONS = 8  # of the load at most
+
+
+def slope_of(counts: np.ndarray) -> np.ndarray:
+    """(c,) counts by which an electrode rises when ln Z falls by one, at the median of counts (n, c)."""
+    middle = np.clip(np.median(counts, axis=0), 1, FULL_SCALE - 1)
+    return middle * (1 - middle / FULL_SCALE)
+
+
+class Model:
+    """Bins of a recording and the Gaussian of the rows that are fitted. m bins, c usable electrodes.
+
+    Args:
+      counts: (n, 19); good: (n, 19) bool, samples that are measurements; fit: (n,) bool, contiguous from row
+        0; rate: [Hz]; fresh: share of the rows that are no repetition.
+
+    Attributes:
+      used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;
+      inside (m,) bool, bins fitted; slope (c,) [counts]; noise (c,) of a bin [ln Z]; dimensions of the load,
+      0 of an unloaded sensor; activity (c,) RMS change within windows [ln Z];
+      precision (c + products, same).
+    """
+
+    def __init__(self, counts: np.ndarray, good: np.ndarray, fit: np.ndarray, rate: float, fresh: float):
+        n = len(counts)
+        self.width = int(max(1, min(round(_BIN * rate), fit.sum() // 200)))
+        m = n // self.width
+        rows = fit & good.any(1)  # rows without any good sample are a fault of the log, not of a channel
+        self.used = np.flatnonzero(good[rows].mean(0) > 0.5)
+        self.rate, self.period = rate, self.width / rate
+        self.time = (np.arange(m) + 0.5) * self.period
+        self.inside = self.time < fit.sum() / rate
+        self.slope = slope_of(counts[rows][:, self.used])
+        x = log_impedance(counts[: m * self.width, self.used]).reshape(m, self.width, -1)
+        weight = good[: m * self.width, self.used].reshape(x.shape)
+        self.known = weight.mean(1) > 0.5
+        self.known |= weight.any(1) & (good[: m * self.width].any(1).reshape(m, -1).mean(1) < 0.5)[:, None]
+        x = np.where(self.known, (x * weight).sum(1) / np.maximum(weight.sum(1), 1), np.nan)
+        self.mean = np.nanmean(x[self.inside], axis=0)
+        x = x - self.mean
+        sample = noise_level(counts[rows][:, self.used])
+        self.noise = sample / self.slope / np.sqrt(max(1.0, self.width * fresh))
+        last = np.zeros(x.shape, int)  # a hole takes the bin before it, then what the others say
+        last[self.known] = np.nonzero(self.known)[0]
+        last = np.maximum.accumulate(last, axis=0)
+        first = np.argmax(self.known, axis=0)
+        last = np.where(np.arange(m)[:, None] < first, first, last)
+        self.value = np.take_along_axis(np.where(self.known, x, 0), last, axis=0)
+        self._fit()
+        if not self.known.all():
+            for _ in range(2):
+                self.value = np.where(self.known, self.value, self.value - self.alone())
+                self._fit()
+
+    def _fit(self):
+        span = int(np.clip(self.inside.sum() / 24, _WINDOW[0] / self.period, _WINDOW[1] / self.period))
+        span = max(4, span)
+        x = self.value
+        centred = x - x.mean(1, keepdims=True)
+        within = _within(x[self.inside], span, self.known[self.inside])
+        self.activity = np.sqrt((within**2).mean(0))
+        # dimensions that move by more than noise and rounding do
+        lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
+        self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
+        # a load moves electrodes by tens of counts within seconds; noise, filtered or not, does not
+        moved = np.median(np.sort(self.activity * self.slope)[-6:])
+        if not self.parted or moved < _MOVED:
+            self.dimensions = 0
+        q = self.dimensions
+        if not q:
+            self.precision, self._products = np.diag(1 / self.noise**2), np.zeros((len(x), 0))
+            return
+        axes = np.linalg.svd(centred[self.inside], full_matrices=False)[2][:q]
+        score = centred @ axes.T
+        score = score / score[self.inside].std(0)
+        # beyond what was fitted a square would only extrapolate
+        score = np.clip(score, score[self.inside].min(0), score[self.inside].max(0))
+        i, j = np.triu_indices(q)
+        self._products = score[:, i] * score[:, j]
+        self._products -= self._products[self.inside].mean(0)
+        whole = np.concatenate([x, self._products], axis=1)
+        within = _within(whole[self.inside], span, self.known[self.inside])
+        covariance = within.T @ within / len(within)
+        floor = np.concatenate([self.noise**2, 0.02 * np.ones(len(i))])
+        self.precision = np.linalg.inv(covariance + np.diag(floor))
+
+    @property
+    def parted(self) -> bool:
+        """Whether the rows fitted are long enough to tell load from drift."""
+        return bool(self.inside.sum() * self.period >= _LEAST)
+
+    @property
+    def whole(self) -> np.ndarray:
+        """(m, c + products)"""
+        return np.concatenate([self.value, self._products], axis=1)
+
+    def alone(self, value: np.ndarray | None = None) -> np.ndarray:
+        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: about its own mean.
+        value: (m, c) other levels than the model's own."""
+        c = len(self.used)
+        whole = self.whole if value is None else np.concatenate([value, self._products], axis=1)
+        return (whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
+
+    def shared(self, pattern: np.ndarray, value: np.ndarray | None = None) -> np.ndarray:
+        """(m,) amplitude of a pattern (c,); unloaded the median over electrodes, so that none decides
+        alone."""
+        value = self.value if value is None else value
+        if not self.dimensions:
+            return np.median(value / pattern, axis=1)
+        filtered = self.precision[:, : len(self.used)] @ pattern
+        whole = np.concatenate([value, self._products], axis=1)
+        return whole @ filtered / (pattern @ filtered[: len(self.used)])
+
+    def levels(self, series: np.ndarray, every: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Means (w, ...) of a series (m, ...) over cells, of the bins fitted or of all, and the cells' times
+        (w,)."""
+        size = max(1, int(self.inside.sum() // _CELLS))
+        rows = len(self.time) if every else int(self.inside.sum())
+        w = rows // size
+        cells = series[: w * size].reshape(w, size, *series.shape[1:])
+        return cells.mean(1), self.time[: w * size].reshape(w, size).mean(1)
+
+
+def _within(x, span, known):
+    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out, for
+    a step within one is a change of the sensor and not of the load, and those with holes (m, c) while enough
+    are left."""
+    k = len(x) // span
+    cells = x[: k * span].reshape(k, span, -1)
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
+    cells = (cells - basis @ (basis.T @ cells)) * np.sqrt(span / (span - 2))
+    energy = (cells / np.maximum(np.sqrt((cells**2).mean((0, 1))), 1e-12)) ** 2
+    energy = energy.mean(1).max(1)
+    keep = energy <= np.quantile(energy, 0.96)
+    whole = known[: k * span].reshape(k, -1).all(1)
+    if (keep & whole).sum() * span > 2 * x.shape[1]:
+        keep &= whole
+    return cells[keep].reshape(-1, x.shape[1])

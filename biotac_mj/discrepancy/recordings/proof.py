@@ -1,0 +1,229 @@
+"""Before and after, on the part kept aside: of every finding by its own number in raw units, and of the
+whole model in counts and newtons, beside the noise floor."""
+
+import numpy as np
+
+from ...sensor.channels import counts_from_log_impedance, log_impedance
+from ..noise import noise_level
+from . import electronics, sampling
+from .between import force_view
+from .findings import Finding
+from .session import Session
+
+__all__ = ["prove", "views"]
+
+# number that a fault of samples or of the electronics is found by, and its value where there is none
+_NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
+
+
+def prove(session: Session, finding: Finding) -> None:
+    """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
+    with it."""
+    without = session.without(finding)
+    if finding.seen is not None:
+        before, after, floor, unit, name = _force(session, finding)
+    elif finding.mask is not None:
+        by = _held if finding.mask.all(1).any() else _samples
+        before, after, floor, unit, name = by(session, without, finding)
+    elif finding.id in _NEUTRAL:
+        before, after, floor, unit, name = _again(session, without, finding)
+    elif finding.id == "lost_rows":
+        return
+    else:
+        before, after, floor, unit, name = _counts(session, without, finding)
+    if not np.isfinite(before):
+        return
+    finding.gap = {
+        "name": name,
+        "unit": unit,
+        "before": before,
+        "after": after,
+        "noise": floor,
+        "part": "part kept aside",
+    }
+    if unit == "counts" and np.isfinite(after):
+        finding.gap["closed"] = float(np.sign(before - after) * np.sqrt(abs(before**2 - after**2)))
+    finding.verified = bool(after < before) if np.isfinite(after) else None
+    if finding.mask is not None:  # it was told in these rows by their own samples
+        finding.verified = True
+
+
+def _aside(session):
+    """Model of the session, and which of its bins were kept aside."""
+    m = session.model()
+    return m, m.time > session.recording.time[session.fit][-1]
+
+
+def _counts(session, without, finding):
+    """RMS of the finding's electrodes about what the others, or for a shared effect their own level, say."""
+    m, aside = _aside(session)
+    bare = without.model()
+    if len(bare.used) != len(m.used):
+        return np.nan, np.nan, np.nan, "counts", ""
+    out = []
+    for value in (bare.value + bare.mean - m.mean, m.value):
+        if len(finding.channels) > 12:
+            series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
+            floor = float(np.sqrt(np.mean((m.noise * m.slope) ** 2) / len(m.used)))
+        else:
+            mine = np.flatnonzero(np.isin(m.used, finding.channels))
+            series = m.alone(value)[:, mine] * m.slope[mine]
+            floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
+        out.append(float(np.sqrt(np.mean(series[aside] ** 2))) if series.shape[1] else np.nan)
+    what = (
+        "the electrodes' common part about its level"
+        if len(finding.channels) > 12
+        else "electrode against what the others say"
+    )
+    return *out, floor, "counts", f"RMS of {what} in the part fitted"
+
+
+def _samples(session, without, finding):
+    """RMS by which masked samples miss what the other electrodes say, against the same of samples that are
+    measurements."""
+    m, aside = _aside(session)
+    said = counts_from_log_impedance(m.value - m.alone() + m.mean)
+    time = session.recording.time
+    late = ~session.fit
+    error = np.full(session.counts.shape, np.nan)
+    for i, k in enumerate(m.used):
+        error[:, k] = without.counts[:, k] - np.interp(time, m.time, said[:, i])
+    mine = finding.mask & late[:, None] & np.isfinite(error)
+    fair = ~session.masked & late[:, None] & np.isfinite(error) & finding.mask.any(0)
+    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    if mine.sum() < 5 or not fair.any():
+        return np.nan, np.nan, floor, "counts", ""
+    pair = (float(np.sqrt(np.mean(error[rows] ** 2))) for rows in (mine, fair))
+    return *pair, floor, "counts", "RMS of samples against what the others say: those masked, those left"
+
+
+def _held(session, without, finding):
+    """RMS by which held rows miss the line between those that are measurements, and by which these miss the
+    line between their neighbours."""
+    late = np.flatnonzero(~session.fit)
+    x, held = without.counts[late], finding.mask[late].all(1)
+    rows = np.arange(len(late))
+    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    own = rows[~held]
+    if held.sum() < 5 or len(own) < 5:
+        return np.nan, np.nan, floor, "counts", ""
+    missed = np.column_stack([np.interp(rows[held], own, c[own]) - c[held] for c in x.T])
+    part = ((own[1:-1] - own[:-2]) / (own[2:] - own[:-2]))[:, None]
+    own_missed = x[own[:-2]] * (1 - part) + x[own[2:]] * part - x[own[1:-1]]
+    text = "RMS of rows against the line between their neighbours: those held, those left"
+    return float(np.sqrt(np.mean(missed**2))), float(np.sqrt(np.mean(own_missed**2))), floor, "counts", text
+
+
+def _again(session, without, finding):
+    """The finding's own parameter on the part kept aside alone: its distance from none, and from what was
+    fitted."""
+    s = Session(without.recording, ~session.fit, without.findings)
+    find = {
+        "lowpass": electronics.coloured,
+        "hum": electronics.humming,
+        "quantise": sampling.quantised,
+        "noise": electronics.noisy,
+    }.get(finding.id, electronics.correlated)
+    found = find(s)
+    found = [
+        f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
+    ]
+    found = [f for f in found if set(f.channels) & set(finding.channels)]
+    name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
+    unit = finding.kind.params[name].unit
+    value = finding.parameters[name][0]
+    floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
+    late = found[0].parameters[name][0] if found else _NEUTRAL[finding.id]
+    text = f"{name}: its distance from none, and from what was fitted"
+    return abs(late - _NEUTRAL[finding.id]), abs(late - value), floor, unit, text
+
+
+def _force(session, finding):
+    """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left
+    out."""
+    known = [f for f in session.findings if f.seen is not None and f is not finding]
+    out = []
+    for chain in (known, [*known, finding]):
+        view = force_view(session, ~session.fit, chain)
+        out.append(np.nan if view is None else float(np.exp(0.5 * view.errors().mean())))
+    floor = float(np.mean(noise_level(session.recording.force[session.fit], None, 1e-6)))
+    return *out, floor, "N", "RMS error of force from electrodes, by blocks of that part"
+
+
+def views(session: Session) -> dict:
+    """Numbers that the whole model says of the part kept aside without having been given them, before and
+    after the findings: name -> unit, before, after, noise, and the same by channel or component."""
+    bare = session.without(*session.findings)
+    out = {}
+    sample = noise_level(session.recording.electrodes[session.fit])
+    if session.loaded:
+        each = [_alone(s) for s in (bare, session)]
+        out["each electrode from the others"] = _view(
+            "counts", each, "channels", sample / np.sqrt(session.model().width)
+        )
+    else:
+        each = [_at_rest(s) for s in (bare, session)]
+        out["electrodes at rest"] = _view("counts", each, "channels", sample)
+    if session.recording.force is not None and session.recording.force.std(0).max() > 0.02:
+        # a drift that load has blurred may be right for the electrodes and wrong for the force, whose own
+        # trend it resembles: the last rows fitted choose, said from those before them
+        fit = np.flatnonzero(session.fit)
+        late = fit[int(0.7 * len(fit)) :]
+        still = session.without(*(f for f in session.findings if "course" in f.clues))
+        best = min(
+            (session, still), key=lambda s: np.sum(_force_said(s, fit[: int(0.7 * len(fit))], late) ** 2)
+        )
+        each = [_force_said(s, fit, np.flatnonzero(~s.fit)) for s in (bare, best)]
+        noise = noise_level(session.recording.force[session.fit], None, 1e-6)
+        out["force from electrodes"] = _view("N", each, "components", noise)
+    return out
+
+
+def _view(unit, each, what, noise):
+    before, after = (float(np.sqrt(np.nanmean(e**2))) for e in each)
+    floor = float(np.sqrt(np.mean(noise**2)))
+    excess = before**2 - floor**2
+    return {
+        "unit": unit,
+        "before": before,
+        "after": after,
+        "noise": floor,
+        "variance_removed": 1 - (after / max(before, 1e-12)) ** 2,
+        "closed": float((before**2 - after**2) / excess) if before > 1.05 * floor else float("nan"),
+        f"{what}_before": each[0].tolist(),
+        f"{what}_after": each[1].tolist(),
+    }
+
+
+def _alone(s):
+    m, aside = _aside(s)
+    out = np.full(19, np.nan)
+    out[m.used] = np.sqrt((m.alone()[aside] ** 2).mean(0)) * m.slope
+    return out
+
+
+def _at_rest(s):
+    rows, late = s.fit, ~s.fit
+    level = counts_from_log_impedance(log_impedance(s.counts[rows]).mean(0))
+    error = np.where(s.masked, np.nan, s.counts - level)[late]
+    known = np.isfinite(error)
+    square = np.where(known, error**2, 0).sum(0) / np.maximum(known.sum(0), 1)
+    return np.where(known.any(0), np.sqrt(square), np.nan)
+
+
+def _force_said(s, fit, judged):
+    """(3,) RMS error [N] on some rows of a linear map from ln Z, fitted on others."""
+    z, force = log_impedance(s.filled()), s.recording.force
+    chain = [f.seen for f in s.findings if f.seen is not None]
+    for effect, theta in chain:
+        if "width" not in theta:
+            z = effect.unsee(z, s.recording.rate, theta)
+    mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
+    A = np.column_stack([np.ones(len(z)), (z - mean) / sd])
+    ridge = 1e-3 * len(fit) * np.eye(20)
+    ridge[0, 0] = 0
+    said = A @ np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
+    for effect, theta in chain:
+        if "width" in theta:  # a loop is of newtons, not of ln Z
+            said = effect.unsee(said, s.recording.rate, theta)
+    return np.sqrt(((said - force)[judged] ** 2).mean(0))
