@@ -29,6 +29,7 @@ LAYERS = {
     "tasks": "coupling plugin sensor geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments data sensor geometry fields files reading",
+    "matching": "skin sensor geometry learning.recording",
     "discrepancy": "effects data skin sensor geometry fields files reading",
     "biotac_mj": "plugin",
 }

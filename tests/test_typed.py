@@ -21,6 +21,7 @@ TYPED = (
     "sensor",
     "discrepancy",
     "skin",
+    "matching",
 )
 
 
