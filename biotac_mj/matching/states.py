@@ -17,7 +17,7 @@ from ..skin.cache import kept
 
 __all__ = ["PlateGrid", "PlateStates", "plate_states"]
 
-_STRIDE = 1.4e-4  # [m] of a step towards the core
+_STRIDE = 1.6e-4  # [m] of a step towards the core
 _DEEPEST = 4.5e-3  # [m] from the first touch: beyond skin and gap
 _LOST = 3  # steps without a balance after which a way ends
 
@@ -34,8 +34,8 @@ class PlateGrid:
       load: normal force over Young's modulus, rising [m^2].
     """
 
-    pitch: tuple = tuple(np.radians([-2, 3, 7, 11, 16, 23, 32]).tolist())
-    roll: tuple = tuple(np.radians([0, 12, 24, 38]).tolist())
+    pitch: tuple = tuple(np.radians([0, 5, 9, 14, 20, 30]).tolist())
+    roll: tuple = tuple(np.radians([0, 13, 26, 40]).tolist())
     drag: tuple = (0.7, 1.4)
     load: tuple = tuple((np.geomspace(0.25, 24, 12) / 1.55e6).tolist())
 
@@ -98,7 +98,8 @@ def plate_states(
     grid: PlateGrid | None = None,
     quiet: bool = False,
 ) -> PlateStates:
-    """The table of a skin, kept on disk pitch by pitch: stopped, it goes on where it was.
+    """The table of a skin, kept on disk pitch by pitch: stopped, it goes on where it was. Skins that differ
+    in Young's modulus alone share it.
 
     Raises:
       ValueError: a material that depends on time: states of a plate are those of rest.
@@ -106,6 +107,8 @@ def plate_states(
     grid, options = grid or PlateGrid(), options or SkinOptions()
     if material.remembers:
         raise ValueError("a table of states knows no time: leave prony, mullins and hysteresis out")
+    if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not go with E alone
+        material = dataclasses.replace(material, youngs_modulus=Material().youngs_modulus)
     node = np.unique(geometry.inner_face)
     model = SkinModel(geometry, material, options)
     ways = np.array([(roll, *way) for roll in grid.roll for way in grid.ways])
