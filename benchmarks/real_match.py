@@ -11,6 +11,7 @@ state, electrodes that the state has not seen, and the force from the electrodes
 import argparse
 import json
 import pathlib
+import sys
 import time
 
 from biotac_mj.geometry.skins import load_skin
@@ -18,17 +19,18 @@ from biotac_mj.learning.recording import load_recording
 from biotac_mj.matching.fit import Setup
 from biotac_mj.matching.match import log_changes, match, rows_of
 from biotac_mj.matching.response import Response
-from biotac_mj.matching.states import PlateGrid, plate_states
-from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import SkinOptions
+from biotac_mj.matching.states import plate_states
+from biotac_mj.sensor.film import CALIBRATED_RADIUS, FilmConduction
 from biotac_mj.skin.settings import read_material
 
 
-def table(skin: str = "coarse", material: str | None = None, options=None, grid=None) -> Response:
-    """What the simulated sensor says in the states of a plate."""
+def table(skin: str = "coarse", material: str | None = None, radius: float = CALIBRATED_RADIUS) -> Response:
+    """What the simulated sensor says in the states of a plate, with electrodes of a radius [m]."""
     geometry = load_skin(skin)
-    states = plate_states(geometry, read_material(material), options or SkinOptions(), grid or PlateGrid())
-    return Response(states, log_changes(states, FilmConduction(geometry, sensor=None)))
+    states = plate_states(geometry, read_material(material))
+    return Response(
+        states, log_changes(states, FilmConduction(geometry, electrode_radius=radius, sensor=None))
+    )
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -38,13 +40,17 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the scores go")
     parser.add_argument("--skin", default="coarse", help="skin of the table of states")
     parser.add_argument("--material", help="preset, .json file or JSON of the rubber")
+    parser.add_argument("--radius", type=float, default=CALIBRATED_RADIUS, help="of the electrodes [m]")
     parser.add_argument("--every", type=int, default=10, help="of the loaded rows one is taken")
     given = parser.parse_args(argv)
-    rows = rows_of(load_recording(given.electrodes, given.force), given.every)
     begin = time.perf_counter()
-    response = table(given.skin, given.material)
+    try:
+        rows = rows_of(load_recording(given.electrodes, given.force), given.every)
+        response = table(given.skin, given.material, given.radius)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"real_match: {error}")
     found = match(response, rows)[0]
-    found["gains_one"] = match(response, rows, Setup(gains=0.0))[0]
+    found["gains_one"] = match(response, rows, Setup(gains=0.0), alone=False)[0]
     found["seconds"] = time.perf_counter() - begin
     given.json.write_text(json.dumps(found, indent=1))
     print(report(found))

@@ -110,9 +110,9 @@ def measures(counts: np.ndarray, rest: np.ndarray, pressing: np.ndarray) -> dict
         "RMS change at 4-6 N [counts]": _rms(change[firm]),
         "largest change [counts]": float(np.abs(change).max()),
         "lowest count": float(counts.min()),
-        "mean change of ln Z at 4-6 N": float(log_z[firm].mean()),
-        "share with more counts than at rest, 2-4 N": float((change[light] > 0).mean()),
-        "E7 to E9 at 4-6 N [counts]": float(change[firm][:, _TIP].mean()),
+        "mean change of ln Z at 4-6 N": _mean(log_z[firm]),
+        "share with more counts than at rest, 2-4 N": _mean(change[light] > 0),
+        "E7 to E9 at 4-6 N [counts]": _mean(change[firm][:, _TIP]),
         "participation dimension": float(power.sum() ** 2 / (power * power).sum()),
         "left after 8 principal components [counts]": _rms(rest8),
         **_correlations(log_z),
@@ -129,8 +129,12 @@ def _correlations(log_z):
     }
 
 
+def _mean(x):
+    return float(np.mean(x)) if x.size else float("nan")
+
+
 def _rms(x):
-    return float(np.sqrt(np.mean(np.square(x)))) if x.size else float("nan")
+    return float(np.sqrt(_mean(np.square(x))))
 
 
 def build(data: pathlib.Path, skin: str, every: int) -> list[dict]:
@@ -177,7 +181,8 @@ def build(data: pathlib.Path, skin: str, every: int) -> list[dict]:
         real = measures(taken.counts, rest, taken.force[:, 2])
         mine = measures(np.clip(np.round(found.counts + noise), 0, 4095), rest, taken.force[:, 2])
         for key in real:
-            add(key, name, real[key], mine[key])
+            if np.isfinite(real[key]):  # else no row has such a force
+                add(key, name, real[key], mine[key])
     for row in rows.values():
         real = row["real"]
         apart = max(real.values()) - min(real.values()) if len(real) > 1 else _ALONE * abs(min(real.values()))

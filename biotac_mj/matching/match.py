@@ -11,7 +11,7 @@ from .fit import Constants, Rows, Setup, fit_constants, fit_states
 from .response import Response
 from .states import PlateStates
 
-__all__ = ["Scores", "log_changes", "match", "rows_of"]
+__all__ = ["SIGNS", "Scores", "log_changes", "match", "rows_of"]
 
 _LOADED = 0.5  # [N] of force from which a row counts as loaded
 _SHARE = 0.7  # of the rows, in time, that constants are fitted on
@@ -83,8 +83,13 @@ def rows_of(recording: Recording, every: int = 10) -> Rows:
 SIGNS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def match(response: Response, rows: Rows, setup: Setup | None = None) -> tuple[dict, Constants]:
+def match(
+    response: Response, rows: Rows, setup: Setup | None = None, alone: bool = True
+) -> tuple[dict, Constants]:
     """Fits constants to the first 70 % of rows and judges states of the last 30 %.
+
+    Args:
+      alone: whether the force is sought from the electrodes alone, too.
 
     Returns:
       What `benchmarks/real_match.py` writes, and the constants.
@@ -110,12 +115,13 @@ def match(response: Response, rows: Rows, setup: Setup | None = None) -> tuple[d
         ),
         "electrode_rms_counts": np.sqrt(((found.counts - last.counts) ** 2).mean(0)).round(1).tolist(),
         "shear_rms_N": np.sqrt(((found.force - last.force[:, :2]) ** 2).mean(0)).round(3).tolist(),
-        "force_alone_N": force_alone(response, last, const, setup),
         "modulus_Pa": const.modulus,
         "gains": const.gain.round(3).tolist(),
         "rest_counts": counts_from_log_impedance(const.offset).round(0).tolist(),
         "drift": {"size_ln_Z": const.drift[0], "tau_share_of_recording": float(np.exp(const.drift[1]))},
     }
+    if alone:
+        out["force_alone_N"] = force_alone(response, last, const, setup)
     return out, const
 
 
