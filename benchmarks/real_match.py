@@ -24,13 +24,11 @@ from biotac_mj.sensor.film import CALIBRATED_RADIUS, FilmConduction
 from biotac_mj.skin.settings import read_material
 
 
-def table(skin: str = "coarse", material: str | None = None, radius: float = CALIBRATED_RADIUS) -> Response:
-    """What the simulated sensor says in the states of a plate, with electrodes of a radius [m]."""
+def table(skin: str, material: str | None, film: dict) -> Response:
+    """What the simulated sensor says in the states of a plate; film: settings of FilmConduction."""
     geometry = load_skin(skin)
     states = plate_states(geometry, read_material(material))
-    return Response(
-        states, log_changes(states, FilmConduction(geometry, electrode_radius=radius, sensor=None))
-    )
+    return Response(states, log_changes(states, FilmConduction(geometry, sensor=None, **film)))
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -46,7 +44,7 @@ def main(argv: list[str] | None = None) -> None:
     begin = time.perf_counter()
     try:
         rows = rows_of(load_recording(given.electrodes, given.force), given.every)
-        response = table(given.skin, given.material, given.radius)
+        response = table(given.skin, given.material, {"electrode_radius": given.radius})
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"real_match: {error}")
     found = match(response, rows)[0]

@@ -5,8 +5,8 @@ python benchmarks/real_table.py --data DIR --json OUT --figure OUT.png
 Under DIR, packed (.gz) or not, in folders of any depth: `ForceData.txt` with a pressed sensor's
 `SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold an
 object, `*.btd` of a resting sensor. The simulated sensor is the default one on `--skin` under a flat plate;
-pressed rows have the state that `matching` finds for them with all gains 1 and the default rubber's modulus,
-so that both columns are of the same presses. A row is inside where no simulated value is further from the
+pressed rows have the state that `matching` finds for them with all gains 1 and the rubber's own modulus, so
+that both columns are of the same presses. A row is inside where no simulated value is further from the
 real one of the same recording than the real ones are from each other (of a single one: than 10 %)."""
 
 import argparse
@@ -36,6 +36,7 @@ from biotac_mj.sensor.channels import (
     log_impedance,
     pac_from_counts,
 )
+from biotac_mj.sensor.film import CALIBRATED_RADIUS
 from biotac_mj.skin.rubber.material import PRESETS
 
 _SMOOTH = 51  # rows over which slow changes are taken out of noise, half a second
@@ -137,7 +138,7 @@ def _rms(x):
     return float(np.sqrt(_mean(np.square(x))))
 
 
-def build(data: pathlib.Path, skin: str, every: int) -> list[dict]:
+def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[dict]:
     """Rows of the table: name, real and simulated values by recording, whether these are inside."""
     rows = {}
 
@@ -171,10 +172,11 @@ def build(data: pathlib.Path, skin: str, every: int) -> list[dict]:
         n = max(len(warm) // 50, 1)
         add("warm-up of an unloaded sensor, ln Z", name, float((warm[-n:] - warm[:n]).mean()), 0.0)
     if pressed:
-        response = table(skin)
+        material = "calibrated" if calibrated else "default"
+        response = table(skin, material, {"electrode_radius": CALIBRATED_RADIUS} if calibrated else {})
+        modulus = PRESETS[material].youngs_modulus
     for name, recording in pressed.items():
         taken = rows_of(recording, every)
-        modulus = PRESETS["default"].youngs_modulus
         const, found = fit_constants(response, taken, Setup(gains=0.0, modulus=modulus, hold_modulus=True))
         rest = counts_from_log_impedance(const.offset + const.drifted(taken.time)[:, None])
         noise = np.random.default_rng(0).normal(0, electrode_noise(found.counts))
@@ -243,8 +245,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--figure", type=pathlib.Path)
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--every", type=int, default=20, help="of the loaded rows one is taken")
+    parser.add_argument("--calibrated", action="store_true", help="rubber and electrodes that were fitted")
     given = parser.parse_args(argv)
-    rows = build(given.data, given.skin, given.every) if given.data.is_dir() else []
+    rows = build(given.data, given.skin, given.every, given.calibrated) if given.data.is_dir() else []
     if not rows:
         parser.error(
             f"{given.data} has no recordings: ForceData.txt with SynImp*.txt, *_HOLD.mat "
