@@ -121,13 +121,15 @@ def match(
         "drift": {"size_ln_Z": const.drift[0], "tau_share_of_recording": float(np.exp(const.drift[1]))},
     }
     if alone:
-        out["force_alone_N"] = force_alone(response, last, const, setup)
+        out["force_alone_N"] = _force_alone(response, first, fitted, last, const, setup)
     return out, const
 
 
-def force_alone(response: Response, rows: Rows, const: Constants, setup: Setup) -> dict:
-    """RMSE [N] along, across, pressing, of the force that the electrodes alone suggest: the best of several
-    loads, a parabola through the best three; and the force's standard deviation."""
+def _force_alone(response, first, fitted, rows, const, setup):
+    """RMSE [N] along, across, pressing, of the force that the electrodes alone suggest, and its spread.
+
+    The best of several loads, a parabola through the best three. A load is as likely as the first rows' are,
+    and electrodes err by what the first rows are off."""
     blind = dataclasses.replace(setup, shear=0.0)
     top = rows.force[:, 2].max()
     loads = np.geomspace(top / 10, top * 1.2, _TRIED)
@@ -136,7 +138,9 @@ def force_alone(response: Response, rows: Rows, const: Constants, setup: Setup) 
         force = np.concatenate([rows.force[:, :2], np.full((len(rows), 1), load)], 1)
         fits.append(fit_states(response, Rows(rows.counts, force, rows.time), const, blind, also=also))
         also = fits[-1].state
-    cost = np.array([f.cost for f in fits])
+    sigma = _rms(fitted.counts - first.counts)
+    usual = (loads - first.force[:, 2].mean()) / first.force[:, 2].std()
+    cost = np.array([f.cost for f in fits]) / sigma**2 + (usual * usual)[:, None]
     k = np.clip(cost.argmin(0), 1, _TRIED - 2)
     row = np.arange(len(rows))
     before, here, after = (cost[k + i, row] for i in (-1, 0, 1))

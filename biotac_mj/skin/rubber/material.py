@@ -146,8 +146,8 @@ class Material:
 # elements that do not lock: nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is
 # squeezed on the core; "rubber": nu 0.45, as the reference solutions). "paper" keeps to linear tetrahedra:
 # the stiffness of its mesh is in the fitted modulus.
-# "calibrated": E with the liquid, FITTED to two real sensors pressed on a plate, 0.6 to 1.4 MPa by sensor and by
-# what else is fitted (docs/real_match.md); nu 0.45, Neo-Hookean, fits them no better than this law.
+# "calibrated": E with the liquid, FITTED to two real sensors pressed on a plate, 0.6 to 1.4 MPa by sensor and
+# by what else is fitted (docs/real_match.md); Neo-Hookean with nu 0.45 fits them no better than this law.
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False, element="linear"),
