@@ -131,7 +131,7 @@ def _force_alone(response, first, fitted, rows, const, setup):
     The best of several loads, a parabola through the best three. A load is as likely as the first rows' are,
     and electrodes err by what the first rows are off."""
     blind = dataclasses.replace(setup, shear=0.0)
-    top = rows.force[:, 2].max()
+    top = first.force[:, 2].max()
     loads = np.geomspace(top / 10, top * 1.2, _TRIED)
     fits, also = [], None
     for load in loads:
