@@ -18,7 +18,7 @@ INDENTERS = (
     "cube_14mm ring_7mm"
 ).split()
 TIERS = ("full", "condensed")
-MATERIALS = ("default", "paper", "rubber", "ansys")
+MATERIALS = ("default", "paper", "rubber", "ansys", "calibrated")
 SKINS = ("coarse", "default", "fine")
 PEGS = "peg_round_4mm peg_round_8mm peg_square_5mm peg_square_10mm peg_hexagon_8mm peg_triangle_8mm".split()
 OBJECTS = (*INDENTERS, *PEGS, "table_surface", "table_edge", "table_corner")

@@ -32,6 +32,7 @@ LAYERS = {
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading",
     "discrepancy": "effects recordings data skin sensor geometry fields files reading",
+    "matching": "skin sensor geometry recordings",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

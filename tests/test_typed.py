@@ -22,6 +22,7 @@ TYPED = (
     "sensor",
     "discrepancy",
     "skin",
+    "matching",
 )
 
 

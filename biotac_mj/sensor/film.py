@@ -35,6 +35,7 @@ from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
 
 __all__ = [
+    "CALIBRATED_RADIUS",
     "CONDUCTIVITY",
     "EXCITATION",
     "BatchFilm",
@@ -50,6 +51,9 @@ EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 
 # [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at
 # 25 C
 CONDUCTIVITY = 0.367
+# [m] of all electrodes, FITTED to two real sensors pressed on a plate (docs/real_match.md): 0.8 and 1.1 mm
+# leave less than 0.5 mm on rows kept aside. Not the default: X1..X4 and learned weights belong to that
+CALIBRATED_RADIUS = 0.9e-3
 # [m], published cylinder about the x axis; only says where to look for the core's surface
 _CORE_RADIUS = 5.325e-3
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges

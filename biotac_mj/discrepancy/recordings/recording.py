@@ -7,8 +7,8 @@ import pathlib
 
 import numpy as np
 
-from ...data.columns import read_columns
-from ...sensor.channels import CHANNELS, REST_COUNTS, check_counts, check_force, log_impedance
+from ...recordings import load_one
+from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "Recording", "read_recording"]
 
@@ -116,35 +116,16 @@ def read_recording(
     tdc: pathlib.Path | str | None = None,
     rate: float | None = None,
 ) -> Recording:
-    """Reads text files of numbers (`data.columns`).
+    """Reads a recording of any kind that `biotac import` knows.
 
     Args:
-      electrodes: path, 19 columns of raw counts.
-      force: path, 3 columns [N]; tdc: path, 1 column of raw counts; rate: rows per second [Hz], None guesses
-        (see Recording).
+      electrodes: path of it, or of text with 19 columns of counts.
+      force, tdc: paths of text beside it, 3 columns [N] and 1 of raw counts. rate: rows per second [Hz], None
+        takes the file's, or guesses (see Recording).
 
     Raises:
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
-    table = read_columns(electrodes, CHANNELS[:19])
-    push = None if force is None else read_columns(force, ("Fx", "Fy", "Fz"))
-    temperature = None if tdc is None else read_columns(tdc, ("tdc",))[:, 0]
-    for name, path, value in (("--force", force, push), ("--tdc", tdc, temperature)):
-        if value is not None and len(value) != len(table):
-            raise ValueError(
-                f"{name} {path} has {len(value)} rows and --electrodes {electrodes} has {len(table)}: they "
-                "must be logged row by row "
-                "together; cut both to the time they share (a clock gap cannot be guessed)"
-            )
-    return Recording(table, push, temperature, rate, "given" if rate else "", pathlib.Path(electrodes).name)
-
-
-def _check_numbers(value, label):
-    bad = np.argwhere(~np.isfinite(value))
-    if len(bad):
-        row, column = bad[0]
-        raise ValueError(
-            f"{label}: {len(bad)} values are not finite, the first in row {row + 1}, column {column + 1}: a "
-            "gap cannot be guessed; "
-            "cut the recording there or log it again"
-        )
+    found, _ = load_one(electrodes, force=force, tdc=tdc, rate=rate)
+    counts, _ = found.counts()
+    return Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)

@@ -1,0 +1,268 @@
+"""The table 'real against simulated': every row of recordings and of the simulated sensor as it is now.
+
+python benchmarks/real_table.py --data DIR --json OUT --figure OUT.png
+
+Under DIR, packed (.gz) or not, in folders of any depth: `ForceData.txt` with a pressed sensor's
+`SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold an
+object, `*.btd` of a resting sensor. The simulated sensor is the default one on `--skin` under a flat plate;
+pressed rows have the state that `matching` finds for them with all gains 1 and the rubber's own modulus, so
+that both columns are of the same presses. A row is inside where no simulated value is further from the
+real one of the same recording than the real ones are from each other (of a single one: than 10 %)."""
+
+import argparse
+import gzip
+import json
+import pathlib
+import tempfile
+
+import numpy as np
+import scipy.io
+from real_match import table
+from vibration import floor
+
+from biotac_mj.geometry.electrodes import electrode_positions
+from biotac_mj.recordings import load_one
+from biotac_mj.matching.fit import Setup, fit_constants
+from biotac_mj.matching.match import rows_of
+from biotac_mj.sensor.channels import (
+    OTHER_NOISE,
+    PAC_COLOUR,
+    PAC_NOISE,
+    REST_TEMPERATURE,
+    counts_from_log_impedance,
+    counts_from_pac,
+    counts_from_temperature,
+    electrode_noise,
+    log_impedance,
+    pac_from_counts,
+)
+from biotac_mj.sensor.film import CALIBRATED_RADIUS
+from biotac_mj.skin.rubber.material import PRESETS
+
+_SMOOTH = 51  # rows over which slow changes are taken out of noise, half a second
+_ALONE = 0.1  # of the value, by which a single recording's row may be off
+_TIP = [6, 7, 8]
+_NEAR, _FAR = 5e-3, 12e-3  # [m] between electrodes that are near and far
+
+
+def _text(path, folder):
+    """The path of a text file, unpacked into a folder where it is packed."""
+    if path.suffix != ".gz":
+        return path
+    out = pathlib.Path(folder) / (path.parent.name + "_" + path.stem)
+    out.write_bytes(gzip.decompress(path.read_bytes()))
+    return out
+
+
+def presses(data: pathlib.Path, folder: str) -> tuple[dict, dict]:
+    """{name: Recording} of pressed sensors with their force, and of unloaded neighbours without."""
+    pressed, free = {}, {}
+    for force in sorted(data.rglob("ForceData.txt*")):
+        own, *others = sorted(force.parent.glob("SynImp*.txt*"))
+        pressed[force.parent.name] = load_one(_text(own, folder), force=_text(force, folder))[0]
+        for other in others:
+            free[f"{force.parent.name}/{other.name.split('.')[0]}"] = load_one(_text(other, folder))[0]
+    return pressed, free
+
+
+def _noise(series):
+    """Standard deviation (k,) of what changes between rows of (n, k) but for what is slow."""
+    kernel = np.ones(_SMOOTH) / _SMOOTH
+    fast = series - np.apply_along_axis(lambda c: np.convolve(c, kernel, "same"), 0, series)
+    return fast[_SMOOTH:-_SMOOTH].std(0)
+
+
+def _lag(series):
+    series = series - series.mean()
+    return float((series[1:] * series[:-1]).mean() / (series * series).mean())
+
+
+def holds(data: pathlib.Path) -> dict:
+    """{finger: rows of that finger's holds}."""
+    found = {}
+    for path in sorted(data.rglob("*_HOLD.mat")):
+        file = scipy.io.loadmat(path)
+        for finger in ("F0", "F1"):
+            electrodes = file[finger + "Electrodes"].astype(float).T
+            pac = file[finger + "pac"].astype(float)[:, -400:]  # the end of the hold
+            pdc = file[finger + "pdc"].ravel().astype(float)
+            part = found.setdefault(
+                finger, {"tdc": [], "electrodes": [], "pdc": [], "pac": [], "lag": [], "top": []}
+            )
+            part["tdc"].append(file[finger + "tdc"].ravel()[:20].mean())
+            part["electrodes"].append(np.median(_noise(electrodes)))
+            part["pdc"].append(float(_noise(pdc[:, None])[0]))
+            part["pac"].append(pac.std())
+            part["lag"].append(_lag(pac.T.ravel()))
+            part["top"].append(np.ptp(pdc))
+    return {f: {k: float(np.median(v)) for k, v in part.items()} for f, part in found.items()}
+
+
+def measures(counts: np.ndarray, rest: np.ndarray, pressing: np.ndarray) -> dict:
+    """What the table says of pressed rows: counts (n, 19), at rest (n, 19), force (n,) [N]."""
+    change, log_z = counts - rest, log_impedance(counts) - log_impedance(rest)
+    light, firm = (pressing > 2) & (pressing < 4), (pressing > 4) & (pressing < 6)
+    centred = log_z - log_z.mean(0)
+    power = np.linalg.svd(centred, compute_uv=False) ** 2
+    u, s, v = np.linalg.svd(change - change.mean(0), full_matrices=False)
+    rest8 = u[:, 8:] * s[8:] @ v[8:]
+    return {
+        "RMS change at 2-4 N [counts]": _rms(change[light]),
+        "RMS change at 4-6 N [counts]": _rms(change[firm]),
+        "largest change [counts]": float(np.abs(change).max()),
+        "lowest count": float(counts.min()),
+        "mean change of ln Z at 4-6 N": _mean(log_z[firm]),
+        "share with more counts than at rest, 2-4 N": _mean(change[light] > 0),
+        "E7 to E9 at 4-6 N [counts]": _mean(change[firm][:, _TIP]),
+        "participation dimension": float(power.sum() ** 2 / (power * power).sum()),
+        "left after 8 principal components [counts]": _rms(rest8),
+        **_correlations(log_z),
+    }
+
+
+def _correlations(log_z):
+    place = electrode_positions() * 1e-3
+    apart = np.linalg.norm(place[:, None] - place, axis=-1)
+    pair = np.corrcoef(log_z.T)
+    return {
+        "correlation of near electrodes": float(pair[(apart > 0) & (apart < _NEAR)].mean()),
+        "correlation of far electrodes": float(pair[apart > _FAR].mean()),
+    }
+
+
+def _mean(x):
+    return float(np.mean(x)) if x.size else float("nan")
+
+
+def _rms(x):
+    return float(np.sqrt(_mean(np.square(x))))
+
+
+def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[dict]:
+    """Rows of the table: name, real and simulated values by recording, whether these are inside."""
+    rows = {}
+
+    def add(name, where, real, simulated):
+        row = rows.setdefault(name, {"name": name, "real": {}, "simulated": {}})
+        row["real"][where] = real
+        if simulated is not None:
+            row["simulated"][where] = simulated
+
+    for finger, part in holds(data).items():
+        add("TDC at rest [counts]", finger, part["tdc"], float(counts_from_temperature(REST_TEMPERATURE)))
+        level = float(np.median(electrode_noise(np.full(1, 3000.0))))
+        add("noise of an electrode [counts]", finger, part["electrodes"], level)
+        add("noise of PDC [counts]", finger, part["pdc"], OTHER_NOISE)
+        add("PAC in a hold, std [counts]", finger, part["pac"], PAC_NOISE / np.sqrt(1 - PAC_COLOUR**2))
+        add("PAC in a hold, lag-1 correlation", finger, part["lag"], PAC_COLOUR)
+    for path in sorted(data.rglob("*.btd*")):
+        mine = pac_from_counts(PAC_NOISE / np.sqrt(1 - PAC_COLOUR**2) + counts_from_pac(0.0))
+        add("PAC at rest [Pa RMS]", path.name, floor(path)["floor_rms_pa"], float(mine))
+    with tempfile.TemporaryDirectory() as folder:
+        pressed, free = presses(data, folder)
+    for name, recording in free.items():
+        noise = float(np.median(_noise(recording.counts()[0])))
+        add(
+            "noise of an electrode [counts]",
+            name,
+            noise,
+            float(np.median(electrode_noise(recording.counts()[0].mean(0)))),
+        )
+        warm = log_impedance(recording.counts()[0])
+        n = max(len(warm) // 50, 1)
+        add("warm-up of an unloaded sensor, ln Z", name, float((warm[-n:] - warm[:n]).mean()), 0.0)
+    if pressed:
+        material = "calibrated" if calibrated else "default"
+        response = table(skin, material, {"electrode_radius": CALIBRATED_RADIUS} if calibrated else {})
+        modulus = PRESETS[material].youngs_modulus
+    for name, recording in pressed.items():
+        taken = rows_of(recording.counts()[0], recording.force, every)
+        const, found = fit_constants(response, taken, Setup(gains=0.0, modulus=modulus, hold_modulus=True))
+        rest = counts_from_log_impedance(const.offset + const.drifted(taken.time)[:, None])
+        noise = np.random.default_rng(0).normal(0, electrode_noise(found.counts))
+        real = measures(taken.counts, rest, taken.force[:, 2])
+        mine = measures(np.clip(np.round(found.counts + noise), 0, 4095), rest, taken.force[:, 2])
+        for key in real:
+            if np.isfinite(real[key]):  # else no row has such a force
+                add(key, name, real[key], mine[key])
+    for row in rows.values():
+        real = row["real"]
+        apart = max(real.values()) - min(real.values()) if len(real) > 1 else _ALONE * abs(min(real.values()))
+        row["inside"] = all(abs(v - real[k]) <= apart for k, v in row["simulated"].items())
+    return list(rows.values())
+
+
+def draw(path: pathlib.Path, rows: list[dict]) -> None:
+    """Every row as ratios to the mean real size: real values as dots, simulated ones as crosses."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(11, 0.36 * len(rows) + 1.2))
+    for k, row in enumerate(rows):
+        real, mine = (np.array(list(row[key].values())) for key in ("real", "simulated"))
+        scale = np.abs(real).mean() or 1.0
+        axes.plot(
+            [real.min() / scale, real.max() / scale],
+            [k, k],
+            color="0.8",
+            lw=8,
+            solid_capstyle="butt",
+            zorder=0,
+        )
+        axes.plot(real / scale, np.full(len(real), k), "o", color="C0", label="real" if k == 0 else None)
+        axes.plot(
+            mine / scale, np.full(len(mine), k), "x", color="C3", mew=2, label="simulated" if k == 0 else None
+        )
+        spread = [
+            f"{v.min():.4g}" if np.ptp(v) == 0 else f"{v.min():.4g} .. {v.max():.4g}" for v in (real, mine)
+        ]
+        axes.text(
+            1.01,
+            k,
+            f"{spread[0]}   |   {spread[1]}",
+            transform=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=8,
+        )
+    axes.set_yticks(range(len(rows)), [("" if r["inside"] else "* ") + r["name"] for r in rows], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel(
+        "value over the mean size of the real ones; right: real | simulated; * outside the real spread"
+    )
+    axes.legend(loc="upper left", fontsize=8)
+    axes.grid(axis="x", color="0.9")
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with the recordings")
+    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--figure", type=pathlib.Path)
+    parser.add_argument("--skin", default="coarse")
+    parser.add_argument("--every", type=int, default=20, help="of the loaded rows one is taken")
+    parser.add_argument("--calibrated", action="store_true", help="rubber and electrodes that were fitted")
+    given = parser.parse_args(argv)
+    rows = build(given.data, given.skin, given.every, given.calibrated) if given.data.is_dir() else []
+    if not rows:
+        parser.error(
+            f"{given.data} has no recordings: ForceData.txt with SynImp*.txt, *_HOLD.mat "
+            "or *.btd are looked for"
+        )
+    given.json.write_text(json.dumps({"rows": rows, "inside": sum(r["inside"] for r in rows)}, indent=1))
+    for row in rows:
+        real, mine = ([f"{v:.4g}" for v in row[key].values()] for key in ("real", "simulated"))
+        print(
+            f"{row['name']:46s} {', '.join(real):34s} | {', '.join(mine):34s} "
+            f"{'' if row['inside'] else 'outside'}"
+        )
+    if given.figure:
+        draw(given.figure, rows)
+
+
+if __name__ == "__main__":
+    main()

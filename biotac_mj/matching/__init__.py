@@ -1,0 +1,1 @@
+"""A recording of a flat press against simulated states of the sensor."""

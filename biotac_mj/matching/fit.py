@@ -1,0 +1,336 @@
+"""Fits one state of the skin to every row of a recording, one set of constants of the sensor to all rows."""
+
+import dataclasses
+
+import numpy as np
+
+from ..sensor.channels import FULL_SCALE, REST_COUNTS, counts_from_log_impedance, log_impedance
+from .response import Loaded, Response
+
+__all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
+
+_COUNTS = 20.0  # [counts] of an electrode that weigh as much as one sigma of a force or a prior
+_TOGETHER = 25  # rows that count as one against the priors: a model's errors hardly change from row to row
+_STEPS, _LEAST = 40, 16  # joint steps at most, and before which none is the last
+_AGAIN = (6, 14)  # steps before which all states are sought anew: some began in the wrong valley
+_STARTS = 3  # directions of the table from which a row's state is sought
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What a fit may change, and what is known before.
+
+    Attributes:
+      gains: sigma of the electrodes' factors on their change of ln Z about 1; 0: they are 1.
+      offsets: sigma of ln Z at rest about the mean of the published sensors, all electrodes' common level
+        free (the three published sensors scatter by 0.13 RMS).
+      drift: sigma of the size a of a common change of ln Z, a (1 - exp(-t / tau)) (warm-up, published -0.23);
+        0: none.
+      shear: [N] sigma of the plate's tangential force against the measured one; 0: it is not looked at.
+      modulus: Young's modulus at which the search begins [Pa]. hold_modulus: it is known.
+      spread: sigma of the states about the middle of the table, in half widths of its axes; weak.
+    """
+
+    gains: float = 0.3
+    offsets: float = 0.13
+    drift: float = 0.25
+    shear: float = 0.3
+    modulus: float = 1.2e6
+    hold_modulus: bool = False
+    spread: float = 2.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of a recording.
+
+    Attributes:
+      counts: (n, 19). force: (n, 3) of the plate on the skin, along the finger (towards the tip), across (to
+        +z), pressing [N]. time: (n,) as a share of the recording.
+    """
+
+    counts: np.ndarray
+    force: np.ndarray
+    time: np.ndarray
+
+    def __getitem__(self, which) -> "Rows":
+        return Rows(self.counts[which], self.force[which], self.time[which])
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Constants:
+    """Of one sensor, for all rows.
+
+    Attributes:
+      offset: (19,) ln Z at rest at the first row. gain: (19,) on its change. drift: size a, ln tau (tau as a
+        share of the recording). modulus: Young's modulus [Pa].
+    """
+
+    offset: np.ndarray
+    gain: np.ndarray
+    drift: np.ndarray
+    modulus: float
+
+    def drifted(self, time: np.ndarray) -> np.ndarray:
+        """(n,) common change of ln Z at times (n,)."""
+        return self.drift[0] * (1 - np.exp(-time / np.exp(self.drift[1])))
+
+    def log_z(self, change: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """(n, 19) of changes (n, 19) by the skin's state."""
+        return self.offset + self.gain * change + self.drifted(time)[:, None]
+
+    @property
+    def _vector(self):
+        return np.concatenate([self.offset, self.gain, self.drift, [np.log(self.modulus)]])
+
+    @classmethod
+    def _of(cls, vector):
+        drift = np.array([vector[38], np.clip(vector[39], -3.0, 1.0)])
+        return cls(vector[:19], np.clip(vector[19:38], 0.1, 5.0), drift, float(np.exp(vector[40])))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Match:
+    """Rows with their states.
+
+    Attributes:
+      state: (n, 4) pitch, roll [rad], drag along and across. counts: (n, 19) of the model. force: (n, 2)
+        tangential of the model [N]. cost: (n,) sum of squares, in counts.
+    """
+
+    state: np.ndarray
+    counts: np.ndarray
+    force: np.ndarray
+    cost: np.ndarray
+
+
+def fit_constants(response: Response, rows: Rows, setup: Setup) -> tuple[Constants, Match]:
+    """Constants and the states of all rows together: Gauss and Newton, the states eliminated in each step."""
+    const = _begin(response, rows, setup)
+    problem = _Problem(response, rows, const, setup)
+    state = fit_states(response, rows, const, setup).state
+    now, damp = problem.evaluate(state, const), 1e-2
+    for number in range(_STEPS):
+        if number in _AGAIN:
+            const, state = now.const, fit_states(response, rows, now.const, setup, also=now.state).state
+            now = problem.evaluate(state, const)
+        new = problem.evaluate(*problem.step(now, damp))
+        if new.cost < now.cost:
+            small = now.cost - new.cost < 1e-4 * now.cost
+            now, damp = new, max(damp / 5, 1e-6)
+            if small and number > _LEAST:
+                break
+        else:
+            damp *= 8
+            if damp > 1e6:
+                break
+    return now.const, fit_states(response, rows, now.const, setup, also=now.state)
+
+
+def fit_states(
+    response: Response,
+    rows: Rows,
+    const: Constants,
+    setup: Setup,
+    electrodes: np.ndarray | None = None,
+    also: np.ndarray | None = None,
+) -> Match:
+    """The best state of every row for constants that are known.
+
+    Args:
+      electrodes: numbers of those that are looked at; None: all.
+      also: (n, 4) states to begin from beside the table's best nodes.
+    """
+    problem = _Problem(response, rows, const, setup, electrodes)
+    starts = problem.best_nodes(const)
+    if also is not None:
+        starts = np.concatenate([starts, also[None]])
+    found = [problem.descend(start, const) for start in starts]
+    best = np.argmin([cost for _, cost in found], axis=0)
+    state, cost = (np.array([f[i] for f in found])[best, np.arange(len(rows))] for i in (0, 1))
+    value, _ = problem.loaded(const)(state, False)
+    counts = counts_from_log_impedance(const.log_z(value[:, :19], rows.time))
+    return Match(state, counts, value[:, 19:] * const.modulus, cost)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Now:
+    """Where a search is: states, constants, values (n, 21), residuals (n, m), their slopes over the states
+    (n, m, 4), the cost."""
+
+    state: np.ndarray
+    const: Constants
+    value: np.ndarray
+    r: np.ndarray
+    Js: np.ndarray
+    cost: float
+
+
+class _Problem:
+    """Residuals of rows and their slopes."""
+
+    def __init__(self, response, rows, const, setup, electrodes=None):
+        self.response, self.rows, self.setup = response, rows, setup
+        self.electrodes = np.arange(19) if electrodes is None else np.asarray(electrodes)
+        self._middle = (response.high + response.low) / 2
+        half = (response.high - response.low) / 2
+        self._pull = _COUNTS / (setup.spread * np.where(half > 0, half, 1.0))
+        self._loaded = const.modulus, response.at_load(rows.force[:, 2] / const.modulus)
+        self._free, self._prior, self._prior_at = _prior(setup, const)
+
+    def loaded(self, const: Constants) -> Loaded:
+        if const.modulus != self._loaded[0]:
+            at = self.response.at_load(self.rows.force[:, 2] / const.modulus)
+            self._loaded = const.modulus, at
+        return self._loaded[1]
+
+    def residuals(self, value, state, const):
+        """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n, 19)."""
+        counts = counts_from_log_impedance(const.log_z(value[:, :19], self.rows.time))
+        r = [(counts - self.rows.counts)[:, self.electrodes], self._pull * (state - self._middle)]
+        if self.setup.shear:
+            shear = value[:, 19:] * const.modulus - self.rows.force[:, :2]
+            r.append(_COUNTS / self.setup.shear * shear)
+        return np.concatenate(r, 1), counts
+
+    def state_slopes(self, slope, counts, const):
+        """(n, m, 4) of the residuals from those of the response (n, 21, 4)."""
+        J = [((_slope(counts) * const.gain)[..., None] * slope[:, :19])[:, self.electrodes]]
+        J.append(np.broadcast_to(np.diag(self._pull), (len(counts), 4, 4)))
+        if self.setup.shear:
+            J.append(_COUNTS / self.setup.shear * const.modulus * slope[:, 19:])
+        return np.concatenate(J, 1)
+
+    def evaluate(self, state, const) -> _Now:
+        value, slope = self.loaded(const)(state)
+        r, counts = self.residuals(value, state, const)
+        prior = self._prior @ const._vector - self._prior_at
+        cost = float((r * r).sum() + (prior * prior).sum())
+        return _Now(state, const, value, r, self.state_slopes(slope, counts, const), cost)
+
+    def step(self, now, damp):
+        """New states and constants, the damped least squares of all residuals (Schur's complement)."""
+        Js, r, free = now.Js, now.r, self._free
+        Jc = self._constant_slopes(now)[..., free]
+        P = self._prior[:, free]
+        prior = self._prior @ now.const._vector - self._prior_at
+        H = np.einsum("nmi,nmj->nij", Js, Js)
+        H = H + damp * np.einsum("nii->ni", H)[:, :, None] * np.eye(4)
+        cross = np.einsum("nmi,nmj->nij", Js, Jc)
+        gs, gc = np.einsum("nmi,nm->ni", Js, r), np.einsum("nmj,nm->j", Jc, r) + P.T @ prior
+        A = np.einsum("nmi,nmj->ij", Jc, Jc) + P.T @ P
+        lead = np.linalg.solve(H, cross)
+        S = A + damp * np.diag(np.diag(A)) - np.einsum("nij,nik->jk", cross, lead)
+        change = -np.linalg.solve(S, gc - np.einsum("nij,ni->j", lead, gs))
+        move = -np.linalg.solve(H, (gs + cross @ change)[..., None])[..., 0]
+        vector = now.const._vector
+        vector[free] += change
+        vector[40] = np.clip(vector[40], *(np.log(now.const.modulus) + [-0.3, 0.3]))
+        state = np.clip(now.state + move, self.response.low, self.response.high)
+        return state, Constants._of(vector)
+
+    def _constant_slopes(self, now):
+        """(n, m, 41) of the residuals by the constants."""
+        const, time = now.const, self.rows.time
+        counts = counts_from_log_impedance(const.log_z(now.value[:, :19], time))
+        J, e, slope = np.zeros((*now.r.shape, 41)), np.arange(19), _slope(counts)
+        J[:, e, e] = slope
+        J[:, e, 19 + e] = slope * now.value[:, :19]
+        ratio, tau = np.exp(-time / np.exp(const.drift[1])), np.exp(const.drift[1])
+        J[:, :19, 38] = slope * (1 - ratio)[:, None]
+        J[:, :19, 39] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
+        there = dataclasses.replace(const, modulus=const.modulus * np.exp(_PROBE))
+        value, _ = self.response.at_load(self.rows.force[:, 2] / there.modulus)(now.state, False)
+        J[..., 40] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
+        return J
+
+    def descend(self, state, const, steps=12):
+        """Levenberg and Marquardt, every row by itself: states (n, 4), costs (n,)."""
+        loaded, damp = self.loaded(const), np.full(len(state), 1e-2)
+
+        def look(state):
+            value, slope = loaded(state)
+            r, counts = self.residuals(value, state, const)
+            return r, self.state_slopes(slope, counts, const), (r * r).sum(1)
+
+        r, J, cost = look(state)
+        for _ in range(steps):
+            H, g = np.einsum("nmi,nmj->nij", J, J), np.einsum("nmi,nm->ni", J, r)
+            H = H + damp[:, None, None] * np.einsum("nii->ni", H)[:, :, None] * np.eye(4)
+            new = state - np.linalg.solve(H, g[..., None])[..., 0]
+            new = np.clip(new, self.response.low, self.response.high)
+            new_r, new_J, new_cost = look(new)
+            better = new_cost < cost
+            damp = np.where(better, damp / 4, damp * 6)
+            state, r = np.where(better[:, None], new, state), np.where(better[:, None], new_r, r)
+            J, cost = np.where(better[:, None, None], new_J, J), np.where(better, new_cost, cost)
+        return state, cost
+
+    def best_nodes(self, const):
+        """(_STARTS, n, 4) nodes of the table nearest to each row, of different directions."""
+        loaded, out = self.loaded(const), np.zeros((_STARTS, len(self.rows), 4))
+        nodes = self.response.nodes
+        for n, row in enumerate(loaded.table):
+            value = row.reshape(-1, 21)
+            time = np.full(len(value), self.rows.time[n])
+            counts = counts_from_log_impedance(const.log_z(value[:, :19], time))
+            cost = ((counts - self.rows.counts[n])[:, self.electrodes] ** 2).sum(1)
+            if self.setup.shear:
+                shear = (value[:, 19:] * const.modulus - self.rows.force[n, :2]) / self.setup.shear
+                cost = cost + _COUNTS**2 * (shear * shear).sum(1)
+            cost = cost.reshape(nodes.shape[:2])
+            direction = np.argsort(cost.min(1))[:_STARTS]
+            out[: len(direction), n] = nodes[direction, cost[direction].argmin(1)]
+        return out
+
+
+_PROBE = 1e-2  # of ln E, for a difference
+
+
+def _slope(counts):
+    """d counts / d ln Z."""
+    return -counts * (1 - counts / FULL_SCALE)
+
+
+def _published_rest():
+    """(19,) mean ln Z at rest of the published sensors."""
+    return np.mean([log_impedance(counts) for counts in REST_COUNTS.values()], axis=0)
+
+
+def _prior(setup, const):
+    """Which constants are free (k,), and the priors' matrix and right side: residuals P vector - at."""
+    weight = _COUNTS * np.sqrt(_TOGETHER)
+    free = [np.arange(19)]
+    P, at = [np.zeros((19, 41))], [np.zeros(19)]
+    P[0][:, :19] = (np.eye(19) - 1 / 19) * weight / setup.offsets
+    at[0] = P[0][:, :19] @ _published_rest()
+    if setup.gains:
+        free.append(np.arange(19, 38))
+        P.append(np.zeros((19, 41)))
+        P[-1][:, 19:38] = np.eye(19) * weight / setup.gains
+        at.append(np.full(19, weight / setup.gains))
+    if setup.drift:
+        free.append(np.array([38, 39]))
+        P.append(np.zeros((2, 41)))
+        P[-1][[0, 1], [38, 39]] = weight / setup.drift, weight
+        at.append(np.array([0.0, weight * np.log(_TAU)]))
+    if not setup.hold_modulus:
+        free.append(np.array([40]))
+    return np.concatenate(free), np.concatenate(P), np.concatenate(at)
+
+
+_TAU = 0.4  # of the recording: where the search for the drift's time constant begins, known to a factor e
+
+
+def _begin(response, rows, setup):
+    """Constants from the published rest, its common level such that the table's best nodes fit the rows."""
+    const = Constants(_published_rest(), np.ones(19), np.array([0.0, np.log(_TAU)]), setup.modulus)
+    for _ in range(4):
+        problem = _Problem(response, rows, const, setup)
+        value, _ = problem.loaded(const)(problem.best_nodes(const)[0], False)
+        left = log_impedance(rows.counts) - const.log_z(value[:, :19], rows.time)
+        const = dataclasses.replace(const, offset=const.offset + np.median(left))
+    return const

@@ -1,0 +1,107 @@
+"""What electrodes and force plate say in a table of states, between its nodes too."""
+
+import dataclasses
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ..geometry.electrodes import electrode_positions
+from .states import PlateStates
+
+__all__ = ["Loaded", "Response"]
+
+_POS = electrode_positions()  # z of the BioTac frame is y of this one
+_MIRRORED = np.abs(_POS[:, None] * [1, -1, 1] - _POS).sum(-1).argmin(0)
+
+
+class Response:
+    """Change of ln Z and tangential forces over pitch, roll and drag, at loads that are known.
+
+    Cubic splines over the angles, the logarithm of the load and each drag, of which the changes
+    add. Rolls to the other side are the mirror image.
+
+    Args:
+      states: the table. log_z: (npitch, nroll, nway, nload, 19) change of ln Z in its states.
+
+    Attributes:
+      axes: nodes of pitch and roll (both sides). ways: (nway, 2) drags. nodes: (ndirection, nway, 4)
+        states of the table. low, high: (4,) ends of a state.
+    """
+
+    def __init__(self, states: PlateStates, log_z: np.ndarray):
+        grid = states.grid
+        here = np.concatenate([log_z, states.force[..., :2]], -1)
+        order = np.concatenate([_MIRRORED, [19, 20]])
+        other = (
+            np.abs(grid.ways[:, None] - grid.ways * [1, -1]).sum(-1).argmin(0)
+        )  # dragged to the other side
+        there = here[:, :0:-1, other][..., order] * np.where(np.arange(21) == 20, -1.0, 1.0)
+        self._table = np.moveaxis(np.concatenate([there, here], 1), 3, 0)
+        roll = np.array(grid.roll)
+        self.axes = np.array(grid.pitch), np.concatenate([-roll[:0:-1], roll])
+        most = max(grid.drag, default=0.0)
+        drag = np.array([most, most])
+        self.low = np.concatenate([[axis[0] for axis in self.axes], -drag])
+        self.high = np.concatenate([[axis[-1] for axis in self.axes], drag])
+        self.ways, self.splines = grid.ways, [_cardinal(axis) for axis in self.axes]
+        node = np.unique(np.concatenate([[0.0], grid.drag, -np.array(grid.drag)]))
+        self.over_drag = _cardinal(node) if grid.drag else None
+        # where the splines' weights of these nodes go among the ways, along and across
+        self.way_of = [np.abs(node[:, None] - grid.ways[:, i]).argmin(1) for i in (0, 1)]
+        direction = np.stack(np.meshgrid(*self.axes, indexing="ij"), -1).reshape(-1, 1, 2)
+        shape = len(direction), len(self.ways), 2
+        parts = np.broadcast_to(direction, shape), np.broadcast_to(self.ways, shape)
+        self.nodes = np.concatenate(parts, -1)
+        self._log_load, self._first = np.log(grid.load), grid.load[0]
+        self._over_load = _cardinal(self._log_load)
+
+    def at_load(self, load: np.ndarray) -> "Loaded":
+        """The response at loads (n,) of normal force over Young's modulus [m^2]."""
+        inside = np.clip(np.log(np.maximum(load, 1e-30)), self._log_load[0], self._log_load[-1])
+        weight = self._over_load(inside)
+        small = np.minimum(load / self._first, 1.0)  # below the first load in proportion
+        table = (weight @ self._table.reshape(len(self._log_load), -1)) * small[:, None]
+        return Loaded(self, table.reshape(len(load), *self._table.shape[1:]).astype(np.float32))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Loaded:
+    """The response at n loads: table (n, npitch, nroll, nway, 21)."""
+
+    response: Response
+    table: np.ndarray
+
+    def __call__(self, state: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
+        """Values (n, 21) at states (n, 4) (pitch, roll, drag along and across): ln Z, then forces along and
+        across over E; and slopes (n, 21, 4)."""
+        pitch, roll = (
+            [spline(state[:, i]), spline(state[:, i], 1)] for i, spline in enumerate(self.response.splines)
+        )
+        here = self._sum(pitch[0], roll[0])
+        way, turn = self._over_ways(state[:, 2:])
+        value = np.einsum("nw,nwc->nc", way, here)
+        if not slope:
+            return value, None
+        change = [self._sum(pitch[1], roll[0]), self._sum(pitch[0], roll[1])]
+        angles = [np.einsum("nw,nwc->nc", way, part) for part in change]
+        return value, np.concatenate([np.stack(angles, -1), np.einsum("nwi,nwc->nci", turn, here)], -1)
+
+    def _sum(self, pitch, roll):
+        """(n, nway, 21) of the table with weights over its directions."""
+        return np.einsum("nj,njwc->nwc", roll, np.einsum("ni,nijwc->njwc", pitch, self.table)).astype(float)
+
+    def _over_ways(self, drag):
+        """Weights (n, nway) of splines in each drag (n, 2), which add, and their slopes (n, nway, 2)."""
+        response = self.response
+        way, slope = np.zeros((len(drag), len(response.ways))), np.zeros((len(drag), len(response.ways), 2))
+        way[:, 0] = 1.0
+        for i in (0, 1) if response.over_drag else ():
+            way[:, response.way_of[i]] += response.over_drag(drag[:, i])
+            slope[:, response.way_of[i], i] += response.over_drag(drag[:, i], 1)
+            way[:, 0] -= 1.0
+        return way, slope
+
+
+def _cardinal(node):
+    """Cubic spline whose values at places (n,) are the weights (n, len(node)) of values at the nodes."""
+    return CubicSpline(node, np.eye(len(node)), bc_type="not-a-knot")

@@ -1,0 +1,169 @@
+"""A table of states of the skin under a flat plate: which way the plate faces, how it was dragged while it
+came, how hard it presses.
+
+A large plate has no place of its own: where it touches follows from which way it faces. So a state has four
+numbers beside the force (pitch, roll and two of the drag), and the force, which is measured, is a coordinate
+of the table and not a result. Forces are told by Young's modulus: with a liquid that keeps its volume and a
+contact in proportion to E, a skin twice as stiff has the same shapes at twice the force."""
+
+import dataclasses
+
+import numpy as np
+from tqdm import tqdm
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from ..skin.cache import kept
+
+__all__ = ["PlateGrid", "PlateStates", "plate_states"]
+
+_STRIDE = 1.6e-4  # [m] of a step towards the core
+_DEEPEST = 4.5e-3  # [m] from the first touch: beyond skin and gap
+_LOST = 3  # steps without a balance after which a way ends
+
+
+@dataclasses.dataclass(frozen=True)
+class PlateGrid:
+    """Where a table has states.
+
+    Attributes:
+      pitch: angle of the plate from the pad towards the tip [rad], rising.
+      roll: of the plate about the finger's axis, to +z, from 0 on [rad]; the other side is the mirror image.
+      drag: tangential over normal motion of the plate, rising and above 0: each direction is met straight
+        and with these drags to both sides along the finger and across it; () leaves drag out.
+      load: normal force over Young's modulus, rising [m^2].
+    """
+
+    pitch: tuple = tuple(np.radians([0, 5, 9, 14, 20, 30]).tolist())
+    roll: tuple = tuple(np.radians([0, 13, 26, 40]).tolist())
+    drag: tuple = (0.7, 1.4)
+    load: tuple = tuple((np.geomspace(0.25, 24, 12) / 1.55e6).tolist())
+
+    def __post_init__(self):
+        for name in ("pitch", "roll", "load"):
+            value = np.array(getattr(self, name), float)
+            if value.ndim != 1 or len(value) < 2 or not (np.diff(value) > 0).all():
+                raise ValueError(f"{name} of a plate's grid is {getattr(self, name)}: give rising numbers")
+        drag = np.array([0.0, *self.drag])
+        if self.roll[0] != 0 or self.load[0] <= 0 or not (np.diff(drag) > 0).all():
+            raise ValueError(
+                "a plate's grid needs rolls from 0 on, loads above 0 and a drags that rise above 0"
+            )
+
+    @property
+    def ways(self) -> np.ndarray:
+        """(nway, 2) drag along the finger (towards the tip) and across it (to +z): none, then each to both
+        sides, first all along it."""
+        both = np.array([[d, -d] for d in self.drag]).ravel()
+        none = np.zeros_like(both)
+        return np.concatenate([np.zeros((1, 2)), np.stack([both, none], 1), np.stack([none, both], 1)])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PlateStates:
+    """States of one skin.
+
+    Attributes:
+      grid: its axes.
+      node: (n,) nodes of the skin's inner surface. rest: (n, 3) their places at rest [m].
+      xpos: (npitch, nroll, nway, nload, n, 3) their places [m], single precision.
+      force: (..., nload, 3) of the plate on the skin over Young's modulus, along the finger (towards the
+        tip), across (to +z), towards the core [m^2].
+      pressure: (..., nload) of the liquid over Young's modulus.
+      reached: (npitch, nroll, nway) largest load of a way [m^2]; states beyond are its last.
+    """
+
+    grid: PlateGrid
+    node: np.ndarray
+    rest: np.ndarray
+    xpos: np.ndarray
+    force: np.ndarray
+    pressure: np.ndarray
+    reached: np.ndarray
+
+
+def frame(pitch: float, roll: float) -> np.ndarray:
+    """(3, 3) rows in the BioTac frame: towards the tip along the plate, across it (to +z), from the plate
+    towards the core."""
+    sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
+    inwards = np.array([sp, cp * cr, -cp * sr])
+    along = np.array([-cp, sp * cr, -sp * sr])
+    return np.array([along, [0.0, sr, cr], inwards])
+
+
+def plate_states(
+    geometry: SkinGeometry,
+    material: Material,
+    options: SkinOptions | None = None,
+    grid: PlateGrid | None = None,
+    quiet: bool = False,
+) -> PlateStates:
+    """The table of a skin, kept on disk pitch by pitch: stopped, it goes on where it was. Skins that differ
+    in Young's modulus alone share it.
+
+    Raises:
+      ValueError: a material that depends on time: states of a plate are those of rest.
+    """
+    grid, options = grid or PlateGrid(), options or SkinOptions()
+    if material.remembers:
+        raise ValueError("a table of states knows no time: leave prony, mullins and hysteresis out")
+    if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not go with E alone
+        material = dataclasses.replace(material, youngs_modulus=Material().youngs_modulus)
+    node = np.unique(geometry.inner_face)
+    model = SkinModel(geometry, material, options)
+    ways = np.array([(roll, *way) for roll in grid.roll for way in grid.ways])
+    parts = []
+    for pitch in tqdm(grid.pitch, desc="states of a plate", unit="pitch", disable=quiet):
+
+        def make(pitch=pitch):
+            axes = np.array([frame(pitch, roll) for roll in ways[:, 0]])
+            return _press(model, node, axes, ways[:, 1:], np.array(grid.load))
+
+        inputs = [geometry.vert, geometry.elem, geometry.fixed, material, options, pitch, ways, grid.load]
+        parts.append(kept("plate", inputs, make))
+    shape = len(grid.pitch), len(grid.roll), len(grid.ways)
+    stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
+    return PlateStates(
+        grid, node, model.rest.vert[node], **{k: v.reshape(*shape, *v.shape[2:]) for k, v in stacked.items()}
+    )
+
+
+def _press(model, node, axes, ways, load):
+    """States along ways (nway, 2) of plates that face along axes (nway, 3, 3), a world for each: xpos (nway,
+    nload, n, 3), force, pressure, reached."""
+    nway, E = len(ways), model.material.youngs_modulus
+    data = SkinData(model, nway)
+    geoms = GeomSet(["plane"], [(0, 0, 0)], nworld=nway)
+    geoms.set_friction([model.material.friction])
+    outer = np.unique(model.geometry.outer_face)
+    along, across, inwards = np.swapaxes(axes, 0, 1)
+    start = (model.rest.vert[outer] @ inwards.T).min(0)[:, None] * inwards
+    push = ways[:, :1] * along + ways[:, 1:] * across + inwards
+    mat = np.stack([along, np.cross(inwards, along), inwards], 2)[:, None]
+    rest = model.rest.vert[node]
+    track = [[(0.0, rest, np.zeros(3), 0.0)] for _ in range(nway)]
+    going, lost, depth = np.ones(nway, bool), np.zeros(nway, int), np.zeros(nway)
+    while going.any():
+        depth[going] += _STRIDE
+        geoms.set_pose((start + depth[:, None] * push)[:, None], mat)
+        step(model, data, geoms)
+        wrench, pressure, x = data.wrench[:, 0, :3], data.pressure, data.vert_xpos[:, node]
+        good = data.converged
+        lost = np.where(good, 0, lost + 1)
+        for w in np.flatnonzero(going & good):
+            force = -axes[w] @ wrench[w] / E
+            if force[2] > track[w][-1][0]:
+                track[w].append((force[2], x[w], force, pressure[w] / E))
+        top = np.array([t[-1][0] for t in track])
+        going &= (top < load[-1]) & (depth < _DEEPEST) & (lost < _LOST)
+    out = {"xpos": [], "force": [], "pressure": [], "reached": top}
+    for t in track:
+        at = np.array([row[0] for row in t])
+        k = np.clip(np.searchsorted(at, load), 1, len(at) - 1)
+        f = np.clip((load - at[k - 1]) / (at[k] - at[k - 1]), 0, 1)
+        for name, column in (("xpos", 1), ("force", 2), ("pressure", 3)):
+            value = np.array([row[column] for row in t])
+            share = f.reshape(-1, *[1] * (value.ndim - 1))
+            out[name].append((1 - share) * value[k - 1] + share * value[k])
+    out["xpos"] = np.array(out["xpos"], np.float32)
+    return {key: np.array(value) for key, value in out.items()}
