@@ -15,11 +15,11 @@ import sys
 import time
 
 from biotac_mj.geometry.skins import load_skin
-from biotac_mj.recordings import load_one
 from biotac_mj.matching.fit import Setup
 from biotac_mj.matching.match import log_changes, match, rows_of
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import plate_states
+from biotac_mj.recordings import load_one
 from biotac_mj.sensor.film import CALIBRATED_RADIUS, FilmConduction
 from biotac_mj.skin.settings import read_material
 

@@ -21,11 +21,10 @@ from real_match import table
 from vibration import floor
 
 from biotac_mj.geometry.electrodes import electrode_positions
-from biotac_mj.recordings import load_one
 from biotac_mj.matching.fit import Setup, fit_constants
 from biotac_mj.matching.match import rows_of
+from biotac_mj.recordings import load_one
 from biotac_mj.sensor.channels import (
-    OTHER_NOISE,
     PAC_COLOUR,
     PAC_NOISE,
     REST_TEMPERATURE,
@@ -37,6 +36,7 @@ from biotac_mj.sensor.channels import (
     pac_from_counts,
 )
 from biotac_mj.sensor.film import CALIBRATED_RADIUS
+from biotac_mj.sensor.presets import SENSORS
 from biotac_mj.skin.rubber.material import PRESETS
 
 _SMOOTH = 51  # rows over which slow changes are taken out of noise, half a second
@@ -152,7 +152,7 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[d
         add("TDC at rest [counts]", finger, part["tdc"], float(counts_from_temperature(REST_TEMPERATURE)))
         level = float(np.median(electrode_noise(np.full(1, 3000.0))))
         add("noise of an electrode [counts]", finger, part["electrodes"], level)
-        add("noise of PDC [counts]", finger, part["pdc"], OTHER_NOISE)
+        add("noise of PDC [counts]", finger, part["pdc"], SENSORS["1"].pdc_noise)
         add("PAC in a hold, std [counts]", finger, part["pac"], PAC_NOISE / np.sqrt(1 - PAC_COLOUR**2))
         add("PAC in a hold, lag-1 correlation", finger, part["lag"], PAC_COLOUR)
     for path in sorted(data.rglob("*.btd*")):

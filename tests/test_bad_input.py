@@ -374,7 +374,7 @@ def files_of_text():
         yield Row(words, f"{NROW - 1}", "force.txt", _one_row_less)
         yield Row(words.replace("force.txt", "nowhere"), "nowhere: no such file")
     yield Row(
-        "diagnose --electrodes electrodes.txt --tdc tdc.txt", f"{NROW - 1} rows", "tdc.txt", _one_row_less
+        "diagnose --electrodes electrodes.txt --tdc tdc.txt", f"has {NROW - 1}", "tdc.txt", _one_row_less
     )
     yield Row("diagnose --electrodes electrodes.txt --tdc tdc.txt", "tdc is 'x'", "tdc.txt", cell(9, 0, "x"))
     for words in LOGS[:2]:

@@ -109,7 +109,7 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
             " ".join(["x1"] + ["5"] * 18) + "\n" + " ".join(["5"] * 18 + ["oops"]) + "\n",
             "line 1: e1 is 'x1', not a finite number",
         ),
-        ((" ".join(["0.5"] * 19) + "\n") * 500, "look like volts"),
+        ((" ".join(["0.5"] * 19) + "\n") * 500, "look like normalised values"),
         ((" ".join(["-40"] * 19) + "\n") * 500, "raw counts 0..4095 are needed, not tared"),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
         ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
@@ -128,7 +128,7 @@ def test_missing_and_uneven_files_are_named(tmp_path):
     e, rng = unloaded(seconds=6)
     np.savetxt(tmp_path / "e.txt", noisy(e, rng), fmt="%d")
     np.savetxt(tmp_path / "f.txt", np.zeros((599, 3)))
-    with pytest.raises(ValueError, match="599 rows and --electrodes .* has 600"):
+    with pytest.raises(ValueError, match="e.txt has 600 rows and .*f.txt has 599"):
         read_recording(tmp_path / "e.txt", tmp_path / "f.txt")
     with pytest.raises(ValueError, match="give newtons"):
         Recording(noisy(e, rng), np.full((600, 3), 2500.0))

@@ -195,7 +195,7 @@ def test_the_command_says_in_one_line_what_is_wrong(real_match, tmp_path):
     files = ["--electrodes", str(tmp_path / "e.txt"), "--force", str(tmp_path / "f.txt")]
     with pytest.raises(SystemExit) as stop:
         real_match.main([*files, "--json", str(tmp_path / "out.json")])
-    assert "500 rows and the force file 499" in str(stop.value) and "\n" not in str(stop.value)
+    assert "has 499: they must be logged" in str(stop.value) and "\n" not in str(stop.value)
 
 
 @pytest.fixture

@@ -127,5 +127,18 @@ def read_recording(
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
     found, _ = load_one(electrodes, force=force, tdc=tdc, rate=rate)
-    counts, _ = found.counts()
+    counts, assumed = found.counts()
+    if assumed:  # a rest that is assumed would itself be found
+        raise ValueError(f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign")
     return Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)
+
+
+def _check_numbers(value, label):
+    bad = np.argwhere(~np.isfinite(value))
+    if len(bad):
+        row, column = bad[0]
+        raise ValueError(
+            f"{label}: {len(bad)} values are not finite, the first in row {row + 1}, column {column + 1}: a "
+            "gap cannot be guessed; "
+            "cut the recording there or log it again"
+        )
