@@ -1,6 +1,9 @@
 """Sensors that run with effects: what `biotac diagnose` found acts in a simulation, on every path that has
 the sensor, and as the effect's own law says."""
 
+import os
+import pathlib
+import runpy
 import warnings
 
 import mujoco
@@ -16,10 +19,12 @@ from biotac_mj.effects.catalogue import CATALOGUE, by_id
 from biotac_mj.effects.effect import Effect, Param, Run
 from biotac_mj.effects.sensor_file import read_sensor_file
 from biotac_mj.effects.sensors import with_effects
+from biotac_mj.recordings.own import noise
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.presets import SENSORS, read_sensor
 
+REAL = os.environ.get("BIOTAC_RECORDINGS")
 SET_UP = {"radius", "misalign", "depth0", "mount", "rocking", "force_cross"}
 # of a press of 0.2 s what each effect has to change at least: counts of an electrode, of PDC, force [N]
 FELT = {
@@ -255,3 +260,35 @@ def test_what_cannot_run_is_refused_by_name(tmp_path):
             tier="condensed",
             effects=[(by_id("relax"), {"g": 0.2, "tau": 1.0})],
         )
+
+
+def _as_recorded(recording, rows, rate):
+    """Rest, change over the rows' time and noise of simulated electrodes are the recording's."""
+    measured = recording.electrodes
+    count = round(len(rows) * recording.rate / rate)
+    rest, drift = (
+        np.median(a[: round(r)], axis=0) for a, r in ((measured, 2 * recording.rate), (rows, 2 * rate))
+    )
+    np.testing.assert_allclose(drift, rest, atol=6)
+    ends = [np.median(a[n - round(2 * r) : n], axis=0) for a, n, r in (
+        (measured, count, recording.rate), (rows, len(rows), rate))]  # fmt: skip
+    changes = ends[0] - rest, ends[1] - drift
+    assert np.abs(changes[0]).mean() > 20
+    np.testing.assert_allclose(changes[1], changes[0], atol=0.15 * np.abs(changes[0]).mean() + 3)
+    np.testing.assert_allclose(noise(rows), noise(measured), rtol=0.15, atol=0.3)
+
+
+def test_a_finger_behaves_like_a_recorded_sensor():
+    """A synthetic recording of a sensor that rests and warms up, named, attached to a hand and run."""
+    path = pathlib.Path(biotac_mj.__file__).parents[1] / "examples" / "finger_like_a_recording.py"
+    example = runpy.run_path(str(path))
+    recording, rows = example["main"]()
+    _as_recorded(recording, rows, 100.0)
+
+
+@pytest.mark.skipif(REAL is None, reason="set BIOTAC_RECORDINGS to the folder of real recordings")
+def test_a_finger_behaves_like_a_real_unloaded_sensor():
+    path = pathlib.Path(biotac_mj.__file__).parents[1] / "examples" / "finger_like_a_recording.py"
+    found = sorted(pathlib.Path(REAL).rglob("epfl_flat_press/SynImpF2.txt"))
+    recording, rows = runpy.run_path(str(path))["main"](found[0])
+    _as_recorded(recording, rows, 100.0)

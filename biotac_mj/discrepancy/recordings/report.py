@@ -11,9 +11,11 @@ import pathlib
 import numpy as np
 
 from ...effects.effect import STAGES
+from ...effects.sensor_file import write_sensor_file
 from ...files import replacing
 from ...sensor.channels import counts_from_log_impedance
 from ..plain_values import plain_values
+from .amended import amended_sensor
 from .confidence import clues
 from .findings import KINDS, Finding
 from .search import RecordingDiagnosis
@@ -138,7 +140,8 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
 
 
 def write_report(diagnosis: RecordingDiagnosis, folder: pathlib.Path | str) -> list:
-    """Writes report.html, verdict.json and the figures; returns the paths."""
+    """Writes report.html, verdict.json, sensor_amended.yaml (a sensor that `attach(effects=)` takes) and the
+    figures; returns the paths."""
     folder = pathlib.Path(folder)
     paths, pictures = [folder / "report.html", folder / "verdict.json"], []
     for name, draw in (("curves.png", _curves), ("overview.png", _overview), ("channels.png", _channels)):
@@ -152,7 +155,8 @@ def write_report(diagnosis: RecordingDiagnosis, folder: pathlib.Path | str) -> l
         temporary.write_text(json.dumps(verdict_dict(diagnosis), indent=1, allow_nan=False))
     with replacing(folder / "report.html") as temporary:
         temporary.write_text(_page(diagnosis, pictures))
-    return paths
+    write_sensor_file(folder / "sensor_amended.yaml", amended_sensor(diagnosis)[0])
+    return [*paths, folder / "sensor_amended.yaml"]
 
 
 def _figure(rows, height):

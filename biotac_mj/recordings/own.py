@@ -1,0 +1,59 @@
+"""What one real sensor has of its own in a recording: rest, noise, warm-up (`sensor.presets.Sensor`)."""
+
+import numpy as np
+
+from ..sensor.channels import counts_from_log_impedance, log_impedance
+from ..sensor.presets import PER_DEGREE
+
+__all__ = ["colour", "noise", "rest_of"]
+
+_TIMES = np.geomspace(0.1, 1.1, 60)  # of warm-up that are tried, of the recording's length
+_LIGHT = 0.08  # of the rows of a loaded sensor that are looked at, those under least force
+
+
+def noise(counts: np.ndarray) -> np.ndarray:
+    """RMS (k,) of white noise [counts] in counts (n, k), without that of rounding."""
+    second = np.diff(counts, n=2, axis=0)
+    quiet = np.abs(second) <= 6 * np.maximum(np.median(np.abs(second), axis=0), 1)
+    square = np.array([np.mean(d[q] ** 2) for d, q in zip(second.T, quiet.T, strict=True)]) / 6
+    return np.sqrt(np.maximum(square - 1 / 12, 0))
+
+
+def colour(pac: np.ndarray) -> tuple[float, float]:
+    """Lag-one correlation and RMS of the white noise behind samples (n, k) of PAC, blocks of k."""
+    pac = pac - pac.mean()
+    keep = float((pac[:, 1:] * pac[:, :-1]).mean() / (pac**2).mean())
+    return keep, float(pac.std() * np.sqrt(1 - keep**2))
+
+
+def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
+    """What a sensor has of its own.
+
+    Args:
+      counts: (n, 19) of the electrodes, raw. rate: rows per second [Hz]. force: (n, 3) on them [N], or None:
+        nothing touches.
+
+    Returns:
+      rest: (19,) counts at no force and at the beginning; loaded: whether it was never untouched; noise:
+      (19,) RMS [counts]; warm_up [C] at 7.1 % per degree, and warm_time [s] of its exponential.
+    """
+    time, log_z = np.arange(len(counts)) / rate, log_impedance(counts)
+    load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)
+    if force is not None:
+        load, normal = np.column_stack([force, force[:, 2] ** 2]), np.abs(force[:, 2])
+        light = normal < np.quantile(normal, _LIGHT)
+    best = None
+    for tau in _TIMES * time[-1]:
+        design = np.column_stack([np.ones(len(time)), 1 - np.exp(-time / tau), load])[light]
+        answer = np.linalg.lstsq(design, log_z[light], rcond=None)[0]
+        error = np.mean((log_z[light] - design @ answer) ** 2)
+        if best is None or error < best[0]:
+            best = error, tau, answer
+    _, tau, answer = best
+    return {
+        "rest": counts_from_log_impedance(answer[0]),
+        "loaded": force is not None,
+        "noise": noise(counts),
+        "warm_up": float(-answer[1].mean() / PER_DEGREE),
+        "warm_time": float(tau),
+    }
