@@ -49,6 +49,7 @@ BANDS = ((25.0, 100.0), (100.0, 300.0), (300.0, 1000.0))  # [Hz]
 _BLOCK = 88  # samples of PAC in 40 ms, which a log holds without gaps
 _RESTING = 6.0  # [counts] RMS of a block of a sensor that nothing touches, and [counts] off the common level
 _PITCH = 1e-3  # [m] of the ridged plate
+_BAND = 3.0  # [dB]
 _SEEDS = 4  # draws of a roughness whose energies are averaged
 _PLATE = np.array([-9e-3, -13.3e-3, 0.0])
 
@@ -238,9 +239,12 @@ def slides(folder: pathlib.Path, skin: str) -> dict:
         def error(log_square, trial, recorded=recorded, unit=unit):
             return 10 * np.log10((np.exp(log_square) * unit[trial] + quiet) / recorded[trial])
 
-        # least largest error of the three bands
+        # the energy of all bands, as far as none of them is off by more than _BAND
         grid = np.linspace(-15, 15, 6001)
-        best = grid[np.argmin([np.abs(error(x, 0)).max() for x in grid])]
+        worst = np.array([np.abs(error(x, 0)).max() for x in grid])
+        whole = np.array([np.log((np.exp(x) * unit[0] + quiet).sum() / recorded[0].sum()) for x in grid])
+        able = worst <= max(_BAND, worst.min())
+        best = grid[able][np.argmin(np.abs(whole[able]))]
         out["roughness"][label] = float(1e-6 * np.exp(best / 2))
         out["energy_error_db"][label] = error(best, 1).tolist()
         out["energy_db"][label] = {
