@@ -12,7 +12,7 @@ NEWEST := $(VENV)-newest
 PIP := -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 ARGS ?=
 # a process for each core, each with whole files: what a file sets up is set up once
-PYTEST := pytest --numprocesses auto --dist loadfile
+PYTEST := pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling*.py impacts.py batch.py press.py scenes.py errors.py)
 test test-all test-newest: export OMP_NUM_THREADS := 1
 

@@ -131,6 +131,8 @@ def _choice(text):
     """A name, or JSON of a dict."""
     import json
 
+    if text.endswith((".yaml", ".yml")):
+        raise argparse.ArgumentTypeError(f"{text!r} is a sensor file: give it as --effects {text}")
     if not text.startswith("{"):
         return text
     try:

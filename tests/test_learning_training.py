@@ -27,7 +27,7 @@ from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
-from biotac_mj.sensor.acquisition import HELD, HELD_PDC  # noqa: E402
+from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
@@ -361,16 +361,9 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
     pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
     import warp as wp
 
-    from biotac_mj.batch.attach import _readings
-
     skin = load_skin("coarse")
-    film, acquisition = _readings(
-        biotac_mj.SensorBioTac("latent_projection", weights=str(weights), noise=False).batch(),
-        skin,
-        2,
-        0,
-        "cpu",
-    )
+    film = LearnedBatchFilm(skin, 2, "cpu", str(weights))
+    acquisition = BatchAcquisition(film.rest, 2, noise=False)
     u = dent(skin, [-9e-3, -7e-3, 0], 0.6e-3, 2e-3, 0)
     x = wp.array(np.stack([skin.vert, skin.vert + u], axis=1), dtype=wp.vec3d)
     pressure = wp.zeros(2, dtype=wp.float64)

@@ -223,8 +223,8 @@ def test_bulk_and_shear_modulus():
     (dict(poissons_ratio=0.5), "outside .-1, 0.5.: an incompressible rubber needs nu below 0.5"),
     (dict(poissons_ratio=-1.0), "outside .-1, 0.5."),
     (dict(youngs_modulus=float("nan")), "youngs_modulus is nan: pass a finite number"),
-    (dict(youngs_modulus=0.0), "must be from 100"),
-    (dict(density=-1.0), "must be from 100"),
+    (dict(youngs_modulus=0.0), "must be from 0.001"),
+    (dict(density=-1.0), "must be from 0.001"),
     (dict(friction=-0.1), "friction -0.1 is negative: pass a Coulomb coefficient"),
 ])  # fmt: skip
 def test_bad_constants(values, text):

@@ -15,6 +15,8 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 "
             "columns of raw counts)"
         )
+    if args.data and _is_recording(args.data):
+        args.electrodes = args.data
     if args.electrodes:
         from .recordings.recording import read_recording
         from .recordings.report import summary, write_report
@@ -29,3 +31,15 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     from .trajectories.report import diagnose_data
 
     diagnose_data(args)
+
+
+def _is_recording(path):
+    """Whether a file is a recording of `biotac import`, or no HDF5 at all."""
+    import h5py
+
+    if not pathlib.Path(path).is_file():
+        return False  # what reads it says so
+    if not h5py.is_hdf5(path):
+        return True
+    with h5py.File(path) as file:
+        return str(file.attrs.get("schema", "")).startswith("biotac_mj.recording")

@@ -35,7 +35,8 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
 
     Returns:
       rest: (19,) counts at no force and at the beginning; loaded: whether it was never untouched; noise:
-      (19,) RMS [counts]; warm_up [C] at 7.1 % per degree, and warm_time [s] of its exponential.
+      (19,) RMS [counts]; warm_up [C] at 7.1 % per degree, warm_time [s] of its exponential, and
+      warm_share (19,) of it that each electrode takes.
     """
     time, log_z = np.arange(len(counts)) / rate, log_impedance(counts)
     load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)
@@ -50,10 +51,15 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
         if best is None or error < best[0]:
             best = error, tau, answer
     _, tau, answer = best
+    # of all electrodes; where they go apart, the size that they have
+    whole = float(answer[1].mean()) or 1e-9
+    if abs(whole) < 0.1 * np.abs(answer[1]).max():
+        whole = float(np.copysign(np.abs(answer[1]).max(), whole))
     return {
         "rest": counts_from_log_impedance(answer[0]),
         "loaded": force is not None,
         "noise": noise(counts),
-        "warm_up": float(-answer[1].mean() / PER_DEGREE),
+        "warm_up": float(-whole / PER_DEGREE),
         "warm_time": float(tau),
+        "warm_share": answer[1] / whole,
     }

@@ -10,6 +10,7 @@ from .search import RecordingDiagnosis
 
 __all__ = ["amended_sensor"]
 
+_DRIFTS = {"warmup", "fluidloss", "drift"}
 _MATERIAL = "calibrated"  # the rubber that real sensors were matched with
 
 
@@ -17,21 +18,26 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     """The recording's sensor and the named effects that a sensor can run with; and ids of those that it
     cannot: of the logger, of the force beside it, or of the moment.
 
-    Rest, noise and warm-up are measured over the whole recording; the warm-up acts only where it was named.
+    Rest, noise and the course that drifts have in common are measured over the whole recording; the course
+    acts only where a warm-up, a loss of liquid or a drift was named.
     """
     session = diagnosis.session
-    r, findings = session.recording, {f.id: f for f in diagnosis.findings}
-    own = rest_of(session.filled(), r.rate, r.force)
-    rest, mixing = own["rest"].copy(), np.eye(19)
-    sensor = {"like": "1", "rest": rest, "noise": rest_of(r.electrodes, r.rate, r.force)["noise"]}
+    r, named = session.recording, {f.id for f in diagnosis.findings}
+    without, recorded = (rest_of(counts, r.rate, r.force) for counts in (session.filled(), r.electrodes))
+    drifts = named & _DRIFTS
+    own = recorded if drifts else without
+    # what was named is no noise; and no electrode rests where it has never been
+    seen = r.electrodes.min(0), r.electrodes.max(0)
+    rest, mixing = np.clip(own["rest"], *seen), np.eye(19)
+    noise = np.minimum(recorded["noise"], without["noise"]) if "hum" in named else recorded["noise"]
+    sensor = {"like": "1", "rest": rest, "noise": noise}
+    if drifts:  # whatever its cause: by its course, and each electrode's share of it
+        sensor |= {name: own[name] for name in ("warm_up", "warm_time", "warm_share")}
     effects, left = [], []
     for finding in diagnosis.findings:
-        if finding.id == "warmup":
-            measured = rest_of(r.electrodes, r.rate, r.force)
-            sensor |= {"warm_up": measured["warm_up"], "warm_time": measured["warm_time"]}
-            if "share" in finding.clues:
-                sensor["warm_share"] = finding.clues["share"]
-        elif finding.id in ("stuck", "gain"):
+        if finding.id in _DRIFTS:
+            continue
+        if finding.id in ("stuck", "gain"):
             for k in finding.channels:
                 value = finding.parameters.get("value", finding.parameters.get(f"e{k + 1}", (0.0,)))[0]
                 mixing[k, k] = 0.0 if finding.id == "stuck" else 1 + value
@@ -43,8 +49,6 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
                 left.append(finding.id)
             else:
                 effects.append((by_id(finding.id), theta))
-    if "warmup" in findings:
-        rest[:] = np.where(np.diag(mixing) == 0, rest, measured["rest"])
     if (mixing != np.eye(19)).any():
         sensor["mixing"] = mixing
     plain = {k: np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for k, v in sensor.items()}

@@ -130,7 +130,10 @@ def read_recording(
     counts, assumed = found.counts()
     if assumed:  # a rest that is assumed would itself be found
         raise ValueError(f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign")
-    return Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)
+    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)
+    if not np.ptp(counts, axis=0).any():
+        raise ValueError(f"{found.name}: no electrode changes, the logger stood still: record again")
+    return out
 
 
 def _check_numbers(value, label):

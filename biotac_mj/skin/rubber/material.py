@@ -10,7 +10,7 @@ __all__ = ["ELEMENTS", "PRESETS", "Material", "material"]
 
 ELEMENTS = ("linear", "quadratic")
 
-_SOFTEST, _HARDEST = 1e2, 1e12  # [Pa]: softer than any gel, harder than any solid
+_SOFTEST, _HARDEST = 1e-3, 1e15  # [Pa]: far softer than any gel, harder than any solid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Material:
 
     Attributes:
       law: "corotational", "svk", "neo_hookean" or "linear".
-      youngs_modulus: E [Pa], from 100 Pa to 1 TPa.
+      youngs_modulus: E [Pa], from 0.001 to 1e15.
       poissons_ratio: nu, inside (-1, 0.5).
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
