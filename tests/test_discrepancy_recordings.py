@@ -311,6 +311,17 @@ def test_electronics_show_in_the_noise():
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 
 
+@pytest.mark.parametrize("seed, channel", [(3, 7), (5, 2), (8, 16)])
+def test_an_electrode_that_dies_is_said(seed, channel):
+    """It keeps its level and its noise, and no longer answers."""
+    e, force, rng = pressed(seed, seconds=100)
+    counts = noisy(e, rng, 2.0)
+    start = len(counts) // 3
+    counts[start:, channel] = noisy(np.full(len(counts) - start, counts[:start, channel].mean()), rng, 2.0)
+    d = diagnose_recording(Recording(counts, force))
+    assert any(f.id == "stuck" and f.channels == (channel,) for f in d.findings), d.verdict
+
+
 def test_single_channels_stick_and_spike():
     e, rng = unloaded(3)
     stuck = noisy(e, rng)

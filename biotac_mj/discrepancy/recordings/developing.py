@@ -23,6 +23,7 @@ _ALONE = 0.7
 _NAN = float("nan")
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
+_DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
 
 
 # --- levels
@@ -369,11 +370,13 @@ def gains(session: Session, refused: set) -> Finding | None:
         if (
             p > 0.02
             or gain.sum() < 5
-            or np.ptp(factors) > 0.8 * abs(c)
-            or abs(np.log(abs(c))) < _CURVED
-            and c > 0
+            or np.ptp(factors) > 0.8 * max(abs(c), 0.25 * abs(1 - c))
+            or c > 0
+            and abs(np.log(c)) < _CURVED
         ):
             continue
+        if abs(c) < _DEAD:
+            return _dead(session, k, split * span * m.period, gain, p)
         return _gain_finding(session, k, i, c, np.ptp(factors) / 2, split * span * m.period, gain, p)
     return None
 
@@ -412,6 +415,27 @@ def _rest(moment, i, beta):
     v = v.copy()
     v[i] = 1.0
     return float(v @ moment @ v)
+
+
+def _dead(session, k, onset, gain, p):
+    """An electrode that no longer answers, whatever its noise: from then on it measures nothing."""
+    counts, time = session.recording.electrodes, session.recording.time
+    late = time > onset
+    value = float(np.median(counts[late & session.fit, k]))
+    mask = np.zeros(counts.shape, bool)
+    mask[late, k] = True
+    return Finding(
+        "stuck",
+        (k,),
+        {"value": (value, value, value)},
+        float(gain.sum()),
+        p,
+        onset,
+        time[-1],
+        note=f"from {onset:.1f} s on it does not answer the load, at {value:.0f} counts",
+        clues={"nats": float(gain.mean()), "blocks": float(np.mean(gain > 0))},
+        mask=mask,
+    )
 
 
 def _gain_finding(session, k, i, c, spread, onset, gain, p):
