@@ -8,12 +8,11 @@ import json
 import os
 import pathlib
 import shutil
-from collections.abc import Callable
 
-import h5py
 import mujoco
 import numpy as np
 import pytest
+from bad_rows import Row, h5
 from good_input import ROWS as NROW
 from good_input import make_files
 
@@ -25,31 +24,6 @@ from biotac_mj.sensor.channels import ELECTRODES
 from biotac_mj.skin.contact.law import ContactLaw
 from biotac_mj.skin.model import SkinOptions
 from biotac_mj.skin.rubber.material import Material
-
-
-@dataclasses.dataclass
-class Row:
-    """words: of the command line, those that name a valid file get it. text: in the message. file, change:
-    change(path) breaks that file."""
-
-    words: str
-    text: str
-    file: str = ""
-    change: Callable = lambda path: None
-
-    def __str__(self):
-        return f"{self.words} | {self.text}"[:120]
-
-
-# --- ways to break a file
-
-
-def h5(change):
-    def do(path):
-        with h5py.File(path, "a") as file:
-            change(file)
-
-    return do
 
 
 def drop(name):

@@ -13,7 +13,9 @@ import yaml
 
 import biotac_mj
 from biotac_mj import cli
-from biotac_mj.discrepancy import Simulator
+from biotac_mj.discrepancy import Recording, Simulator, diagnose_recording
+from biotac_mj.discrepancy.recordings.amended import amended_sensor
+from biotac_mj.discrepancy.recordings.report import summary
 from biotac_mj.effects.amended import Model, amend
 from biotac_mj.effects.catalogue import CATALOGUE, by_id
 from biotac_mj.effects.effect import Effect, Param, Run
@@ -284,6 +286,28 @@ def test_a_finger_behaves_like_a_recorded_sensor():
     example = runpy.run_path(str(path))
     recording, rows = example["main"]()
     _as_recorded(recording, rows, 100.0)
+
+
+def test_an_amended_sensor_says_what_it_leaves_out():
+    """A synthetic recording: one electrode does not warm up with the others, and a hum lies over all."""
+    sensor = read_sensor({"like": "phac_f1", "warm_up": 5.0, "warm_time": 30.0, "noise": [3.0] * 19})
+    share = np.ones(19)
+    share[4] = 0.0
+    time = np.arange(9000) / 100
+    warm = 5.0 * (1 - np.exp(-time / 30.0))
+    z = sensor.impedance * np.exp(-sensor.per_degree * np.outer(warm, share))
+    rng = np.random.default_rng(2)
+    counts = counts_from_impedance(z) + 3 * rng.standard_normal(z.shape)
+    counts += 25 * np.sin(2 * np.pi * 31.3 * time)[:, None]
+    diagnosis = diagnose_recording(Recording(np.rint(counts)))
+    file, left = amended_sensor(diagnosis)
+    assert "hum" in {f.id for f in diagnosis.findings} and "hum" in left
+    assert "not in sensor_amended.yaml: hum" in summary(diagnosis)
+    own = file.base["sensor"]
+    assert own["warm_up"] * own["warm_share"][4] == pytest.approx(0.0, abs=0.6)
+    drift = own["warm_up"] * np.delete(own["warm_share"], 4) * (1 - np.exp(-90 / own["warm_time"]))
+    np.testing.assert_allclose(drift, warm[-1], rtol=0.15)
+    assert np.median(own["noise"]) < 6  # not the 18 of the hum
 
 
 @pytest.mark.skipif(REAL is None, reason="set BIOTAC_RECORDINGS to the folder of real recordings")

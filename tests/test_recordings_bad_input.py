@@ -3,45 +3,19 @@ said.
 
 A row ends in one line on stderr that holds the row's text, exit code 2, and nothing is written."""
 
-import dataclasses
 import gzip
 import json
 import pickle
 import shutil
-from collections.abc import Callable
 
-import h5py
 import numpy as np
 import pytest
 import scipy.io
+from bad_rows import Row, h5
 from recorded import synthetic, write_btd, write_csv, write_mat
 
 from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, write
-
-
-@dataclasses.dataclass
-class Row:
-    """words: of the command line. text: in the message. file, change: change(path) breaks that file."""
-
-    words: str
-    text: str
-    file: str = ""
-    change: Callable = lambda path: None
-
-    def __str__(self):
-        return f"{self.words} | {self.text}"[:120]
-
-
-# --- ways to break a file
-
-
-def h5(change):
-    def do(path):
-        with h5py.File(path, "a") as file:
-            change(file)
-
-    return do
 
 
 def put(name, value):

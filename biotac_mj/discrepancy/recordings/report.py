@@ -134,6 +134,11 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
             f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept "
             f"aside, noise {view['noise']:.2g}"
         )
+    if left := amended_sensor(d)[1]:
+        lines.append(
+            f"  not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the "
+            "moment, or no running sensor has it"
+        )
     lines.append(f"  left: {d.rest.text}")
     lines += [f"  cannot be known: {n}" for n in d.notes[1:]]
     return "\n".join(lines)
