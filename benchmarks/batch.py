@@ -44,13 +44,13 @@ def advance(count: wp.array(dtype=int)):
     count[0] = count[0] + 1
 
 
-def time_batch(skin: str, worlds: int, increments: int, element=None) -> dict:
-    """A row of the table."""
+def time_batch(skin: str, worlds: int, increments: int, element=None, senses=False) -> dict:
+    """A row of the table; senses: with heat and vibration."""
     path, _ = standard_path(load_skin(skin), increments)
     spec = mujoco.MjSpec()
     spec.option.timestep = 2e-3
     sphere = spec.worldbody.add_body(name="sphere", mocap=True, pos=path[0])
-    sphere.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0])
+    sphere.add_geom(name="sphere", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0])
     batch.add(spec, body="world", skin=skin)
     mjm = spec.compile()
     mjd = mujoco.MjData(mjm)
@@ -59,7 +59,14 @@ def time_batch(skin: str, worlds: int, increments: int, element=None) -> dict:
     before = device.free_memory if device.is_cuda else 0
     began = time.perf_counter()
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=worlds)
-    biotac = batch.attach(mjm, m, d, skin=skin, options={"skin": {"element": element}} if element else None)
+    biotac = batch.attach(
+        mjm,
+        m,
+        d,
+        skin=skin,
+        options={"skin": {"element": element}} if element else None,
+        **({"thermal": {"sphere": "steel"}, "textures": {"sphere": "cork"}} if senses else {}),
+    )
     points, count = wp.array(path[1:].astype(np.float32), dtype=wp.vec3), wp.zeros(1, dtype=int)
 
     def step():
@@ -92,6 +99,7 @@ def time_batch(skin: str, worlds: int, increments: int, element=None) -> dict:
         "device": device.name,
         "skin": skin,
         "worlds": worlds,
+        "senses": senses,
         "ms_per_step": 1e3 * float(np.mean(seconds)),
         "ms_median_step": 1e3 * float(np.median(seconds)),
         "ms_slowest_step": 1e3 * max(seconds),
@@ -111,12 +119,14 @@ def main(arguments=None) -> int:
     parser.add_argument("--skins", default="default", help="comma-separated")
     parser.add_argument("--worlds", default="1,128,1024", help="comma-separated")
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
+    parser.add_argument("--senses", action="store_true", help="each once more with heat and vibration")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     for skin in options.skins.split(","):
-        for worlds in map(int, options.worlds.split(",")):
-            row = time_batch(skin, worlds, options.increments)
+        sizes = [(int(w), s) for w in options.worlds.split(",") for s in (False, True)[: 1 + options.senses]]
+        for worlds, senses in sizes:
+            row = time_batch(skin, worlds, options.increments, senses=senses)
             rows.append(row)
             print(
                 "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()),

@@ -58,6 +58,7 @@ def test_what_the_device_feels_is_what_one_sensor_feels():
     shaking, state = Shaking(stepper, geoms), np.zeros(stepper.nstate)
     stepper.reset(state)
     touched = Touched(stepper._data, np.array([0]), 1, skin_modes(stepper.model))
+    device = touched.device  # a single sensor's, whatever the batches run on
     slid = 0
     for i in range(32):
         touched.begin()
@@ -65,8 +66,8 @@ def test_what_the_device_feels_is_what_one_sensor_feels():
         expected = shaking.of_step(state, result, DT)
         area, state = stepper.touched_area(result.state), result.state
         stepper._data.dt.fill_(DT)
-        wrench = wp.array(result.wrench[:, None], dtype=wp.spatial_vectord)
-        touched.end(wrench, wp.array(result.tangent[:, None], dtype=wp.spatial_matrixd))
+        wrench = wp.array(result.wrench[:, None], dtype=wp.spatial_vectord, device=device)
+        touched.end(wrench, wp.array(result.tangent[:, None], dtype=wp.spatial_matrixd, device=device))
         np.testing.assert_allclose(touched.area.numpy()[0], area, rtol=1e-12)
         if expected is None:
             assert not touched.drive.numpy().any()

@@ -123,7 +123,5 @@ def test_worlds_that_differ_in_everything_are_each_alone(n, device, bound):
     forces = together(n, device)
     peak = abs(forces).max()
     assert peak > 0.1 and np.ptp(abs(forces).max((0, 2))) > 0.3 * peak
-    for w in range(n):
-        np.testing.assert_allclose(
-            forces[:, w], alone(n, w, device), atol=bound * peak, rtol=0, err_msg=str(w)
-        )
+    away = {w: float(abs(forces[:, w] - alone(n, w, device)).max() / peak) for w in range(n)}
+    assert not {w: a for w, a in away.items() if not a <= bound}
