@@ -4,7 +4,8 @@
     python benchmarks/discrepancy_recordings.py --fit out/practice.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights from
-practice; the other half is run once, afterwards (--half blind). A run goes on where its JSON ends.
+practice; the other half is run once, afterwards (--half blind), and so are a second author's recordings
+(--half second, `recordings_foreign_second.py`). A run goes on where its JSON ends.
 """
 
 import argparse
@@ -14,7 +15,8 @@ import pathlib
 import time
 
 import numpy as np
-import recordings_foreign as foreign
+import recordings_foreign as first
+import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
@@ -69,6 +71,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
         "force": case.force is not None,
         "truth": case.truth,
         "forms": case.forms,
+        "seen": case.seen,
         "channels": case.channels,
         "rows": len(case.counts),
         "seconds": time.process_time() - began,
@@ -281,7 +284,7 @@ def fit(rows: list) -> dict:
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind"), default="practice")
+    args.add_argument("--half", choices=("practice", "blind", "second"), default="practice")
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
@@ -298,14 +301,15 @@ def main(argv=None):
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
     done = {tuple(r["key"]) for r in rows}
-    sources = foreign.bases(args.data, args.half)
-    cases = foreign.plan(args.half, *map(int, args.counts.split(",")))
+    generator, half = (foreign, ()) if args.half == "second" else (first, (args.half,))
+    sources = generator.bases(args.data, *half)
+    cases = generator.plan(*half, *map(int, args.counts.split(",")))
     # in mixed order, so that a run that was stopped holds some of each
     for base, effects, seed in (cases[i] for i in np.random.default_rng(0).permutation(len(cases))):
         key = (base, "+".join(effects), seed)
         if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
             continue
-        case, clean = foreign.make(args.half, sources, base, effects, seed)
+        case, clean = generator.make(*half, sources, base, effects, seed)
         rows.append({"key": key, **judge(case, clean, args.half == "practice")})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))

@@ -19,7 +19,8 @@ __all__ = ["ACCEPTED", "EFFECTS", "OUTSIDE", "SINGLE", "Case", "Effect", "bases"
 
 @dataclass
 class Case:
-    """One recording on its way: counts (n, 19), force (n, 3) [N], tdc (n,) or None; rate [Hz]."""
+    """One recording on its way: counts (n, 19), force (n, 3) [N], tdc (n,) or None; rate [Hz]; seen: how
+    plain each hidden effect is, where the generator measures it."""
 
     base: str
     counts: np.ndarray
@@ -30,6 +31,7 @@ class Case:
     channels: list = field(default_factory=list)
     truth: list = field(default_factory=list)
     forms: list = field(default_factory=list)
+    seen: list = field(default_factory=list)
 
     @property
     def clock(self):

@@ -1,0 +1,116 @@
+"""Recordings with hidden effects by a second author, on a synthetic base: independent, seen, reproducible."""
+
+import ast
+import importlib
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+
+BENCHMARKS = pathlib.Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def second():
+    sys.path.insert(0, str(BENCHMARKS))
+    yield importlib.import_module("recordings_foreign_second")
+    sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.fixture(scope="module")
+def sources(second):
+    """Synthetic: three smooth loads, of which each electrode has a share, a slow rise, noise of 3 counts."""
+
+    def base(rng):
+        n, rate = 3000, 100.0
+        t = np.arange(n) / rate
+        loads = np.stack(
+            [np.sin(2 * np.pi * f * t + p) ** 2 for f, p in ((0.05, 0), (0.08, 1), (0.12, 2))], 1
+        )
+        counts = np.linspace(2500, 3300, 19) - loads @ rng.uniform(-150, 350, (3, 19))
+        counts += 20 * t[:, None] / t[-1]
+        force = loads @ rng.uniform(-2, 2, (3, 3)) + 0.02 * rng.standard_normal((n, 3))
+        counts = np.rint(counts + 3 * rng.standard_normal(counts.shape))
+        return second.Case("press", counts, rate, force, np.rint(2000 - 40 * t / 30), True)
+
+    return dict.fromkeys(("press", "still"), base)
+
+
+def _forms(second):
+    return [(effect, i) for effect, spec in second.EFFECTS.items() for i in range(len(spec.forms))]
+
+
+def test_it_imports_nothing_of_what_it_judges_and_no_form_of_the_first():
+    path = BENCHMARKS / "recordings_foreign_second.py"
+    assert "biotac_mj" not in path.read_text()
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [(a.name.split(".")[0], "") for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [(node.module.split(".")[0], a.name) for a in node.names]
+    outside = {module for module, _ in names} - set(sys.stdlib_module_names)
+    assert outside == {"numpy", "scipy", "recordings_foreign"}
+    vocabulary = {"ACCEPTED", "NATURAL", "OUTSIDE", "SINGLE", "Case", "Effect", "_counts", "_table", "_z"}
+    assert {name for module, name in names if module == "recordings_foreign"} == vocabulary
+
+
+def test_every_effect_of_the_first_has_three_other_forms(second):
+    first = importlib.import_module("recordings_foreign")
+    assert set(first.EFFECTS) <= set(second.EFFECTS)
+    assert all(len(spec.forms) >= 3 for spec in second.EFFECTS.values())
+    assert sum(len(second.EFFECTS[e].forms) for e in second.OUTSIDE) >= 6
+
+
+def test_every_form_changes_its_electrodes_and_does_so_again_from_the_same_seed(second, sources):
+    for effect, form in _forms(second):
+        case, clean = second.make(sources, "press", (effect,), form)
+        again, clean_again = second.make(sources, "press", (effect,), form)
+        assert case.truth == [effect] and case.forms == [form] and case.seen[0] >= second.LEAST, effect
+        assert np.array_equal(case.counts, again.counts) and np.array_equal(clean, clean_again), effect
+        assert np.array_equal(case.force, again.force) and case.channels == again.channels, effect
+        assert case.counts.min() >= 0 and case.counts.max() <= 4095 and np.isfinite(case.force).all(), effect
+        assert len(case.force) == len(case.counts), effect
+        if effect in ("relax", "hyster"):
+            assert np.array_equal(case.counts, clean), effect
+        elif len(case.counts) == len(clean):
+            changed = np.flatnonzero((case.counts != clean).any(0))
+            assert len(changed) and set(changed) <= set(case.channels[0]), (effect, form)
+        other, _ = second.make(sources, "press", (effect,), form + len(second.EFFECTS[effect].forms))
+        assert other.counts.shape != case.counts.shape or not np.array_equal(other.counts, case.counts)
+
+
+def test_a_change_is_as_visible_as_it_is_large(second, sources):
+    before = sources["press"](np.random.default_rng(0)).counts
+    assert second.visible(before, before) == 0
+    drift = np.zeros_like(before)
+    drift[:, 4] = np.linspace(0, 30, len(before))
+    seen = [second.visible(before, before + k * drift) for k in (1, 2, 20)]
+    assert seen[1] == pytest.approx(2 * seen[0]) and seen[0] > second.LEAST
+    # the same slow change of all electrodes is less beside the recording's own
+    rise = np.repeat(drift[:, [4]], 19, axis=1)
+    assert second.visible(before, before + rise, gradual=True) < second.visible(before, before + rise)
+
+
+def test_the_plan_is_balanced_and_makes_pairs(second, sources):
+    cases = second.plan(9, 5, 20)
+    outside = [c for c in cases if set(c[1]) & second.OUTSIDE]
+    assert len(set(cases)) == len(cases)
+    assert sum(not c[1] for c in cases) >= 40 and sum(len(c[1]) == 2 for c in cases) >= 20
+    assert sum(len(c[1]) == 1 for c in cases) - len(outside) >= 96 and len(outside) >= 16
+    used = {(c[1][0], c[2] % len(second.EFFECTS[c[1][0]].forms)) for c in cases if len(c[1]) == 1}
+    assert used == set(_forms(second))
+    for _, pair, seed in [c for c in cases if len(c[1]) == 2][:4]:
+        case, _ = second.make(sources, "press", pair, seed)
+        assert set(case.truth) == set(pair) and min(case.seen) >= second.LEAST
+    null, clean = second.make(sources, "still", (), 0)
+    assert np.array_equal(null.counts, clean) and null.truth == []
+
+
+def test_a_change_that_cannot_be_seen_is_an_error(second, sources, monkeypatch):
+    monkeypatch.setitem(second.EFFECTS, "hum", second.Effect((lambda c, rng, size: [],)))
+    with pytest.raises(
+        ValueError, match=r"no draw of \('hum',\) can be seen on 'press': give it another base"
+    ):
+        second.make(sources, "press", ("hum",), 0)
