@@ -30,7 +30,7 @@ def right(effect: dict, case) -> str | None:
     return "natural" if foreign.NATURAL[case.base] & {effect["id"]} else None
 
 
-def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
+def judge(case, clean: np.ndarray) -> dict:
     """Runs one case and scores it."""
     from biotac_mj.discrepancy import Recording, diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import clues, family
@@ -38,7 +38,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
 
     began = time.process_time()
     recording = Recording(case.counts, case.force, case.tdc, case.rate)
-    d = diagnose_recording(recording, **({"named": 0.35} if practice else {}))
+    d = diagnose_recording(recording)
     verdict = verdict_dict(d)
     named = []
     for f, e in zip([*d.findings, *d.late], verdict["effects"]):
@@ -281,7 +281,7 @@ def fit(rows: list) -> dict:
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind"), default="practice")
+    args.add_argument("--half", choices=("practice", "blind", "mixed"), default="practice")
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
@@ -306,7 +306,7 @@ def main(argv=None):
         if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
             continue
         case, clean = foreign.make(args.half, sources, base, effects, seed)
-        rows.append({"key": key, **judge(case, clean, args.half == "practice")})
+        rows.append({"key": key, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))

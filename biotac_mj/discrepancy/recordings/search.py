@@ -8,13 +8,15 @@ import tqdm
 
 from .between import find_between
 from .confidence import NAMED, confidence
-from .developing import exchanged, gains, levels, settle
 from .electronics import coloured, correlated, humming, noisy
 from .findings import Finding
+from .gains import gains
+from .levels import levels, settle
+from .order import exchanged
 from .proof import prove, views
 from .recording import Recording
 from .rest import Rest, rest
-from .sampling import sampling_faults
+from .sampling import lost, sampling_faults
 from .session import Session
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
@@ -115,15 +117,14 @@ def _search(session, weak, named, bar):
 
     sampling_faults(session, take)
     bar.update()
-    for _ in range(3):
-        finding = humming(session)
-        if finding is None or not take(finding):
-            break
-    if not any(f.id == "freeze" for f in session.findings):
-        for find in (coloured, correlated):
-            finding = find(session)
-            if finding is not None:
-                take(finding)
+    finding = humming(session)
+    if finding is not None:
+        take(finding)
+    # held rows have a colour, and what is left of a wave is common, by themselves
+    for find, spoilt in ((coloured, {"freeze"}), (correlated, {"freeze", "hum"})):
+        finding = None if spoilt & {f.id for f in session.findings} else find(session)
+        if finding is not None:
+            take(finding)
     for finding in noisy(session):
         take(finding)
     bar.update()
@@ -142,6 +143,8 @@ def _search(session, weak, named, bar):
                 refused.add(mine)
         if find is levels:
             settle(session)
+    for finding in lost(session):  # an exchange or a jump is none
+        take(finding)
     bar.update()
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
