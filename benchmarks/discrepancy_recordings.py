@@ -76,6 +76,7 @@ def judge(case, clean: np.ndarray) -> dict:
         "named": named,
         "weak": weak,
         "unknown": d.rest.significant,
+        "loaded": d.session.loaded,
         "rest": d.rest.clues,
         "closed": closed(d, case, clean),
         "views": {k: (v["before"], v["after"]) for k, v in d.gap.items()},

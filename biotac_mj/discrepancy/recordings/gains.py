@@ -15,6 +15,7 @@ __all__ = ["gains"]
 _CURVED = 0.18
 _DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
 _WINDOW = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
+_SPLITS = 28  # times tried
 _ROUNDS = 4  # of reweighting: an electrode that changes is an outlier for as long
 
 
@@ -83,7 +84,7 @@ class _Regression:
             self.least = max(floor[i], float(np.quantile(square, 0.25)))
             self.weight = self.least / (square + self.least)
         plain = self.cost(self.plain(everything)).sum()
-        splits = np.arange(max(2, int(0.06 * w)), int(0.94 * w))
+        splits = np.unique(np.linspace(max(2, 0.06 * w), 0.94 * w - 1, _SPLITS).astype(int))
         costs = []
         for s in splits:
             late = np.arange(w) >= s

@@ -30,12 +30,13 @@ def levels(session: Session, refused: set) -> Finding | None:
         best = courses(alone[:, i], time)[0]
         options.append((_energy(best, time) * m.precision[i, i], int(k), alone[:, i]))
     options.sort(key=lambda o: -o[0])
+    coarse = [f for f in session.findings if f.id == "quantise"]
     for energy, k, level in [o for o in options if (o[1],) not in refused][:6]:
         course = courses(level, time, thorough=True)[0]
         if course.p > 0.02 or course.nats < 6 or energy < 30:
             continue
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
-        if course.size * slope < _LEAST:
+        if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
         if k is not None and course.kind == "smooth" and not m.parted:
             continue  # in so short a time an electrode creeps with the load as well

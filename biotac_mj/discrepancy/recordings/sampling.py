@@ -205,7 +205,9 @@ def _stuck(session):
     usual = np.median(moves[session.fit & free], axis=0)
     active = np.median(moves / np.maximum(usual, 0.5), axis=1) > 0.5
     steps = np.array([lattice.get(k, 1.0) for k in range(19)])
-    alive = noise_level(whole) > 0.7 * steps  # without noise a constant reading is no news
+    # without noise a constant reading is no news; while it is stuck it has none
+    halves = np.array_split(whole, 2)
+    alive = np.maximum(*(noise_level(x) for x in halves)) > 0.7 * steps
     for k in range(19):
         if not alive[k] and not _edge_value(whole[:, k]):
             continue

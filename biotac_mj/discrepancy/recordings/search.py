@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 import tqdm
 
+from ..evidence import benjamini_hochberg
 from .between import find_between
 from .confidence import NAMED, confidence
 from .electronics import coloured, correlated, humming, noisy
@@ -22,6 +23,7 @@ from .session import Session
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
+_FALSE = 0.05  # of the names of a report
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -74,7 +76,10 @@ def diagnose_recording(
         bar.update()
         for finding in session.findings:
             prove(session, finding)
-        contradicted = [f for f in session.findings if f.verified is False]
+        # of all that was tested here, one in twenty of those named may be false (Benjamini and Hochberg 1995)
+        tested = [*session.findings, *weak]
+        q = dict(zip(map(id, tested), benjamini_hochberg(np.array([f.p for f in tested]))))
+        contradicted = [f for f in session.findings if f.verified is False or q[id(f)] > _FALSE]
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))

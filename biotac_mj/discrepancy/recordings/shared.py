@@ -5,7 +5,7 @@ import numpy as np
 from ...geometry.electrodes import electrode_positions
 from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ..evidence import sign_flip
-from .courses import BLOCKS, Course, compare
+from .courses import BLOCKS, SHARP, Course, compare, sharp
 from .findings import Finding
 from .model import Model
 
@@ -80,10 +80,13 @@ def _shares(m: Model, course: Course, own: np.ndarray) -> np.ndarray:
     g = course(time)
     g = g - g.mean()
     marginal = np.linalg.inv(np.linalg.inv(m.precision)[:number, :number])
-    change = np.diff(m.levels(m.alone())[0], axis=0)
-    # the cells' levels scatter more than the changes within them
-    worse = np.median((np.median(np.abs(change), axis=0) / 0.6745) ** 2 / 2 * np.diag(m.precision)[:number])
-    worse = max(worse, 1e-9)
+    alone = m.levels(m.alone())[0]
+    alone = alone - alone.mean(0)
+    alone = alone - np.outer(g, g @ alone / max(g @ g, 1e-12))
+    # the cells' levels wander by more than the changes within them, and remember where they have been
+    memory = np.clip((alone[1:] * alone[:-1]).sum(0) / np.maximum((alone**2).sum(0), 1e-12), 0, 0.95)
+    scatter = (alone**2).mean(0) * (1 + memory) / (1 - memory)
+    worse = max(float(np.median(scatter * np.diag(m.precision)[:number])), 1e-9)
     share = np.ones(number)
     for _ in range(
         3
@@ -133,7 +136,9 @@ def _name_shared(session, finding, course, change):
         )
         misfit[name] = float(left @ spread @ left)
     rising = change > 0
-    sudden = course.kind == "step"
+    # every sensor warms up, and to a course that is uneven a step fits as well: a step has to be sharp
+    common, at = m.levels(m.shared(np.ones(number)))
+    sudden = course.kind == "step" and sharp(common, at, course.onset) > SHARP
     order = ["fluidloss", "warmup"] if rising else ["warmup"]
     order = [*order, "count_offset", "count_gain"] if not sudden else ["count_offset", "count_gain", *order]
     best = min(misfit.values())
