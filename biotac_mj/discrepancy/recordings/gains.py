@@ -184,7 +184,7 @@ def _gain_finding(session, k, i, c, spread, onset, gain, p):
             "factor": float(abs(np.log(max(abs(c), 0.02)))) if c > 0 else 2.0,
             "blocks": float(np.mean(gain > 0)),
             "seconds": float(np.log(m.time[m.inside][-1])),
-            "spread": float(np.log(spread / abs(1 - c) + 0.01)),
+            "spread": float(np.log(min(spread / abs(1 - c), 2.0) + 0.01)),
             "explained": float(m.activity[i] * np.sqrt(m.precision[i, i])),
         },
         correct=correct,

@@ -12,7 +12,7 @@ from .session import Session
 
 __all__ = ["Rest", "rest"]
 
-_UNKNOWN = 0.5
+_UNKNOWN = 0.42
 
 
 @dataclasses.dataclass

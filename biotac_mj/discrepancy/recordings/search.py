@@ -126,10 +126,11 @@ def _search(session, weak, named, bar):
     if finding is not None:
         take(finding)
     # held rows have a colour, and what is left of a wave is common, by themselves
-    for find, spoilt in ((coloured, {"freeze"}), (correlated, {"freeze", "hum"})):
-        finding = None if spoilt & {f.id for f in session.findings} else find(session)
-        if finding is not None:
-            take(finding)
+    if not {f.id for f in session.findings} & {"freeze", "hum"}:
+        for find in (coloured, correlated):
+            finding = find(session)
+            if finding is not None:
+                take(finding)
     for finding in noisy(session):
         take(finding)
     bar.update()
