@@ -23,11 +23,28 @@ def right(effect: dict, case) -> str | None:
     """The hidden effect that a named one is, on its channel; "natural" for what the base has by itself."""
     ids = {effect["id"], *effect["ties"]}
     for name, channels in zip(case.truth, case.channels):
+        if name == "lost" and not _near(effect.get("places", ()), case):
+            continue
         if foreign.ACCEPTED[name] & ids and (
             name not in foreign.SINGLE or {f"e{k + 1}" for k in channels} & set(effect["channels"])
         ):
             return name
     return "natural" if foreign.NATURAL[case.base] & {effect["id"]} else None
+
+
+def _near(places, case):
+    """Whether one of some times [s] is a gap of the case, within a tenth of a second."""
+    return any(np.abs(np.asarray(case.gaps) / case.rate - t).min(initial=1.0) < 0.1 for t in places)
+
+
+def _as_said(finding):
+    """What decides whether a finding is right."""
+    return {
+        "id": finding.id,
+        "ties": finding.ties,
+        "channels": [f"e{k + 1}" for k in finding.channels],
+        "places": finding.clues.get("places", ()),
+    }
 
 
 def judge(case, clean: np.ndarray) -> dict:
@@ -49,7 +66,7 @@ def judge(case, clean: np.ndarray) -> dict:
                 "channels": e["channels"],
                 "confidence": e["confidence"],
                 "confirmed": e["confirmed"],
-                "right": right(e, case),
+                "right": _named(f, case),
                 "family": family(f),
                 "clues": clues(f),
             }
@@ -60,7 +77,7 @@ def judge(case, clean: np.ndarray) -> dict:
             "family": family(f),
             "clues": clues(f),
             "confidence": f.confidence,
-            "right": right({"id": f.id, "ties": f.ties, "channels": [f"e{k + 1}" for k in f.channels]}, case),
+            "right": _named(f, case),
         }
         for f in d.rejected
     ]
@@ -123,9 +140,7 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
 
 
 def _named(finding, case):
-    return right(
-        {"id": finding.id, "ties": finding.ties, "channels": [f"e{k + 1}" for k in finding.channels]}, case
-    )
+    return right(_as_said(finding), case)
 
 
 def code_hash() -> str:
@@ -228,7 +243,7 @@ CLUES = {
     "order": {"nats": 1, "ratio": 1},
     "samples": {"nats": 1},
     "limit": {"nats": 1, "blocks": 1, "pile": 1},
-    "lost": {"ratio": 1},
+    "lost": {"times": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1},
     "pairs": {"share": 1, "kappa": 1, "t": 1},

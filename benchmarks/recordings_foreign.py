@@ -30,6 +30,7 @@ class Case:
     channels: list = field(default_factory=list)
     truth: list = field(default_factory=list)
     forms: list = field(default_factory=list)
+    gaps: list = field(default_factory=list)  # rows before which some were lost
 
     @property
     def clock(self):
@@ -398,6 +399,7 @@ def _dropped(number, low, high):
         keep = np.ones(len(c.counts), bool)
         for a in (rng.uniform(0.1, 0.85, number) * len(keep)).astype(int):
             keep[a : a + int(rng.uniform(low, high) * c.rate)] = False
+        c.gaps = np.flatnonzero(np.diff(np.flatnonzero(keep)) > 1) + 1
         c.counts = c.counts[keep]
         c.force = None if c.force is None else c.force[: keep.sum()]
         c.tdc = None if c.tdc is None else c.tdc[: keep.sum()]

@@ -410,7 +410,8 @@ def lost(session: Session) -> list[Finding]:
     f.p = len(places) / len(score)  # rows that stand alone as much
     ratio = max(score[i] / max(around[i], 1) for i in places)
     f.clues |= {
-        "ratio": float(np.log(ratio)),
+        "times": float(min(ratio, 30.0)),
+        "places": at / r.rate,
         "number": float(np.log(len(places))),
         "electrodes": float(share),
         "score": float(np.log(max(score[i] for i in places))),
