@@ -1,11 +1,11 @@
 """Recordings of real sensors with hidden effects: what `biotac diagnose --electrodes` names.
 
     python benchmarks/discrepancy_recordings.py DATA --half practice --json out/practice.json
-    python benchmarks/discrepancy_recordings.py --fit out/practice.json
+    python benchmarks/discrepancy_recordings.py --fit out/practice.json out/mixed.json
 
-DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights from
-practice; the other half is run once, afterwards (--half blind), and so are a second author's recordings
-(--half second, `recordings_foreign_second.py`). A run goes on where its JSON ends.
+DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
+pieces of either half and further forms. The other half is run once, afterwards (--half blind), and so are a
+second author's recordings (--half second, `recordings_foreign_second.py`). A run goes on where its JSON ends.
 """
 
 import argparse
@@ -25,6 +25,8 @@ def right(effect: dict, case) -> str | None:
     """The hidden effect that a named one is, on its channel; "natural" for what the base has by itself."""
     ids = {effect["id"], *effect["ties"]}
     for name, channels in zip(case.truth, case.channels):
+        if name == "lost" and not _near(effect.get("places", ()), case):
+            continue
         if foreign.ACCEPTED[name] & ids and (
             name not in foreign.SINGLE or {f"e{k + 1}" for k in channels} & set(effect["channels"])
         ):
@@ -32,7 +34,22 @@ def right(effect: dict, case) -> str | None:
     return "natural" if foreign.NATURAL[case.base] & {effect["id"]} else None
 
 
-def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
+def _near(places, case):
+    """Whether one of some times [s] is a gap of the case, within a tenth of a second."""
+    return any(np.abs(np.asarray(case.gaps) / case.rate - t).min(initial=1.0) < 0.1 for t in places)
+
+
+def _as_said(finding):
+    """What decides whether a finding is right."""
+    return {
+        "id": finding.id,
+        "ties": finding.ties,
+        "channels": [f"e{k + 1}" for k in finding.channels],
+        "places": finding.clues.get("places", ()),
+    }
+
+
+def judge(case, clean: np.ndarray) -> dict:
     """Runs one case and scores it."""
     from biotac_mj.discrepancy import Recording, diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import clues, family
@@ -40,7 +57,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
 
     began = time.process_time()
     recording = Recording(case.counts, case.force, case.tdc, case.rate)
-    d = diagnose_recording(recording, **({"named": 0.35} if practice else {}))
+    d = diagnose_recording(recording)
     verdict = verdict_dict(d)
     named = []
     for f, e in zip([*d.findings, *d.late], verdict["effects"]):
@@ -51,7 +68,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
                 "channels": e["channels"],
                 "confidence": e["confidence"],
                 "confirmed": e["confirmed"],
-                "right": right(e, case),
+                "right": _named(f, case),
                 "family": family(f),
                 "clues": clues(f),
             }
@@ -62,7 +79,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
             "family": family(f),
             "clues": clues(f),
             "confidence": f.confidence,
-            "right": right({"id": f.id, "ties": f.ties, "channels": [f"e{k + 1}" for k in f.channels]}, case),
+            "right": _named(f, case),
         }
         for f in d.rejected
     ]
@@ -79,6 +96,7 @@ def judge(case, clean: np.ndarray, practice: bool = False) -> dict:
         "named": named,
         "weak": weak,
         "unknown": d.rest.significant,
+        "loaded": d.session.loaded,
         "rest": d.rest.clues,
         "closed": closed(d, case, clean),
         "views": {k: (v["before"], v["after"]) for k, v in d.gap.items()},
@@ -125,9 +143,7 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
 
 
 def _named(finding, case):
-    return right(
-        {"id": finding.id, "ties": finding.ties, "channels": [f"e{k + 1}" for k in finding.channels]}, case
-    )
+    return right(_as_said(finding), case)
 
 
 def code_hash() -> str:
@@ -225,78 +241,135 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "size": 1, "lead": 1},
-    "one": {"nats": 1, "stands": 1, "counts": 1, "turns": -1, "lead": 1},
-    "answer": {"nats": 1, "factor": 1, "seconds": 1},
-    "order": {"nats": 1, "ratio": 1, "left": -1},
-    "samples": {"blocks": 1},
-    "limit": {"nats": 1, "blocks": 1},
-    "lost": {"ratio": 1, "score": 1},
+    "one": {"nats": 1, "counts": 1, "turns": -1, "lead": 1},
+    "answer": {"nats": 1, "spread": -1},
+    "order": {"nats": 1, "ratio": 1},
+    "samples": {"nats": 1},
+    "limit": {"nats": 1, "blocks": 1, "pile": 1},
+    "lost": {"times": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1},
-    "pairs": {"share": 1, "kappa": 1},
-    "common": {"share": 1, "kappa": 1},
-    "size": {"factor": 1, "stands": 1},
+    "pairs": {"share": 1, "kappa": 1, "t": 1},
+    "common": {"kappa": 1, "t": 1},
+    "size": {"factor": 1, "counts": 1},
     "force": {"gain": 1, "size": 1},
-    "left_loaded": {"fast3": 1, "level1": 1, "aside3": 1},
-    "left_unloaded": {"counts1": 1, "counts3": 1},
+    "left_loaded": {"fast1": 1, "level1": 1},
+    "left_unloaded": {"counts1": 1, "level3": 1, "stands": 1},
 }
+RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
+SPREAD = 0.5  # of a family's rate about the others', in log odds, before it is seen
+TOP = 0.25  # share of the names, the surest, whose rate no confidence may exceed
+
+
+def _standard(cases, signs):
+    """(n, clues) standardised, their means and spreads."""
+    x = np.array([[c["clues"].get(k, 0.0) for k in signs] for c in cases])
+    return x, x.mean(0), np.maximum(x.std(0), 0.1)
+
+
+def _logistic(cases, signs):
+    """Intercept and weights (1 + clues,): ridge on standardised clues, signs kept."""
+    from scipy.optimize import minimize
+
+    x, mean, sd = _standard(cases, signs)
+    y = np.array([c["right"] is not None for c in cases], float)
+    z, sign = (x - mean) / sd, np.array([*signs.values()])
+
+    def loss(w):
+        t = w[0] + z @ w[1:]
+        # no family is beyond doubt: one name more that was right, one that was wrong
+        doubt = np.logaddexp(0, w[0]) + np.logaddexp(0, -w[0])
+        return np.sum(np.logaddexp(0, t) - y * t) + RIDGE * np.sum((w[1:] - sign) ** 2) + doubt
+
+    bounds = [(None, None), *((0, None) if s > 0 else (None, 0) for s in sign)]
+    w = minimize(loss, np.zeros(1 + len(signs)), method="L-BFGS-B", bounds=bounds).x
+    return np.r_[w[0] - (w[1:] / sd) @ mean, w[1:] / sd]
+
+
+def _left_out(cases, signs, key):
+    """(n,) log odds of each case by weights that have seen none of its kind (`key`)."""
+    out = np.empty(len(cases))
+    kinds = [c[key] for c in cases]
+    for kind in set(kinds):
+        mine = np.array([k == kind for k in kinds])
+        rest = [c for c, m in zip(cases, mine) if not m]
+        w = _logistic(rest, signs) if rest else np.zeros(1 + len(signs))
+        out[mine] = w[0] + _standard([c for c, m in zip(cases, mine) if m], signs)[0] @ w[1:]
+    return out
 
 
 def fit(rows: list) -> dict:
-    """Weights of the confidence's logistic functions, by family: ridge on standardised clues, signs kept."""
+    """Weights of the confidence's logistic functions, by family, made as sure as they are of forms and of
+    sensors that were left out: log odds a s + b + one number for each family, drawn to nothing, fitted to
+    the scores s of names left out (Platt); and the rate of the surest, which none exceeds."""
     from scipy.optimize import minimize
 
-    out = {}
-    everything = [n for r in rows for n in (*r["named"], *r["weak"])]
-    for family, signs in CLUES.items():
-        mine = [n for n in everything if n["family"] == family]
-        if family.startswith("left"):  # effects without a name, against recordings without an effect
+    out, score, family, y = {}, [], [], []
+    for name, signs in CLUES.items():
+        mine = [
+            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "base": r["base"]}
+            for r in rows
+            for n in (*r["named"], *r["weak"])
+            if n["family"] == name
+        ]
+        if name.startswith("left"):  # effects without a name, against recordings without an effect
             mine = [
                 {"clues": r["rest"], "right": "outside" if r["truth"] else None}
                 for r in rows
-                if (r["base"] == "pressed") == (family == "left_loaded")
+                if r["loaded"] == (name == "left_loaded")
                 and (not r["truth"] or set(r["truth"]) & foreign.OUTSIDE)
             ]
         if not mine:
             continue
-        x = np.array([[n["clues"].get(k, 0.0) for k in signs] for n in mine])
-        y = np.array([n["right"] is not None for n in mine], float)
-        mean, sd = x.mean(0), np.maximum(x.std(0), 0.1)
-        z = (x - mean) / sd
-
-        def loss(w, z=z, y=y, signs=signs):
-            t = w[0] + z @ w[1:]
-            return np.sum(np.logaddexp(0, t) - y * t) + 0.1 * np.sum(
-                (w[1:] - np.array([*signs.values()])) ** 2
-            )
-
-        bounds = [(None, None), *((0, None) if s > 0 else (None, 0) for s in signs.values())]
-        w = minimize(loss, np.zeros(1 + len(signs)), method="L-BFGS-B", bounds=bounds).x
-        out[family] = {
-            "intercept": float(w[0] - (w[1:] / sd) @ mean),
-            "weights": dict(zip(signs, (w[1:] / sd).tolist())),
+        w = _logistic(mine, signs)
+        out[name] = {
+            "intercept": float(w[0]),
+            "weights": dict(zip(signs, w[1:].tolist())),
             "cases": len(mine),
-            "right": int(y.sum()),
+            "right": sum(n["right"] is not None for n in mine),
         }
+        if not name.startswith("left"):
+            for key in ("form", "base"):
+                score += np.clip(_left_out(mine, signs, key), -6, 6).tolist()
+                family += [name] * len(mine)
+                y += [n["right"] is not None for n in mine]
+    names = [n for n in out if not n.startswith("left")]
+    score, y = np.array(score), np.array(y, float)
+    which = np.array([names.index(f) for f in family])
+
+    def loss(w):
+        t = w[0] * score + w[1] + w[2:][which]
+        return np.sum(np.logaddexp(0, t) - y * t) + np.sum(w[2:] ** 2) / (2 * SPREAD**2)
+
+    start = np.r_[1.0, np.zeros(1 + len(names))]
+    bounds = [(0.2, 1.0), *[(None, None)] * (1 + len(names))]
+    w = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
+    said = w[0] * score + w[1] + w[2:][which]
+    named = said > 0
+    top = said >= np.quantile(said[named], 1 - TOP)
+    for name, own in zip(names, w[2:]):
+        known = out[name]
+        known["intercept"] = float(w[0] * known["intercept"] + w[1] + own)
+        known["weights"] = {k: float(w[0] * v) for k, v in known["weights"].items()}
+    out["most"] = float((y[top].sum() + 1) / (top.sum() + 2))
     return out
 
 
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind", "second"), default="practice")
+    args.add_argument("--half", choices=("practice", "blind", "mixed", "second"), default="practice")
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
-    args.add_argument("--fit", metavar="JSON")
+    args.add_argument("--fit", metavar="JSON", nargs="+")
     args = args.parse_args(argv)
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
-        path.write_text(
-            json.dumps(fit(json.loads(pathlib.Path(args.fit).read_text())["cases"]), indent=1) + "\n"
-        )
+        rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
+        path.write_text(json.dumps(fit(rows), indent=1) + "\n")
         return
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
@@ -310,7 +383,7 @@ def main(argv=None):
         if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
             continue
         case, clean = generator.make(*half, sources, base, effects, seed)
-        rows.append({"key": key, **judge(case, clean, args.half == "practice")})
+        rows.append({"key": key, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))

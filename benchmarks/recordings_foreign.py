@@ -32,6 +32,7 @@ class Case:
     truth: list = field(default_factory=list)
     forms: list = field(default_factory=list)
     seen: list = field(default_factory=list)
+    gaps: list = field(default_factory=list)  # rows before which some were lost
 
     @property
     def clock(self):
@@ -400,6 +401,7 @@ def _dropped(number, low, high):
         keep = np.ones(len(c.counts), bool)
         for a in (rng.uniform(0.1, 0.85, number) * len(keep)).astype(int):
             keep[a : a + int(rng.uniform(low, high) * c.rate)] = False
+        c.gaps = np.flatnonzero(np.diff(np.flatnonzero(keep)) > 1) + 1
         c.counts = c.counts[keep]
         c.force = None if c.force is None else c.force[: keep.sum()]
         c.tdc = None if c.tdc is None else c.tdc[: keep.sum()]
@@ -576,6 +578,200 @@ def _bubble(c, rng):
     return range(19)
 
 
+# --- further forms, to see what a fit to those above is worth elsewhere
+
+
+def _two_jumps(c, rng):
+    k, n = _one(c, rng), len(c.counts)
+    s, size = _start(rng, n), _sign(rng) * rng.uniform(60, 250)
+    c.counts[s:, k] += 0.6 * size
+    c.counts[s + int(rng.uniform(1, 3) * c.rate) :, k] += 0.4 * size
+    return [k]
+
+
+def _ringing_jump(c, rng):
+    k, s = _one(c, rng), _start(rng, len(c.counts))
+    t = np.arange(len(c.counts) - s) / c.rate
+    c.counts[s:, k] += _sign(rng) * rng.uniform(60, 250) * (1 + 0.3 * np.exp(-t) * np.cos(6 * t))
+    return [k]
+
+
+def _supply_jump(c, rng):
+    c.counts[_start(rng, len(c.counts)) :] += _sign(rng) * rng.uniform(20, 60)
+    return range(19)
+
+
+def _supply_settling(c, rng):
+    s = _start(rng, len(c.counts))
+    t = np.arange(len(c.counts) - s) / len(c.counts)
+    c.counts[s:] += (_sign(rng) * rng.uniform(30, 70) * (0.6 + 0.4 * np.exp(-t / 0.03)))[:, None]
+    return range(19)
+
+
+def _of_impedance(law):
+    def form(c, rng):
+        k, s = _one(c, rng, True), _start(rng, len(c.counts))
+        z = _z(c.counts[:, k])
+        rest = np.median(z)
+        c.counts[s:, k] = _counts(rest + law(z[s:] - rest, np.linspace(0, 1, len(z) - s), rng))
+        return [k]
+
+    return form
+
+
+def _two_pairs(c, rng):
+    s, who = _start(rng, len(c.counts)), rng.choice(19, 4, replace=False)
+    c.counts[s:, who] = c.counts[s:, who[[1, 0, 3, 2]]]
+    return [int(k) for k in who]
+
+
+def _heard(rng):
+    """Every other electrode hears one of the two before it."""
+    m = np.zeros((19, 19))
+    for k in range(2, 19, 2):
+        m[k, k - rng.integers(1, 3)] = rng.uniform(0.12, 0.28)
+    return m
+
+
+def _few_hum(c, rng):
+    t, f = np.arange(len(c.counts)) / c.rate, rng.uniform(0.2, 0.44) * c.rate
+    who = rng.choice(19, 6, replace=False)
+    c.counts[:, who] += (rng.uniform(4, 12) * np.sin(2 * np.pi * f * t))[:, None]
+    return range(19)
+
+
+def _smoothing(c, rng):
+    a, value = rng.uniform(0.15, 0.45), c.counts[0].copy()
+    for i, row in enumerate(c.counts):
+        value = value + a * (row - value)
+        c.counts[i] = value
+    return range(19)
+
+
+def _bell(c, rng):
+    w = np.exp(-0.5 * (np.arange(-9, 10) / rng.uniform(1.2, 3.5)) ** 2)
+    pad = np.concatenate([np.repeat(c.counts[:1], 18, axis=0), c.counts])
+    c.counts = np.stack([np.convolve(x, w / w.sum(), "valid") for x in pad.T], axis=1)
+    return range(19)
+
+
+def _at_times(n, r):
+    on = np.repeat(r.random(24) < 0.6, n // 24 + 1)[:n]
+    return 1.3 * on * r.standard_normal(n)
+
+
+def _fading(c, rng):
+    """A memory that fades as a power of time, in sixteen terms."""
+    total, size = np.zeros_like(c.force), rng.uniform(0.3, 0.5)
+    for tau in np.geomspace(0.2, 20, 16):
+        state, a = c.force[0].copy(), 1 / (tau * c.rate)
+        for i, f in enumerate(c.force):
+            state += a * (f - state)
+            total[i] += (f - state) / 16
+    c.force = c.force + size * total
+    return range(19)
+
+
+def _plays(c, rng):
+    """Three plays of different widths."""
+    out = np.zeros_like(c.force)
+    for share in (0.2, 0.5, 1.0):
+        width, z = share * c.force.std(0), np.zeros(3)
+        for i, step in enumerate(np.diff(c.force, axis=0, prepend=c.force[:1])):
+            z = np.clip(z + step, -width, width)
+            out[i] += z / 3
+    c.force = c.force + rng.uniform(0.6, 1.0) * out
+    return range(19)
+
+
+def _loose(c, rng):
+    """The levels of two electrodes change many times."""
+    for k in rng.choice(19, 2, replace=False):
+        steps = np.repeat(rng.uniform(-90, 90, 24), len(c.counts) // 24 + 1)[: len(c.counts)]
+        c.counts[:, k] += steps
+    return range(19)
+
+
+def _bump(c, rng):
+    """Four electrodes leave their level for a while."""
+    a = _start(rng, len(c.counts))
+    b = a + int(rng.uniform(0.08, 0.16) * len(c.counts))
+    for k in rng.choice(19, 4, replace=False):
+        c.counts[a:b, k] += _sign(rng) * rng.uniform(60, 140) * np.hanning(b - a)
+    return range(19)
+
+
+def _sliding(c, rng):
+    """A slow oscillation of five electrodes that becomes faster."""
+    for k in rng.choice(19, 5, replace=False):
+        c.counts[:, k] += rng.uniform(30, 60) * np.sin(2 * np.pi * (3 * c.clock + 8 * c.clock**2) + k)
+    return range(19)
+
+
+_MORE = {
+    "warmup": [
+        _shared(shape, 0.12, 0.35, -1)
+        for shape in (
+            lambda t, r: t**0.35,
+            lambda t, r: np.minimum(t / r.uniform(0.4, 0.8), 1),
+            lambda t, r: np.tanh(t / r.uniform(0.1, 0.3)) * (0.8 + 0.2 * t),
+        )
+    ],
+    "fluidloss": [
+        _shared(shape, 0.12, 0.35, 1) for shape in (lambda t, r: t**1.4, lambda t, r: np.tanh(2 * t))
+    ],
+    "count_offset": [_supply_jump, _supply_settling],
+    "thermal": [_temperature(lambda t, c: np.sign(t) * np.abs(t) ** 0.9)],
+    "drift": [
+        _slow(lambda c, r: np.clip((c.clock - 0.2) / r.uniform(0.1, 0.3), 0, 1)),
+        _slow(lambda c, r: np.exp(-3 * np.exp(-8 * c.clock))),
+        _slow(lambda c, r: np.arctan(8 * _since(c, r)) / 1.45),
+        _slow(lambda c, r: c.clock),
+    ],
+    "jump": [_two_jumps, _ringing_jump],
+    "gain": [
+        _of_impedance(lambda x, t, r: x * r.uniform(0.4, 0.65)),
+        _of_impedance(lambda x, t, r: x * r.uniform(1.4, 1.7)),
+        _factor(lambda x, t, r: x * (1 - r.uniform(0.4, 0.6) / (1 + np.exp(-(t - 0.2) * 20)))),
+        _factor(lambda x, t, r: np.tanh(x / 150) * 150),
+    ],
+    "flip": [_flip(lambda x, whole: 2 * np.median(whole) - x), _of_impedance(lambda x, t, r: -1.2 * x)],
+    "swap": [_two_pairs, _permuted(lambda r: (r.integers(19) + np.array([0, 5, 9])) % 19)],
+    "crosstalk": [_mix(_heard), _mix(lambda r: r.uniform(0.1, 0.2) * (np.eye(19, k=-1) + np.eye(19, k=-2)))],
+    "lowpass": [_smoothing, _bell, _filtered("3")],
+    "hum": [
+        _tone(lambda p, u: 2 * np.abs((p / np.pi) % 2 - 1) - 1),
+        _tone(lambda p, u: np.sin(p) + 0.5 * np.sin(1.37 * p)),
+        _few_hum,
+    ],
+    "quantise": [_coarse(lambda x, q: 3 * np.floor(x / 3)), _coarse(lambda x, q: q * np.rint(x / q) + 1)],
+    "stuck": [
+        _held_channel(lambda v, n, r: np.rint(v) + (np.arange(n) % 97 == 0)),
+        _held_channel(lambda v, n, r: np.full(n, np.rint(v) - r.integers(5, 60))),
+    ],
+    "saturate": [_clipped(lambda x, level, r: np.clip(x, np.rint(level), None) + (x < level - 200))],
+    "spikes": [
+        _outliers(lambda x, r: np.rint(x / 2)),
+        _outliers(lambda x, r: np.clip(x + r.exponential(300, len(x)) + 150, 0, 4095).astype(int)),
+    ],
+    "freeze": [_hold_rows(_pauses(3, 0.5, 2)), _hold_rows(_pauses(12, 0.3, 0.6))],
+    "lost": [_dropped(2, 1, 3), _dropped(5, 0.7, 1.5)],
+    "dither": [_dithered(5), _dithered(8)],
+    "noise": [
+        _loud(lambda n, r: r.standard_t(4, n) / np.sqrt(2)),
+        _loud(_at_times),
+    ],
+    "common_noise": [
+        _reference(lambda n, r: r.uniform(-1.7, 1.7, n)),
+        _reference(lambda n, r: r.standard_t(5, n) / 1.29),
+    ],
+    "latency": [_late(lambda t, r: r.uniform(0.08, 0.2) + 0.04 * (t > 0.4))],
+    "relax": [_fading],
+    "hyster": [_plays],
+    "outside": [_loose, _bump, _sliding],
+}
+
+
 EFFECTS = {
     "warmup": Effect(tuple(_shared(s, 0.12, 0.35, -1) for s in _RISES)),
     "fluidloss": Effect(tuple(_shared(s, 0.12, 0.35, 1) for s in _LOSSES)),
@@ -610,6 +806,9 @@ EFFECTS = {
     "hyster": Effect(_LOOPS, "force"),
     "outside": Effect((_wander, _telegraph, _sawtooth, _flicker, _echo, _bubble)),
 }
+FEW = {name: len(effect.forms) for name, effect in EFFECTS.items()}
+for _name, _forms in _MORE.items():
+    EFFECTS[_name] = Effect((*EFFECTS[_name].forms, *_forms), EFFECTS[_name].on, EFFECTS[_name].late)
 OUTSIDE = {"outside"}
 SINGLE = {"drift", "jump", "gain", "flip", "swap", "stuck", "saturate", "spikes", "noise"}
 # names of the verdict that are right; an id among the ties counts
@@ -636,8 +835,11 @@ def _table(path):
 
 def bases(folder: pathlib.Path, half: str) -> dict:
     """name -> function (rng) -> Case: real base signals of a half, "practice" or "blind"; no sensor and no
-    stretch of one is in both."""
+    stretch of one is in both. "mixed": of either."""
     folder = pathlib.Path(folder)
+    if half == "mixed":
+        both = [bases(folder, name) for name in ("practice", "blind")]
+        return {name: lambda rng, name=name: both[rng.integers(2)][name](rng) for name in both[0]}
     first = half == "practice"
 
     def piece(e, rng, *others, low=60):
@@ -722,8 +924,11 @@ def make(half: str, sources: dict, base: str, effects: tuple, seed: int) -> tupl
         spec = EFFECTS[effect]
         case.counts = np.clip(np.rint(case.counts), 0, 4095) if spec.late else case.counts
         clean = case.counts.copy() if clean is None else clean
-        form = seed % len(spec.forms) if len(effects) == 1 else int(rng.integers(len(spec.forms)))
-        if len(effects) == 1 and effect in OUTSIDE and not case.loaded:
+        few = FEW[effect]
+        form = seed % few if len(effects) == 1 else int(rng.integers(few))
+        if half == "mixed":  # the further forms first
+            form = (seed + few) % len(spec.forms) if len(effects) == 1 else int(rng.integers(len(spec.forms)))
+        if len(effects) == 1 and effect in OUTSIDE and not case.loaded and 3 <= form < few:
             form %= 3  # the others act on the load
         case.channels.append([int(k) for k in spec.forms[form](case, rng)])
         case.truth.append(effect)

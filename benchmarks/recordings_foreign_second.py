@@ -590,6 +590,7 @@ def _lossy(rows):
     def form(c, rng, size):
         keep = ~rows(len(c.counts), c.rate, rng, size)
         keep[:10] = True
+        c.gaps = np.flatnonzero(np.diff(np.flatnonzero(keep)) > 1) + 1
         c.counts = c.counts[keep]
         same = rng.random() < 0.5
         for name in ("force", "tdc"):

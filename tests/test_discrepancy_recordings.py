@@ -246,6 +246,29 @@ def test_gain_sign_and_order_under_load():
     assert abs(d.findings[0].start - start / RATE) < 0.5
 
 
+def test_a_cycle_of_channels_is_found_in_a_short_recording():
+    """By their levels: ten seconds without load, and four channels of which none has its own place."""
+    e, rng = unloaded(4, seconds=10)
+    mixed = noisy(e, rng)
+    mixed[300:, [2, 9, 14, 17]] = mixed[300:, [17, 2, 9, 14]]
+    d = diagnose_recording(Recording(mixed))
+    assert ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 9, 14, 17}, d.verdict
+    assert np.abs(d.session.filled()[~d.session.fit] - e[0]).mean() < 5
+
+
+def test_what_all_channels_hear_is_taken_out():
+    """A wave that is no sine and wanders is one finding; the noise of the reference goes row by row. Against
+    the known clean counts, on the rows kept aside."""
+    e, _, rng = pressed(7)
+    clean, t = noisy(e, rng), np.arange(len(e)) / RATE
+    wave = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t + 0.5 * np.sin(0.1 * t)))
+    for name, added in (("hum", wave), ("common_noise", 8 * rng.standard_normal(len(e)))):
+        d = diagnose_recording(Recording(np.clip(np.rint(clean + added[:, None]), 0, 4095)))
+        assert ids(d).count(name) == 1, d.verdict
+        left = (d.session.filled() - clean)[~d.session.fit]
+        assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(added**2))
+
+
 def test_lost_rows_are_found_where_they_were():
     e, _, rng = pressed(12)
     counts = noisy(e, rng)

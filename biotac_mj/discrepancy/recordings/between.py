@@ -360,6 +360,8 @@ def _finding(session, view, one, rest, best, gain, null):
             lead = said - score
             close = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
             if close and sign_flip(gain(other, rival, said, rest, without)) < _P:
+                if isinstance(other, Latency):  # of the two the one with less to explain
+                    return _finding(session, view, (other, rival), rest, best, gain, null)
                 ties.append(other.id)
     thetas = effect.tried(view.rate, len(view.rows) / view.rate)
     parameters, theta = _parameters(effect, theta, thetas, table)

@@ -8,11 +8,11 @@ import numpy as np
 
 from ..evidence import sign_flip
 
-__all__ = ["Course", "compare", "courses"]
+__all__ = ["BLOCKS", "SHARP", "Course", "compare", "courses", "sharp"]
 
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
-_SHARP = 5.0  # robust standard deviations by which a step beside a smooth course stands out
+SHARP = 5.0  # robust standard deviations by which a step beside a smooth course stands out
 
 
 @dataclasses.dataclass
@@ -121,7 +121,7 @@ def courses(
         kind = "both" if len(knots) > 2 else "step"
         found.append(Course(kind, onset, knots, values, float(weights[-1]), gain, sign_flip(gain)))
     found = [c for c in found if c.kind in kinds]
-    found = [c for c in found if c.kind != "both" or _sharp(level, time, c.onset) > _SHARP]
+    found = [c for c in found if c.kind != "both" or sharp(level, time, c.onset) > SHARP]
     found.sort(key=lambda c: -c.nats)
     if thorough:
         best = found[0]
@@ -129,7 +129,7 @@ def courses(
     return found
 
 
-def _sharp(level, time, onset):
+def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
     """How much the change of level at a time stands out of those at other times, in robust standard
     deviations."""
     total = np.concatenate([[0.0], np.cumsum(level)])

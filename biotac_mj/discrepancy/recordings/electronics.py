@@ -4,8 +4,12 @@ others.
 Everything is looked for above the band in which the load moves: of a recording's rows less what a smooth
 course through them says."""
 
+import dataclasses
+
 import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.optimize import brentq
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from ...geometry.electrodes import electrode_positions
 from ...sensor.channels import electrode_noise
@@ -17,6 +21,8 @@ from .session import Session
 __all__ = ["coloured", "correlated", "humming", "noisy"]
 
 _NAN = float("nan")
+_WANDERS = 3.0  # [s] within which a line keeps its phase
+_LINES = 8
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
 
@@ -127,8 +133,39 @@ def _pole(ratio, bands):
 
 
 def humming(session: Session) -> Finding | None:
-    """A line in the spectrum above the band in which the load moves, whose phase on blocks left out is that
-    of the others."""
+    """A disturbance made of lines in the spectrum, above the band in which the load moves: the strongest,
+    and those that are left once it is taken out (a wave that is no sine has several)."""
+    first = found = _line(session)
+    for _ in range(_LINES - 1):
+        if found is None:
+            break
+        session = Session(session.recording, session.fit, [*session.findings, found])
+        found = _line(session)
+        if found is not None:
+            first = _with_line(first, found)
+    return first
+
+
+def _smooth(x, rows):
+    """x (n, c) averaged over some rows, twice."""
+    size = max(1, int(rows))
+    return uniform_filter1d(uniform_filter1d(x, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
+
+
+def _with_line(hum, line):
+    """A disturbance and one more line of it."""
+    before, after = hum.correct, line.correct
+    frequency = line.parameters["frequency"][0]
+    return dataclasses.replace(
+        hum,
+        channels=tuple(sorted({*hum.channels, *line.channels})),
+        note=f"{hum.note}; and at {frequency:.2f} Hz",
+        correct=lambda counts, at: after(before(counts, at), at),
+    )
+
+
+def _line(session):
+    """The strongest line whose phase on blocks left out is that of the blocks around."""
     r = session.recording
     x = session.counts[session.fit]
     n, rate = len(x), r.rate
@@ -142,8 +179,6 @@ def humming(session: Session) -> Finding | None:
     f = np.fft.rfftfreq(size, 1 / rate)
     floor = np.median(power[f > 0.3 * rate], axis=0)
     # the load's band ends where the spectrum comes down to the floor
-    from scipy.ndimage import median_filter
-
     smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="nearest")
     above = np.flatnonzero(np.median(smooth / floor, axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
@@ -187,14 +222,16 @@ def humming(session: Session) -> Finding | None:
     amplitude = np.median([np.hypot(*w) for w in local], axis=0)
     if p > 0.01 or np.median(gain) < 1:
         return None
-    weights = np.zeros((BLOCKS, 2, 19))
-    weights[:, :, list(channels)] = np.array(local)
-    centre = (np.arange(BLOCKS) + 0.5) * len(y) / BLOCKS / rate
+    who = list(channels)
 
     def correct(counts, at):
-        w = np.stack([[np.interp(at, centre, weights[:, i, k]) for k in range(19)] for i in range(2)])
-        phase = 2 * np.pi * frequency * at
-        return counts - np.sin(phase)[:, None] * w[0].T - np.cos(phase)[:, None] * w[1].T
+        """Takes out what lies about the line: its phase and size may wander, slower than seconds."""
+        turn = np.exp(-2j * np.pi * frequency * at)[:, None]
+        y = counts[:, who] - _smooth(counts[:, who], 0.25 * rate)
+        out = counts.copy()
+        wander = _smooth(y * turn, _WANDERS * rate) / turn
+        out[:, who] -= 2 * wander.real
+        return out
 
     width = rate / size / 4
     return Finding(
@@ -255,15 +292,16 @@ def correlated(session: Session) -> Finding | None:
         )
         t = by_block.mean() / max(by_block.std(ddof=1) / np.sqrt(BLOCKS), 1e-9)
         if best is None or share > best[1]:
-            best = name, share, by_block, t
-    name, share, by_block, t = best
+            level, slope = np.linalg.lstsq(np.column_stack([np.ones(len(k)), k]), mean, rcond=None)[0]
+            best = name, share, by_block, t, slope**2 * (k @ k) > level**2 * len(k)
+    name, share, by_block, t, near = best
     off = np.median(value, axis=1)
     size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
     last = session.recording.time[-1]
     p = sign_flip(by_block)
     coupling = float(np.median(by_block)) / 2
     noise = 1 / np.sqrt(size)
-    if p < 0.01 and 2 * coupling > 0.03 and share > 0.3:
+    if near and p < 0.01 and 2 * coupling > 0.03 and share > 0.3:
         K = _neighbours()[name]
         matrix = np.linalg.inv(np.eye(19) + coupling * K)
         centre = np.median(session.counts[session.fit], axis=0)
@@ -302,18 +340,35 @@ def correlated(session: Session) -> Finding | None:
                 "share": float(common / (mean.std() + 1e-3)),
                 "t": float(np.log(max(off.mean() / max(off.std(ddof=1), 1e-9) * 4, 1.0))),
             },
-            correct=_without_common(session),
+            correct=_without_common(x.reshape(-1, len(alive)), sd) if len(alive) == 19 else None,
         )
     return None
 
 
-def _without_common(session):
-    """Takes out of counts what all electrodes do from one row to the next beyond what the rows around say."""
-    from scipy.ndimage import uniform_filter1d
+def _without_common(x, sd):
+    """Takes out the one noise that all channels have, each with a share of its own: the factor that their
+    differences x (rows, channels), of unit size, have in common; of counts, what the factor's direction does
+    from row to row beyond a smooth course, as smooth as rows left out there ask for. sd: (19,) of noise."""
+    correlation = np.corrcoef(x.T)
+    own = np.ones(len(correlation))
+    for _ in range(20):  # principal factor
+        size, axes = np.linalg.eigh(correlation - np.diag(own))
+        factor = np.abs(axes[:, -1]) * np.sqrt(max(size[-1], 0.0))
+        own = np.clip(1 - factor**2, 0.02, 1)
+    share = factor * sd
+    weight = factor / (own * sd)
+    weight /= weight @ share
 
     def correct(counts, at):
-        quick = counts - uniform_filter1d(counts, 5, axis=0, mode="nearest")
-        return counts - np.median(quick, axis=1)[:, None]
+        common = counts @ weight
+        smooth, missed = [], []
+        for rows in (5, 9, 17, 33, 65):
+            course = savgol_filter(common, rows, 2, mode="nearest")
+            without = (common - course) / (1 - savgol_coeffs(rows, 2)[rows // 2])
+            smooth.append(course)
+            missed.append(uniform_filter1d(without**2, 65))
+        course = np.take_along_axis(np.array(smooth), np.argmin(missed, axis=0)[None], axis=0)[0]
+        return counts - np.outer(common - course, share)
 
     return correct
 
@@ -334,7 +389,7 @@ def noisy(session: Session) -> list[Finding]:
     """Electrodes whose noise is larger than the law says that the others follow."""
     d, _ = _differences(session)
     k = len(d) // BLOCKS
-    if k < 30 or any(f.id == "quantise" for f in session.findings):
+    if k < 20 or any(f.id == "quantise" for f in session.findings):
         return []
     cells = np.abs(d[: k * BLOCKS].reshape(BLOCKS, k, 19))
     cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen

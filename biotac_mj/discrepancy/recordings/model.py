@@ -117,9 +117,12 @@ class Model:
         return np.concatenate([self.value, self._products], axis=1)
 
     def alone(self, value: np.ndarray | None = None) -> np.ndarray:
-        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: about its own mean.
+        """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: less what all do alike.
         value: (m, c) other levels than the model's own."""
         c = len(self.used)
+        if not self.dimensions:
+            value = self.value if value is None else value
+            return value - self.shared(np.ones(c), value)[:, None]
         whole = self.whole if value is None else np.concatenate([value, self._products], axis=1)
         return (whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
 

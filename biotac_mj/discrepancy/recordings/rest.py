@@ -12,7 +12,7 @@ from .session import Session
 
 __all__ = ["Rest", "rest"]
 
-_UNKNOWN = 0.5
+_UNKNOWN = 0.42
 
 
 @dataclasses.dataclass
@@ -32,8 +32,6 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     kept aside, in units of what the load does to it."""
     m = session.model()
     residual = m.alone()
-    if not m.dimensions:
-        residual = residual - m.shared(np.ones(len(m.used)))[:, None]
     cells, time = m.levels(residual, every=True)
     inside = time < m.time[m.inside][-1]
     change = m.activity + 2 * m.noise

@@ -11,15 +11,16 @@ from .courses import BLOCKS
 from .findings import Finding
 from .session import Session
 
-__all__ = ["quantised", "sampling_faults"]
+__all__ = ["lost", "quantised", "sampling_faults"]
 
 _NAN = float("nan")
+_FEW = 4  # electrodes that may jump for reasons of their own
 
 
 def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
     """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
     without the samples of those before it."""
-    for find in (quantised, _held, _stuck, _clipped, _spiked, _lost):
+    for find in (quantised, _held, _stuck, _clipped, _spiked):
         for finding in find(session):
             take(finding)
 
@@ -203,7 +204,10 @@ def _stuck(session):
     moves = np.array([_movement(c, size) for c in whole.T]).T  # (n,) range over `size` rows
     usual = np.median(moves[session.fit & free], axis=0)
     active = np.median(moves / np.maximum(usual, 0.5), axis=1) > 0.5
-    alive = noise_level(whole) > 0.7  # without noise a constant reading is no news
+    steps = np.array([lattice.get(k, 1.0) for k in range(19)])
+    # without noise a constant reading is no news; while it is stuck it has none
+    halves = np.array_split(whole, 2)
+    alive = np.maximum(*(noise_level(x) for x in halves)) > 0.7 * steps
     for k in range(19):
         if not alive[k] and not _edge_value(whole[:, k]):
             continue
@@ -253,12 +257,13 @@ def _edge_value(x):
 
 
 def _clip_like(x, mask):
-    """Stretches at one end of the channel's range are clipping, unless they are long."""
+    """Stretches at one end of the channel's range, to which it comes back, are clipping, unless they are
+    long."""
     if mask.mean() > 0.8 or not mask.any():
         return False
     value = np.median(x[mask])
     edge = value <= np.quantile(x, 0.001) + 2 or value >= np.quantile(x, 0.999) - 2
-    return bool(edge and len(_runs(mask)[0]) > 7 and 5 < value < 4090)
+    return bool(edge and len(_runs(mask)[0]) > 4 and 5 < value < 4090)
 
 
 def _clipped(session):
@@ -302,6 +307,7 @@ def _clipped(session):
                 BLOCKS,
             )
         )
+        found[-1].beyond = side
         found[-1].clues |= {
             "pile": float(np.log(group[0][3] / group[0][4])),
             "share": float(np.log(flags.mean())),
@@ -348,7 +354,7 @@ def _outliers(x):
 # --- lost rows
 
 
-def _lost(session):
+def lost(session: Session) -> list[Finding]:
     """Places where all electrodes jump from one row to the next: straight lines on either side do not
     meet."""
     r = session.recording
@@ -368,8 +374,9 @@ def _lost(session):
     left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
     right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
     jump = (right[h:] - left[:-h]) / noise / np.sqrt(2 * (end**2).sum())
-    # one electrode that jumps is no loss: a fifth of them has to
-    score = np.sqrt((jump**2).mean(1)) * ((np.abs(jump) > 3).mean(1) >= 0.2)
+    # a few electrodes that jump are no loss: of all others a fifth has to
+    rest = np.sort(np.abs(jump), axis=1)[:, : max(4, jump.shape[1] - _FEW)]
+    score = np.sqrt((rest**2).mean(1)) * ((rest > 3).mean(1) >= 0.2)
     # the load bends by as much on the rows around, a loss stands alone
     around = percentile_filter(score, 90, size=81)
     order = np.argsort(-score / np.maximum(around, 1))
@@ -403,7 +410,9 @@ def _lost(session):
     f.p = len(places) / len(score)  # rows that stand alone as much
     ratio = max(score[i] / max(around[i], 1) for i in places)
     f.clues |= {
-        "ratio": float(np.log(ratio)),
+        # up to a dozen times what is around it a place or two of every record jumps
+        "times": float(np.clip(ratio, 12, 30)),
+        "places": at / r.rate,
         "number": float(np.log(len(places))),
         "electrodes": float(share),
         "score": float(np.log(max(score[i] for i in places))),

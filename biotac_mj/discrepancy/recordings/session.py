@@ -72,6 +72,10 @@ class Session:
                 if last - first > 3 * m.width and len(place) and not self.masked[first:last].all(1).any():
                     z = np.interp(time[first:last], m.time, said[:, place[0]])
                     out[first:last, k] = counts_from_log_impedance(z)
+        for finding in self.findings:
+            if finding.beyond:
+                limit = np.maximum if finding.beyond > 0 else np.minimum
+                out = np.where(finding.mask, limit(out, self.recording.electrodes), out)
         return out
 
     def _take_out(self, finding):
