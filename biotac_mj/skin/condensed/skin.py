@@ -264,6 +264,7 @@ class CondensedSkin:
         mat: np.ndarray,
         effort: Effort,
         moved: float | None = None,
+        exact: bool = False,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
@@ -271,6 +272,7 @@ class CondensedSkin:
           memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
           effort: what it may cost.
           moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
+          exact: take contact's exact stiffness from the start, and not near balance only.
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -280,7 +282,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort, moved)
+        step = self._step(memory, u, pos, mat, motion, effort, moved, exact)
         try:
             for _ in range(4):
                 step.run()
@@ -325,10 +327,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort, moved=None):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None, exact=False):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, moved)
+        return Step(self, memory, u, pos, mat, motion, effort, moved, exact)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
