@@ -21,7 +21,9 @@ _FIRST = 0.4  # of the effort, that the step at once may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
 
-def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple[Outcome, np.ndarray]:
+def follow(
+    skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray, near: Memory | None = None
+) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
@@ -30,7 +32,7 @@ def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple
     turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
     if np.abs(motion).max(initial=0.0) + _LEVER * turned <= _PART:
         effort.allow(_FIRST)
-        found = skin.attempt(memory, None, pos, mat, effort)
+        found = skin.attempt(memory, None, pos, mat, effort, near=near)
         if found:
             return found
     deep = skin.search.deep(pos, mat)

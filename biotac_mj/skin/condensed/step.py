@@ -137,6 +137,7 @@ class Step:
         effort: Effort,
         moved: float | None = None,
         exact: bool = False,
+        near: Memory | None = None,
     ):
         self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
@@ -157,6 +158,9 @@ class Step:
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
         self.softening, self.swelling = (memory.after + self.repeat * memory.drift).tolist()
+        if near is not None:
+            self.coordinate, self.force, self.bulge = near.coordinate, near.force, near.bulge
+            self.pressure, (self.softening, self.swelling) = near.pressure, near.after.tolist()
         self.after, self.squeezed, self.spread = np.ones(2), 0.0, 0.0
         self._choose()
 
