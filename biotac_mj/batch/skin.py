@@ -132,11 +132,14 @@ class BatchSkin:
             wp.copy(kept, array)
 
     def put_back(self) -> None:
-        """Gives the wanted worlds back what they remembered. Launches only."""
+        """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
+        begins from it, as if the skin had gone there in the last step already. Launches only."""
         wanted = self.data.worlds.wanted
+        last = self.data.increment.ptr, self._motion.ptr, self._touched_by.ptr
         for array, kept in self._kept.values():
             now, then = _words(array), _words(kept)
-            self._launch(kernels.put_back, now.shape[:2], [then, wanted], [now])
+            given = [then, wanted, int(array.ptr in last), self.reason]
+            self._launch(kernels.put_back, now.shape[:2], given, [now])
 
     def _memory(self):
         """All that a step starts from, and changes."""

@@ -177,10 +177,13 @@ def put_back(
     # In:
     kept: wp.array3d(dtype=int),
     wanted: wp.array(dtype=int),
+    start: int,
+    reason: wp.array(dtype=int),
     # Out:
     out: wp.array3d(dtype=int),
 ):
+    """start: whether it is what Newton's method starts from, and stays that of a solve that converged."""
     i, w = wp.tid()
-    if wanted[w] == 1:
+    if wanted[w] == 1 and (start == 0 or reason[w] != 0):
         for k in range(out.shape[2]):
             out[i, w, k] = kept[i, w, k]

@@ -69,13 +69,15 @@ class CondensedStepper(FemStepper):
         dt: float,
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
+        near: SkinResult | None = None,
     ) -> SkinResult:
         """See `SkinStepper`.
 
         Raises:
           ValueError: NaN in a pose.
         """
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat)
+        begin = None if near is None else self._read(near.state)
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin)
         new = np.zeros_like(state)
         self._write(new, out.memory)
         return SkinResult(

@@ -71,7 +71,7 @@ class Coupled:
         if share < 1.0 and self.asked is not None:
             pose = displace(*self.asked, share * displacement(*pose, *self.asked))
         pose = self._within_reach(pose)
-        result = self.instance.solve_for_pose(*pose, self._core_motion())
+        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
         self._iterations += result.iterations
         self.may_go = result.converged and self._iterations < _MOST_ITERATIONS
         self.use(pose, result)

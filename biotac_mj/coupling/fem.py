@@ -39,6 +39,8 @@ class FemStepper:
     geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
     liquid's pressure and, with implicit dynamics, nodal velocities."""
 
+    begins_near = True
+
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
         self._settings = _in_time(config, skin_settings(config))
@@ -144,6 +146,7 @@ class FemStepper:
         dt: float,
         core_pos: np.ndarray = _STILL[0],
         core_mat: np.ndarray = _STILL[1],
+        near: SkinResult | None = None,
     ) -> SkinResult:
         """See `SkinStepper`.
 
@@ -153,7 +156,7 @@ class FemStepper:
         if self._untouched(state, geom_pos, geom_mat):
             return self._still(state, geom_pos, geom_mat)
         d, geoms = self._data, self._geom_set
-        self._unpack(state)
+        self._unpack(state, None if near is None else (self._part(near.state, "x"), np.ravel(geom_pos)))
         geoms.set_pose(geom_pos, geom_mat)
         started = self._part(state, "started")[0]
         if not started:
@@ -260,15 +263,22 @@ class FemStepper:
 
     # --- the state as numbers  ---
 
-    def _unpack(self, state):
+    def _unpack(self, state, near=None):
+        """near: nodes and positions of the geoms of a solve that this one is to begin from, as if the skin
+        had gone there in the last step already."""
         d, geoms = self._data, self._geom_set
+        increment, motion = self._part(state, "increment"), self._part(state, "motion")
+        if near is not None:
+            increment, motion = near[0] - self._part(state, "x"), near[1] - self._part(state, "geom_pos")
         d.load(
             x=self._part(state, "x").reshape(-1, 3),
-            increment=self._part(state, "increment").reshape(-1, 3),
-            motion=self._part(state, "motion").reshape(-1, 3),
+            increment=increment.reshape(-1, 3),
+            motion=motion.reshape(-1, 3),
             contacts=_contacts(self._part(state, "contacts")),
             pressure=self._part(state, "pressure")[0],
         )
+        if near is not None:
+            d.geom_memory(geoms.count, geoms.ngroup)[1].fill_(1)  # whose motion counts
         if self._material.remembers:
             d.memory.load(self._part(state, "memory"), d.x)
         geoms.set_pose(

@@ -294,16 +294,21 @@ class Instance:
             self._result = skin.untouched
         self._pose, self._reading = (pos, mat), None
 
-    def solve_for_pose(self, pos: np.ndarray, mat: np.ndarray, core: tuple = ()) -> SkinResult:
+    def solve_for_pose(
+        self, pos: np.ndarray, mat: np.ndarray, core: tuple = (), near: SkinResult | None = None
+    ) -> SkinResult:
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
-        the result for the readings.
+        the result for the readings. near: an earlier result of this step, to begin from.
 
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
         """
         self._pose = pos, mat
         dt = self.model.opt.timestep
-        key = (pos.tobytes(), mat.tobytes(), dt, self._key(), *(c.tobytes() for c in core))
+        begin, also = {}, core
+        if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
+            begin, also = {"near": near}, (*core, *near.pose)
+        key = (pos.tobytes(), mat.tobytes(), dt, self._key(), *(a.tobytes() for a in also))
         result = self._solved.get(
             key
         )  # solving is a function of the key, so a second mj_forward costs nothing
@@ -311,7 +316,7 @@ class Instance:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
-                result = skin.stepper.solve_skin(before, *geom_pose, dt, *core)
+                result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
             result = dataclasses.replace(result, pose=(pos, mat))
             if not result.converged:
                 result = self._as_far_as_known(result, before)

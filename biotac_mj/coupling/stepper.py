@@ -97,7 +97,8 @@ class SkinStepper(Protocol):
         """Solves for the geoms' poses (ngeom, 3), (ngeom, 3, 3) at the end of the step; a function of its
         arguments alone, which keeps `state` as it is. A stepper with a true attribute `inertial` gets
         core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
-        end of the step."""
+        end of the step. One with a true attribute `begins_near` gets near: a converged result of the same
+        step for poses not far from these, or None, from which Newton's method begins."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""

@@ -22,8 +22,9 @@ __all__ = ["CandidateFaces"]
 
 wp.set_module_options({"enable_backward": False})
 
-touch_face = contact_kernels(False).touch_face
+touch_sample, touch_face = contact_kernels(False).touch_sample, contact_kernels(False).touch_face
 _SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a sample counts as slipping
+_BY = wp.constant(1e-9)  # of a difference [m]
 
 
 @wp.kernel
@@ -88,6 +89,59 @@ def _touch(
                 force_out[i] += corner_out[3 * f + 2, 0]
                 lumped_out[i] += b02 + b12 + block_out[6 * f + 5, 0]
                 touched_out[i] = 1
+
+
+@wp.kernel
+def _differ(
+    # In:
+    count: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    area: wp.array(dtype=real),
+    sample: wp.array(dtype=vec3),
+    stiffness: real,
+    stick_ratio: real,
+    geoms: Geoms,
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    x_last: wp.array2d(dtype=vec3),
+    anchor_geom: wp.array2d(dtype=int),
+    anchor: wp.array2d(dtype=vec3),
+    touching: wp.array2d(dtype=int),
+    geom: wp.array2d(dtype=int),
+    # Out:
+    block_out: wp.array2d(dtype=mat33),
+):
+    """Stiffness of the faces that touch as it is, by differences of the contact itself: with what friction
+    takes from the normal force and with the curvature of the geoms. It is not symmetric."""
+    nsample = sample.shape[0]
+    for f in range(count[0]):
+        if touching[f, 0] == 1:
+            t = face[f]
+            share = area[f] / real(nsample)
+            k = stiffness * share
+            for c in range(6):
+                block_out[6 * f + c, 0] = mat33()
+            for s in range(nsample):
+                if geom[f * nsample + s, 0] >= 0:
+                    b = sample[s]
+                    K = mat33()
+                    for axis in range(3):
+                        by = vec3()
+                        by[axis] = real(_BY)
+                        _t, _b, _c, ahead, _K, _a = touch_sample(
+                            f * nsample + s, 0, b, t, x[t[0], 0] + by, x[t[1], 0] + by, x[t[2], 0] + by, k,
+                            k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
+                        )  # fmt: skip
+                        _t, _b, _c, behind, _K, _a = touch_sample(
+                            f * nsample + s, 0, b, t, x[t[0], 0] - by, x[t[1], 0] - by, x[t[2], 0] - by, k,
+                            k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
+                        )  # fmt: skip
+                        change = (behind - ahead) / (real(2.0) * real(_BY))
+                        for row in range(3):
+                            K[row, axis] = change[row]
+                    for c in range(3):
+                        for e in range(c, 3):
+                            block_out[6 * f + c * (5 - c) // 2 + e, 0] += b[c] * b[e] * K
 
 
 @wp.kernel
@@ -300,21 +354,18 @@ class CandidateFaces:
         load, self._load = zeros((geoms.ngroup, 6), real)
         share, self._share = zeros((geoms.ngroup, nnode), real)
         faces, springs = [count, face, self._slot_wp], [touching, block]
+        contact = [
+            area,
+            m.sample,
+            m.contact_stiffness,
+            m.options.stick_ratio,
+            geoms.struct,
+            empty_laws("cpu"),
+        ]
+        contact += [self._x, self._last, anchor_geom, anchor]
         self.evaluate = self._record(
             _touch,
-            [
-                *faces,
-                area,
-                m.sample,
-                m.contact_stiffness,
-                m.options.stick_ratio,
-                geoms.struct,
-                empty_laws("cpu"),
-                self._x,
-                self._last,
-                anchor_geom,
-                anchor,
-            ],
+            [*faces, *contact],
             [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
         )
         self.couple = self._record(
@@ -322,6 +373,7 @@ class CandidateFaces:
             [count, face, m.sample, geoms.struct, self._x, touching, geom, sample_force],
             [block],
         )
+        self.differ = self._record(_differ, [count, face, *contact, touching, geom], [block])
         self._multiply = self._record(_product, [*faces, *springs, p], [product])
         self._loads = self._record(
             _loads,

@@ -17,19 +17,22 @@ _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingerti
 _FAR = 1.0  # geoms are moved out of the skin by no more [m]
 _EFFORT = 1.5e5  # of a step, for each outer node: about 0.25 s on the coarse skin
 _SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
-_FIRST, _EACH = 0.4, 0.5  # shares of the effort left that the step at once and each part may take
+_FIRST = 0.4  # of the effort, that the step at once may take
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
 
-def follow(skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> tuple[Outcome, np.ndarray]:
+def follow(
+    skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray, near: Memory | None = None
+) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
     motion = skin.pose(memory, pos, mat)
-    if np.abs(motion).max(initial=0.0) <= _PART:
+    turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
+    if np.abs(motion).max(initial=0.0) + _LEVER * turned <= _PART:
         effort.allow(_FIRST)
-        found = skin.attempt(memory, None, pos, mat, effort)
+        found = skin.attempt(memory, None, pos, mat, effort, near=near)
         if found:
             return found
     deep = skin.search.deep(pos, mat)
@@ -58,8 +61,12 @@ def _go(skin, memory, pos, mat, effort):
         pose = from_pos + to * move, Rotation.from_rotvec(to * turn).as_matrix() @ from_mat
         if to > 1 - 1e-9:
             to, pose = 1.0, (pos, mat)
-        effort.allow(_EACH)
-        new = skin.attempt(memory, u, *pose, effort, (to - at) * length)
+        effort.allow(1.0)
+        moved = (to - at) * length
+        # symmetric stiffness comes from further away, the exact one out of where that goes round in circles
+        new = skin.attempt(memory, u, *pose, effort, moved) or (
+            not skin.search.deep(*pose) and skin.attempt(memory, u, *pose, effort, moved, exact=True)
+        )
         if new:
             found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]

@@ -161,6 +161,11 @@ class Lumped:
         return G.T @ self.solve(G)
 
 
+def exact_fits(springs: Springs) -> bool:
+    """Whether so few coordinates touch that their stiffness may be unsymmetric."""
+    return len(springs.on) <= _COUPLED
+
+
 def cost(k: int, coupled: bool) -> float:
     """What `solve` costs over k coordinates that touch, in products of a matrix with one row and column."""
     return 0.05 * k**3 if k <= (_COUPLED if coupled else _DIRECT) else 10.0 * k**2

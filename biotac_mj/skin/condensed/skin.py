@@ -236,9 +236,11 @@ class CondensedSkin:
 
     # --- a step  ---
 
-    def solve(self, memory: Memory, geom_pos: np.ndarray, geom_mat: np.ndarray) -> Outcome:
+    def solve(
+        self, memory: Memory, geom_pos: np.ndarray, geom_mat: np.ndarray, near: Memory | None = None
+    ) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
-        alone.
+        alone. near: what a step from the same memory to poses not far from these came to, to begin from.
 
         Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
         its memory, which are those asked for where `reached` is 1.
@@ -252,7 +254,7 @@ class CondensedSkin:
                 "never set"
             )
         with single_thread():
-            out, u = follow(self, memory, geom_pos, geom_mat)
+            out, u = follow(self, memory, geom_pos, geom_mat, near)
         self._keep(out.memory, u)
         return out
 
@@ -264,6 +266,8 @@ class CondensedSkin:
         mat: np.ndarray,
         effort: Effort,
         moved: float | None = None,
+        exact: bool = False,
+        near: Memory | None = None,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
@@ -271,6 +275,8 @@ class CondensedSkin:
           memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
           effort: what it may cost.
           moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
+          near: see `solve`.
+          exact: take contact's exact stiffness from the start, and not near balance only.
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -280,7 +286,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort, moved)
+        step = self._step(memory, u, pos, mat, motion, effort, moved, exact, near)
         try:
             for _ in range(4):
                 step.run()
@@ -325,10 +331,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort, moved=None):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None, exact=False, near=None):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, moved)
+        return Step(self, memory, u, pos, mat, motion, effort, moved, exact, near)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..rigid import rigid_motions
-from .linear import Compliance, Lumped, Springs, cost, solve
+from .linear import Compliance, Lumped, Springs, cost, exact_fits, solve
 
 __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 
@@ -16,6 +16,7 @@ _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, a
 _TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
 _MAX_NEWTON, _PASSES = 30, 4
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
+_NEAR, _SLOW = 0.03, 8  # error below which contact's exact stiffness is taken, where a step is slow from here
 _PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
@@ -135,10 +136,12 @@ class Step:
         motion: np.ndarray,
         effort: Effort,
         moved: float | None = None,
+        exact: bool = False,
+        near: Memory | None = None,
     ):
         self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
-        self.coupled = moved is not None
+        self.coupled, self.near = moved is not None, math.inf if exact else _NEAR
         moved = moved if self.coupled else 2 * np.abs(motion).max(initial=0.0)
         self.reach = _REACH + moved
         self.share = min(1.0, 1.5 * moved / max(u.max(), -u.min(), 1e-9))
@@ -155,6 +158,9 @@ class Step:
         self.coordinate, self.force = memory.coordinate, memory.force
         self.iterations, self.error, self.converged = 0, 0.0, True
         self.softening, self.swelling = (memory.after + self.repeat * memory.drift).tolist()
+        if near is not None:
+            self.coordinate, self.force, self.bulge = near.coordinate, near.force, near.bulge
+            self.pressure, (self.softening, self.swelling) = near.pressure, near.after.tolist()
         self.after, self.squeezed, self.spread = np.ones(2), 0.0, 0.0
         self._choose()
 
@@ -215,8 +221,6 @@ class Step:
         if m:
             s._x[self.outer, 0] = s.rest[self.outer] + u[:m].reshape(-1, 3)
             s.faces.evaluate()
-            if self.coupled:
-                s.faces.couple()
             f[:m] = s.faces.force.ravel()
         if len(self.inner):
             f[m:], self.closed = self.meeting.force(u[m:])
@@ -314,28 +318,37 @@ class Step:
         self.W, shift = self._scaled()
         u = self.W @ f + shift
         g = self._evaluate(u)
-        self.converged, self.lumped = False, None
-        for _ in range(_MAX_NEWTON):
+        self.converged, self.lumped, self.error = False, None, math.inf
+        for number in range(_MAX_NEWTON):
             springs = self._springs()
-            if not self.effort.spend(len(f), cost(len(springs.on), self.coupled)):
+            fits = exact_fits(springs)
+            if self.near == math.inf and not fits:
+                break  # as the try before this one went
+            exact = fits and self.error <= self.near and (self.coupled or number >= _SLOW)
+            coupled = self.coupled or exact
+            if exact:
+                self.skin.faces.differ()
+            elif coupled:
+                self.skin.faces.couple()
+            if not self.effort.spend(len(f), cost(len(springs.on), coupled)):
                 break
             r = g - f
-            df, du, self.lumped = solve(self.W, springs, r, self.lumped, self.coupled)
+            df, du, self.lumped = solve(self.W, springs, r, self.lumped, coupled)
             slope = float(r @ du)
-            left = max(abs(slope), float(df @ du)) if self.coupled else max(slope, 0.0)
+            left = max(abs(slope), float(df @ du)) if coupled else max(slope, 0.0)
             self.error = math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
             if self.error < _TOLERANCE:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
                 return f + df
             self.iterations += 1
-            f, u, g = self._search(f, u, df, du, slope)
+            f, u, g = self._search(f, u, df, du, slope, coupled)
         return f
 
-    def _search(self, f, u, df, du, slope):
+    def _search(self, f, u, df, du, slope, coupled):
         """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi
         where the step overshoots)."""
-        along = -du if self.coupled and slope < 0 else du
+        along = -du if coupled and slope < 0 else du
         low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
         for _ in range(10):

@@ -53,8 +53,8 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
 
 @functools.cache
 def contact_kernels(lawful: bool) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_face` is a function
-    of theirs."""
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_sample` and
+    `touch_face` are functions of theirs."""
     module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
 
     @wp.func
@@ -300,4 +300,6 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
             force_out[i, w] = force
             tangent_out[i, w] = K
 
-    return types.SimpleNamespace(touch_face=touch_face, by_face=by_face, by_sample=by_sample)
+    return types.SimpleNamespace(
+        touch_sample=touch_sample, touch_face=touch_face, by_face=by_face, by_sample=by_sample
+    )

@@ -29,6 +29,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
 _CLUSTER = 4  # nodes whose rows are computed together
+_DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
 _FACTOR = 25  # products of the tangent: about what a factor costs
 
 
@@ -239,17 +240,15 @@ class SparsePreconditioner:
         size = m + (self._gradient is not None)
         if size == 0:
             return None
-        D = np.zeros((size, size))
-        D[:m, :m] = assemble(nodes, faces, blocks, len(self._is_free))
+        D = assemble(nodes, faces, blocks, len(self._is_free))
         rows, W = self._compliance(w, nodes)
         compliance, soft = np.zeros((size, size)), self._softness[w]
         compliance[:m, :m] = W * soft
         if self._gradient is not None:
-            D[m, m] = self._kappa[w]
             along = self._along[:, w] * soft
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
             compliance[m, m] = np.vdot(self._gradient[:, w], along)
-        return nodes, rows, _Solver(np.eye(size) + D @ compliance, D), compliance
+        return nodes, rows, _Solver(D, self._kappa[w], compliance), compliance
 
     def _compliance(self, w, nodes):
         """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes
@@ -307,10 +306,19 @@ class SparsePreconditioner:
 
 
 class _Solver:
-    """q = (I + D W)^-1 D u."""
+    """q = (I + D W)^-1 D u, D of the springs (m, m) and, with a liquid, its bulk modulus over its volume."""
 
-    def __init__(self, matrix, D):
-        self._lu, self._D = lu_factor(matrix, check_finite=False), D
+    def __init__(self, springs: np.ndarray, kappa: float, W: np.ndarray):
+        self._springs, self._kappa = springs if len(springs) < _DENSE else sp.csr_matrix(springs), kappa
+        matrix = self._stiffen(W)
+        matrix.ravel()[:: len(W) + 1] += 1
+        self._lu = lu_factor(matrix.T, overwrite_a=True, check_finite=False)  # as LAPACK has it, no copy
 
-    def __call__(self, u):
-        return lu_solve(self._lu, self._D @ u, check_finite=False)
+    def __call__(self, u: np.ndarray) -> np.ndarray:
+        return lu_solve(self._lu, self._stiffen(u), trans=1, overwrite_b=True, check_finite=False)
+
+    def _stiffen(self, u):
+        m, out = self._springs.shape[0], np.empty(u.shape)
+        out[:m] = self._springs @ u[:m]
+        out[m:] = self._kappa * u[m:]
+        return out
