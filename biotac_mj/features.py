@@ -216,7 +216,7 @@ SENSES = (
     Sense("drift of counts", '`randomise=["drift"]`', {"randomise": {"drift": 40.0}},
           "electrodes", 5),
     Sense("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
-          {"thermal": {"touched": "steel at -20000"}}, "tac", 3),
+          {"thermal": {"touched": "steel at 20000"}}, "tac", 3),
     Sense("vibration: PAC by texture, slip and taps", "`textures=` (press, generate: `texture`)",
           {"textures": {"touched": {"roughness": 5e-5}}}, "pac", 10,
           cells=_NO_MODES),

@@ -16,11 +16,11 @@ from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
-from ..coupling.touching import Touching
+from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
-from ..sensor.materials import check_choices, read_thermal
+from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..skin.per_world import make_room
 from ..skin.rubber.material import Material
@@ -190,7 +190,7 @@ def attach(
     felt = sensor, randomise, thermal, textures
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
     skin = skin_of(bool(slots) or textures is not None)
-    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
@@ -251,7 +251,7 @@ def make(
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
     felt = sensor, randomise, thermal, textures
     skin = skin_of(textures is not None)
-    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     return PoseBatch(mjm, touching, skin, senses)
 
 
@@ -275,6 +275,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     geometry = skin_reference(skin)[1]
     config = Config(
+        name=prefix,
         skin=skin_reference(skin)[0],
         material=plain(chosen),
         liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
@@ -427,7 +428,7 @@ def _slots(mjm, m, d, touching, prefix):
     return {g: place[root] for g, root in enumerate(roots) if root in needed}
 
 
-def _senses(choice, felt, geometry, seed, skin, touching, mjm):
+def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     """The sensors of the worlds, or None."""
     nworld, device = skin.nworld, str(skin.model.device)
     sensor, randomise, thermal, textures = felt
@@ -449,12 +450,11 @@ def _senses(choice, felt, geometry, seed, skin, touching, mjm):
         check_settings(
             {k: v for k, v in {**settings, "sensor": one}.items() if v is not None}, known, "readings"
         )
-    for wanted, read in ((thermal, read_thermal), (textures, read_texture)):
-        for one in wanted if isinstance(wanted, list) else [wanted or {}]:
-            for name, value in one.items():
-                _resolve_geom(mjm, name)
-                check_choices(value, read)
-    rows, redraw = draws(nworld, seed, settings, thermal, textures, touching.geoms)
+    for what, wanted, read in (("thermal", thermal, read_thermal), ("textures", textures, read_texture)):
+        for one in wanted if isinstance(wanted, list) else [wanted]:
+            check_geoms(what, one, read)
+            find_geoms(ModelView(mjm._address), one or ())
+    rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms)
     signal, weights = settings.pop("signal", "physics"), settings.pop("weights", None)
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
@@ -466,10 +466,3 @@ def _senses(choice, felt, geometry, seed, skin, touching, mjm):
         film = BatchFilm(FilmConduction(geometry), nworld, device)
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
     return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)
-
-
-def _resolve_geom(mjm, name):
-    names = [mjm.geom(i).name for i in range(mjm.ngeom)]
-    if not any(n == name or n.endswith(name) for n in names):
-        found = ", ".join(n for n in names if n) or "no named geom"
-        raise ValueError(f"no geom {name!r} to touch: the model has {found}")

@@ -15,7 +15,7 @@ from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
-from ..sensor.materials import check_choices, read_thermal
+from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
@@ -64,7 +64,7 @@ class Handle:
     @property
     def numbers(self) -> Sensor:
         """The sensor's own numbers by its settings: rest counts, noise, levels."""
-        return take_sensor(self.config.options.get("readings", {}), self.config.seed)[0]
+        return take_sensor(self.config.options.get("readings", {}), self.config.own_seed())[0]
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
         """Puts another sensor at rest in the place of this one, until the next reset, where the settings
@@ -206,16 +206,15 @@ def attach(
         textures=textures,
         priority=priority,
         seed=seed,
+        name=prefix,
         device=device,
         options=options,
         on_error=on_error,
         **({} if friction is None else {"friction": friction}),
     )
     _check(config, geometry)
-    for value in (config.thermal or {}).values():
-        check_choices(value, read_thermal)
-    for value in (config.textures or {}).values():
-        check_choices(value, read_texture)
+    check_geoms("thermal", config.thermal, read_thermal)
+    check_geoms("textures", config.textures, read_texture)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
     if slots is not None:

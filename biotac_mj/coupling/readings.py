@@ -36,7 +36,7 @@ class SensorReadings:
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
         settings = check_settings(config.options.get("readings", {}), {"cold": bool})
-        self.sensor, self._options, _ = take_sensor(settings, config.seed)
+        self.sensor, self._options, _ = take_sensor(settings, config.own_seed())
         self._bodies: list[Material] | None = None
         self._textures: list[Texture] | None = None
         self._geoms: list[Geom] = []
@@ -81,7 +81,7 @@ class SensorReadings:
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
         """Resets to another sensor, other materials and textures, where the settings leave them open."""
-        sensor = take_sensor(self._config.options.get("readings", {}), seed)[0]
+        sensor = take_sensor(self._config.options.get("readings", {}), self._config.own_seed(seed))[0]
         bodies = self._bodies and materials_of(self._geoms, self._config.thermal, seed)
         textures = self._textures and textures_of(self._geoms, self._config.textures, seed)
         self._physics.reset(state, sensor=sensor, bodies=bodies, textures=textures)
