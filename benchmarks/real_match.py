@@ -20,7 +20,8 @@ from biotac_mj.matching.match import log_changes, match, rows_of
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import plate_states
 from biotac_mj.recordings import load_one
-from biotac_mj.sensor.film import CALIBRATED_RADIUS, FilmConduction
+from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin.rubber.material import PRESETS
 from biotac_mj.skin.settings import read_material
 
 
@@ -38,7 +39,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the scores go")
     parser.add_argument("--skin", default="coarse", help="skin of the table of states")
     parser.add_argument("--material", help="preset, .json file or JSON of the rubber")
-    parser.add_argument("--radius", type=float, default=CALIBRATED_RADIUS, help="of the electrodes [m]")
+    radius = PRESETS["calibrated"].electrode_radius
+    parser.add_argument("--radius", type=float, default=radius, help="of the electrodes [m]")
     parser.add_argument("--every", type=int, default=10, help="of the loaded rows one is taken")
     given = parser.parse_args(argv)
     begin = time.perf_counter()

@@ -35,7 +35,7 @@ from biotac_mj.sensor.channels import (
     log_impedance,
     pac_from_counts,
 )
-from biotac_mj.sensor.film import CALIBRATED_RADIUS
+from biotac_mj.sensor.film import read_film
 from biotac_mj.sensor.presets import SENSORS
 from biotac_mj.skin.rubber.material import PRESETS
 
@@ -173,7 +173,7 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[d
         add("warm-up of an unloaded sensor, ln Z", name, float((warm[-n:] - warm[:n]).mean()), 0.0)
     if pressed:
         material = "calibrated" if calibrated else "default"
-        response = table(skin, material, {"electrode_radius": CALIBRATED_RADIUS} if calibrated else {})
+        response = table(skin, material, read_film(None, PRESETS[material].electrode_radius))
         modulus = PRESETS[material].youngs_modulus
     for name, recording in pressed.items():
         taken = rows_of(recording.counts()[0], recording.force, every)

@@ -14,6 +14,7 @@ from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _colli
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
+from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
@@ -152,10 +153,11 @@ def attach(
         dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
         `SensorBioTac(...).batch()` gives.
       sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is drawn,
-        every reset of a world draws again, by its seed. sensor, thermal and textures may be lists of one for
+        world w begins with what a single sensor of its seed and prefix has, and every reset draws again, by
+        its seed. sensor, thermal and textures may be lists of one for
         each world, which resets leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
-        elements}, as for `biotac_mj.attach`, of all worlds.
+        elements, "film": of the electrodes}, as for `biotac_mj.attach`, of all worlds.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
         adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
         a number or (nworld,), and modulus (nworld, nelem). `batch.skin.data` changes them later.
@@ -459,10 +461,12 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
     if signal != "physics":
+        if "film" in config.options:
+            raise ValueError("a network stands in the film's place: leave options['film'] out")
         from ..learning.serve import LearnedBatchFilm
 
         film = LearnedBatchFilm(geometry, nworld, device, weights)
     else:
-        film = BatchFilm(FilmConduction(geometry), nworld, device)
+        film = BatchFilm(FilmConduction(geometry, **film_of(config)), nworld, device)
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
     return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)

@@ -149,14 +149,17 @@ def attach(
       skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
       material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
+        "calibrated" is what was fitted to real sensors, rubber and electrodes.
       liquid, friction: None takes the material's choice.
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "readings": of the sensor (noise, sensor, randomise, film_every_step,
+        elements' centroids; "film": residual_film, electrode_radius [m], excitation, see
+        `sensor.film.read_film`; "readings": of the sensor (noise, sensor, randomise, film_every_step,
         temperature, cold; weights).
-      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by the
-        seed), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for options["readings"].
-      randomise: names of effects that are drawn by the seed ("dead", "crosstalk", "relax"), or {name: size};
+      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by seed
+        and prefix), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for
+        options["readings"].
+      randomise: names of effects that are drawn likewise ("dead", "crosstalk", "relax"), or {name: size};
         see `effects.sensors.RANDOM`. Short for options["readings"].
       effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
         (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,

@@ -66,7 +66,7 @@ class Config:
         other names are drawn apart.
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
-        and "readings".
+        "film" between skin and core (`sensor.film.read_film`), and "readings".
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
@@ -120,7 +120,7 @@ class Config:
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
         self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
-            refuse_unknown(self.options, ("skin", "modulus", "readings"), "options")
+            refuse_unknown(self.options, ("skin", "modulus", "film", "readings"), "options")
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")

@@ -109,6 +109,8 @@ class LearnedReadings:
     it."""
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
+        if "film" in config.options:
+            raise ValueError("a network stands in the film's place: leave options['film'] out")
         settings = check_settings(config.options.get("readings", {}), more={"weights": str | None})
         self._settings, self._config = settings, config
         sensor, settings, _ = take_sensor(settings, config.own_seed())

@@ -713,6 +713,7 @@ class BatchAcquisition:
             self.due = wp.zeros(nworld, dtype=int)
             self._still = wp.zeros((nworld, 0), dtype=real)
             self.reset(wp.full(nworld, True, dtype=bool))
+            self._drawn.zero_()  # the first reset by whoever has it is the beginning, and draws nothing
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""

@@ -33,6 +33,7 @@ class Settings(NamedTuple):
 def read_settings(
     material: Material | dict | str | pathlib.Path | None = None,
     options: dict | None = None,
+    also: tuple = (),
     **defaults: object,
 ) -> Settings:
     """Settings of a skin.
@@ -40,13 +41,14 @@ def read_settings(
     Args:
       material: see `read_material`.
       options: {"skin": {...} or SkinOptions, "modulus": see `read_modulus`}, a JSON text of it or a file.
+      also: further keys of `options` that somebody else reads.
       defaults: of SkinOptions, where `options` has no word on it.
 
     Raises:
       ValueError: unknown keys, or values that cannot be. FileNotFoundError: no such file.
     """
     given = read_dict(options, "options")
-    refuse_unknown(given, _KEYS, "options")
+    refuse_unknown(given, (*_KEYS, *also), "options")
     skin = given.get("skin")
     if not isinstance(skin, SkinOptions):
         skin = SkinOptions(
