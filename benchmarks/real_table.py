@@ -25,12 +25,14 @@ from vibration import resting
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.matching.fit import Setup, fit_constants
 from biotac_mj.matching.match import rows_of
+from biotac_mj.matching.response import Response
 from biotac_mj.recordings import load_one
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import (
     PDC_REST,
     REST_TEMPERATURE,
     counts_from_log_impedance,
+    counts_from_pressure,
     counts_from_temperature,
     electrode_noise,
     impedance_from_counts,
@@ -130,6 +132,30 @@ def holds(data: pathlib.Path) -> dict:
     return found
 
 
+def firm_holds(data: pathlib.Path, response: Response, modulus: float) -> dict:
+    """{finger: (real, simulated)}: by how much PDC is higher in the holds that are not soft, median [counts],
+    and in the states of a plate that change the electrodes by as much, mean of the straight ways."""
+    files = [scipy.io.loadmat(path) for path in sorted(data.rglob("*_HOLD.mat"))]
+    files.sort(key=lambda file: abs(np.median(file["JEff"])))
+    cut, out = -(-len(files) // 3), {}
+    pdc = counts_from_pressure(response.states.pressure[:, :, 0] * modulus) - PDC_REST
+    for finger in ("F0", "F1") if len(files) > cut else ():
+        held = [
+            [np.median(file[finger + name][..., -_END:], -1) for name in ("Electrodes", "pdc")]
+            for file in files
+        ]
+        rest, level = (np.median([np.ravel(h[i]) for h in held[:cut]], 0) for i in (0, 1))
+        change = counts_from_log_impedance(log_impedance(rest) + response.log_z[:, :, 0]) - rest
+        size = np.sqrt((change * change).mean(-1)).reshape(-1, change.shape[2])
+        rows = []
+        for electrodes, now in held[cut:]:
+            here = _rms(np.ravel(electrodes) - rest)
+            at = [np.interp(here, s, p) for s, p in zip(size, pdc.reshape(size.shape), strict=True)]
+            rows.append([float(np.ravel(now)[0] - level[0]), np.mean(at)])
+        out[finger] = tuple(np.median(rows, 0).tolist())
+    return out
+
+
 def _shared(files):
     """Coherence of both fingers' PAC and its mean square [counts^2] below 20 Hz, mean of the holds."""
     rows = []
@@ -219,6 +245,8 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> tuple[
         material = "calibrated" if calibrated else "default"
         response = table(skin, material, read_film(None, PRESETS[material].electrode_radius))
         modulus = PRESETS[material].youngs_modulus
+        for finger, pair in firm_holds(data, response, modulus).items():
+            add("PDC in a firm hold over a soft one [counts]", finger, *pair)
     for name, recording in pressed.items():
         taken = rows_of(recording.counts()[0], recording.force, every)
         const, found = fit_constants(response, taken, Setup(gains=0.0, modulus=modulus, hold_modulus=True))
