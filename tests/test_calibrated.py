@@ -1,5 +1,7 @@
 """`material="calibrated"` and `options["film"]` reach the film on every path that has a sensor."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from biotac_mj.press.indenter import make_indenter
 from biotac_mj.press.path import plan_path
 from biotac_mj.press.scene import build_scene
 from biotac_mj.sensor.film import FilmConduction, read_film
+from biotac_mj.skin import SkinData, SkinModel
 from biotac_mj.skin.rubber.material import PRESETS
+from biotac_mj.skin.settings import read_settings
 
 SKIN, CALIBRATED = "coarse", PRESETS["calibrated"]
 
@@ -112,8 +116,6 @@ def test_paths_without_a_film_refuse_it():
     pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
     with pytest.raises(ValueError, match="a network stands in the film's place"):
         biotac_mj.attach(mujoco.MjSpec(), body="world", readings="latent_projection", options={"film": {}})
-    from biotac_mj.skin.settings import read_settings
-
     with pytest.raises(ValueError, match="options has 'film'"):
         read_settings(None, {"film": {}})
 
@@ -127,3 +129,20 @@ def test_wider_electrodes_rest_alike_and_feel_the_thick_film_less_sharply():
     np.testing.assert_allclose(films[0].rest, films[1].rest, rtol=1e-9)
     a, b = (np.log(film.impedance(thin) / film.rest) for film in films)
     assert np.abs(a - b).max() > 0.02
+
+
+def test_the_material_fills_the_skin_unless_the_options_say_otherwise():
+    pressure = CALIBRATED.rest_pressure
+    assert pressure > 0
+    for options, found in (
+        (None, pressure),
+        ({"skin": {"rest_pressure": 0.0}}, 0.0),
+        ({"skin": {"fill_volume": 1e-9}}, 0.0),
+        ({"skin": {"liquid": False}}, 0.0),
+    ):
+        assert read_settings("calibrated", options).options.rest_pressure == found
+    model = SkinModel(load_skin(SKIN), "calibrated")
+    assert model.rest.pressure == pytest.approx(pressure, rel=1e-3)
+    assert SkinModel(load_skin(SKIN)).options.rest_pressure == 0.0
+    with pytest.raises(ValueError, match="a world's material has a rest_pressure of 0.0"):
+        SkinData(model, 2, [CALIBRATED, dataclasses.replace(CALIBRATED, rest_pressure=0.0)])

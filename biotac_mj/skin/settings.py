@@ -14,7 +14,7 @@ from ..fields import refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import read_json, reading
 from .contact.law import ContactLaw
-from .model import SkinOptions
+from .model import SkinOptions, filled
 from .rubber.material import PRESETS, Material
 
 __all__ = ["Settings", "plain", "read_dict", "read_material", "read_modulus", "read_settings"]
@@ -54,7 +54,8 @@ def read_settings(
         skin = SkinOptions(
             **{**defaults, **_known(read_dict(skin, "options['skin']"), SkinOptions, "options['skin']")}
         )
-    return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
+    rubber = read_material(material)
+    return Settings(rubber, filled(skin, rubber), read_modulus(given.get("modulus")))
 
 
 def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:
