@@ -824,7 +824,7 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"effects": []}, "options has 'effects': choose from skin, modulus, readings"),
+        ({"effects": []}, "options has 'effects': choose from skin, modulus, film, readings"),
         ({"skn": {}}, "options has 'skn': did you mean 'skin'?"),
         ({"skin": {"sample": 3}}, r"options\['skin'\] has 'sample': did you mean 'samples'?"),
         ({"skin": {"samples": 2.5}}, "samples is 2.5: pass a whole number"),
