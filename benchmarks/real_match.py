@@ -20,11 +20,12 @@ from biotac_mj.matching.match import log_changes, match, rows_of
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import plate_states
 from biotac_mj.recordings import load_one
-from biotac_mj.sensor.film import CALIBRATED_RADIUS, FilmConduction
+from biotac_mj.sensor.film import FilmConduction, read_film
+from biotac_mj.skin.rubber.material import Material
 from biotac_mj.skin.settings import read_material
 
 
-def table(skin: str, material: str | None, film: dict) -> Response:
+def table(skin: str, material: str | Material, film: dict) -> Response:
     """What the simulated sensor says in the states of a plate; film: settings of FilmConduction."""
     geometry = load_skin(skin)
     states = plate_states(geometry, read_material(material))
@@ -37,15 +38,18 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--force", required=True, help="text: Fx Fy Fz [N], as many rows")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the scores go")
     parser.add_argument("--skin", default="coarse", help="skin of the table of states")
-    parser.add_argument("--material", help="preset, .json file or JSON of the rubber")
-    parser.add_argument("--radius", type=float, default=CALIBRATED_RADIUS, help="of the electrodes [m]")
+    what = "preset, .json file or JSON of rubber and filling, of which E is fitted"
+    parser.add_argument("--material", default="calibrated", help=what)
+    parser.add_argument("--radius", type=float, help="of the electrodes [m]; default: the material's")
     parser.add_argument("--every", type=int, default=10, help="of the loaded rows one is taken")
     given = parser.parse_args(argv)
     begin = time.perf_counter()
     try:
         recording, _ = load_one(given.electrodes, force=given.force)
         rows = rows_of(recording.counts()[0], recording.force, given.every)
-        response = table(given.skin, given.material, {"electrode_radius": given.radius})
+        material = read_material(given.material)
+        film = read_film(None, given.radius or material.electrode_radius)
+        response = table(given.skin, material, film)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"real_match: {error}")
     found = match(response, rows)[0]

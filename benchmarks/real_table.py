@@ -6,8 +6,9 @@ Under DIR, packed (.gz) or not, in folders of any depth: `ForceData.txt` with a 
 `SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold an
 object, `*.btd` of a resting sensor. The simulated sensor is the default one on `--skin` under a flat plate;
 pressed rows have the state that `matching` finds for them with all gains 1 and the rubber's own modulus, so
-that both columns are of the same presses. A row is inside where no simulated value is further from the
-real one of the same recording than the real ones are from each other (of a single one: than 10 %)."""
+that both columns are of the same presses. Such a row is inside where no simulated value is further from the
+real one of the same recording than the real ones are from each other (of a single one: than 10 %); a row
+of what a sensor has of its own, where no simulated value leaves the real ones' spread by more than 10 %."""
 
 import argparse
 import gzip
@@ -17,30 +18,33 @@ import tempfile
 
 import numpy as np
 import scipy.io
+import scipy.signal
 from real_match import table
-from vibration import floor
+from vibration import resting
 
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.matching.fit import Setup, fit_constants
 from biotac_mj.matching.match import rows_of
+from biotac_mj.matching.response import Response
 from biotac_mj.recordings import load_one
+from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import (
-    PAC_COLOUR,
-    PAC_NOISE,
+    PDC_REST,
     REST_TEMPERATURE,
     counts_from_log_impedance,
-    counts_from_pac,
+    counts_from_pressure,
     counts_from_temperature,
     electrode_noise,
+    impedance_from_counts,
     log_impedance,
-    pac_from_counts,
+    pressure_from_counts,
 )
-from biotac_mj.sensor.film import CALIBRATED_RADIUS
-from biotac_mj.sensor.presets import SENSORS
+from biotac_mj.sensor.film import read_film
 from biotac_mj.skin.rubber.material import PRESETS
 
+_END = 400  # rows of a hold's end
 _SMOOTH = 51  # rows over which slow changes are taken out of noise, half a second
-_ALONE = 0.1  # of the value, by which a single recording's row may be off
+_ALONE = 0.1  # of a value, beyond what real sensors differ by
 _TIP = [6, 7, 8]
 _NEAR, _FAR = 5e-3, 12e-3  # [m] between electrodes that are near and far
 
@@ -72,30 +76,96 @@ def _noise(series):
     return fast[_SMOOTH:-_SMOOTH].std(0)
 
 
-def _lag(series):
-    series = series - series.mean()
-    return float((series[1:] * series[:-1]).mean() / (series * series).mean())
+def _lag(blocks):
+    blocks = blocks - blocks.mean()
+    return float((blocks[:, 1:] * blocks[:, :-1]).mean() / (blocks * blocks).mean())
+
+
+def _held(electrodes, pac, pdc):
+    """What the table says of a sensor that holds something still: counts (n, 19), (22, n), (n,)."""
+    end = pac[:, -_END:].T
+    return {
+        "noise of an electrode [counts]": float(np.median(_noise(electrodes))),
+        "noise of PDC [counts]": float(_noise(pdc[:, None])[0]),
+        "PAC at rest, std [counts]": float(end.std()),
+        "PAC at rest, lag-1 correlation": _lag(end.reshape(1, -1)),
+    }
+
+
+def _replayed(electrodes, pdc, seed):
+    """The same of the default sensor, which bears the slow part of what PDC (n,) says and the electrodes'
+    median counts."""
+    sensor = Acquisition(seed=seed)
+    state, rows = np.zeros(sensor.nstate), []
+    window = scipy.signal.windows.hann(2 * _SMOOTH + 1)  # smooth, so that PDC's noise is none of PAC's
+    slow = np.convolve(np.pad(pdc, _SMOOTH, "edge"), window / window.sum(), "valid")
+    pressure = pressure_from_counts(PDC_REST + slow - slow[0])
+    impedance = impedance_from_counts(np.median(electrodes, 0))
+    sensor.reset(state, impedance, pressure[0])
+    for i, now in enumerate(pressure):
+        sensor.advance(state, i * 0.01, 0.01, impedance, now)
+        rows.append(sensor.readings(state))
+    counts = {name: np.array([row[name] for row in rows], float) for name in ("electrodes", "pac", "pdc")}
+    return _held(counts["electrodes"], np.roll(counts["pac"], -1, 1).T, counts["pdc"])
 
 
 def holds(data: pathlib.Path) -> dict:
-    """{finger: rows of that finger's holds}."""
-    found = {}
-    for path in sorted(data.rglob("*_HOLD.mat")):
-        file = scipy.io.loadmat(path)
-        for finger in ("F0", "F1"):
-            electrodes = file[finger + "Electrodes"].astype(float).T
-            pac = file[finger + "pac"].astype(float)[:, -400:]  # the end of the hold
+    """{finger: (rows of that finger's holds, those of the simulated sensor)}, and under None what the fingers
+    share. Noise is that of the third of the holds with the least effort: what is soft keeps the gripper's
+    motion from the fingers."""
+    files = [scipy.io.loadmat(path) for path in sorted(data.rglob("*_HOLD.mat"))]
+    files.sort(key=lambda file: abs(np.median(file["JEff"])))
+    soft, found = files[: -(-len(files) // 3)], {}
+    for finger in ("F0", "F1") if files else ():
+        parts = []
+        for number, file in enumerate(soft):
+            electrodes, pac = (file[finger + name].astype(float) for name in ("Electrodes", "pac"))
             pdc = file[finger + "pdc"].ravel().astype(float)
-            part = found.setdefault(
-                finger, {"tdc": [], "electrodes": [], "pdc": [], "pac": [], "lag": [], "top": []}
-            )
-            part["tdc"].append(file[finger + "tdc"].ravel()[:20].mean())
-            part["electrodes"].append(np.median(_noise(electrodes)))
-            part["pdc"].append(float(_noise(pdc[:, None])[0]))
-            part["pac"].append(pac.std())
-            part["lag"].append(_lag(pac.T.ravel()))
-            part["top"].append(np.ptp(pdc))
-    return {f: {k: float(np.median(v)) for k, v in part.items()} for f, part in found.items()}
+            parts.append((_held(electrodes.T, pac, pdc), _replayed(electrodes.T, pdc, number)))
+        real, mine = ({k: float(np.median([p[k] for p in one])) for k in one[0]} for one in zip(*parts))
+        tdc = np.median([file[finger + "tdc"].ravel()[:20].mean() for file in files])
+        real["TDC at rest [counts]"] = float(tdc)
+        mine["TDC at rest [counts]"] = float(counts_from_temperature(REST_TEMPERATURE))
+        found[finger] = real, mine
+    if files:
+        found[None] = {"soft": _shared(soft), "firm": _shared(files[len(soft) :])}
+    return found
+
+
+def firm_holds(data: pathlib.Path, response: Response, modulus: float) -> dict:
+    """{finger: (real, simulated)}: by how much PDC is higher in the holds that are not soft, median [counts],
+    and in the states of a plate that change the electrodes by as much, mean of the straight ways."""
+    files = [scipy.io.loadmat(path) for path in sorted(data.rglob("*_HOLD.mat"))]
+    files.sort(key=lambda file: abs(np.median(file["JEff"])))
+    cut, out = -(-len(files) // 3), {}
+    pdc = counts_from_pressure(response.states.pressure[:, :, 0] * modulus) - PDC_REST
+    for finger in ("F0", "F1") if len(files) > cut else ():
+        held = [
+            [np.median(file[finger + name][..., -_END:], -1) for name in ("Electrodes", "pdc")]
+            for file in files
+        ]
+        rest, level = (np.median([np.ravel(h[i]) for h in held[:cut]], 0) for i in (0, 1))
+        change = counts_from_log_impedance(log_impedance(rest) + response.log_z[:, :, 0]) - rest
+        size = np.sqrt((change * change).mean(-1)).reshape(-1, change.shape[2])
+        rows = []
+        for electrodes, now in held[cut:]:
+            here = _rms(np.ravel(electrodes) - rest)
+            at = [np.interp(here, s, p) for s, p in zip(size, pdc.reshape(size.shape), strict=True)]
+            rows.append([float(np.ravel(now)[0] - level[0]), np.mean(at)])
+        out[finger] = tuple(np.median(rows, 0).tolist())
+    return out
+
+
+def _shared(files):
+    """Coherence of both fingers' PAC and its mean square [counts^2] below 20 Hz, mean of the holds."""
+    rows = []
+    for file in files:
+        both = [file[f + "pac"].astype(float)[:, -_END:].T.ravel() for f in ("F0", "F1")]
+        f, coherence = scipy.signal.coherence(*both, 22 * 100, nperseg=1024)
+        power = np.mean([scipy.signal.welch(one, 22 * 100, nperseg=1024)[1] for one in both], 0)
+        low = (f > 4) & (f < 20)
+        rows.append([coherence[low].mean(), power[low].sum() * f[1]])
+    return dict(zip(("coherence", "mean_square"), np.mean(rows, 0).tolist(), strict=True))
 
 
 def measures(counts: np.ndarray, rest: np.ndarray, pressing: np.ndarray) -> dict:
@@ -138,8 +208,9 @@ def _rms(x):
     return float(np.sqrt(_mean(np.square(x))))
 
 
-def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[dict]:
-    """Rows of the table: name, real and simulated values by recording, whether these are inside."""
+def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> tuple[list[dict], dict | None]:
+    """Rows of the table: name, real and simulated values by recording, whether these are inside; and what
+    the fingers of a gripper share."""
     rows = {}
 
     def add(name, where, real, simulated):
@@ -148,16 +219,15 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[d
         if simulated is not None:
             row["simulated"][where] = simulated
 
-    for finger, part in holds(data).items():
-        add("TDC at rest [counts]", finger, part["tdc"], float(counts_from_temperature(REST_TEMPERATURE)))
-        level = float(np.median(electrode_noise(np.full(1, 3000.0))))
-        add("noise of an electrode [counts]", finger, part["electrodes"], level)
-        add("noise of PDC [counts]", finger, part["pdc"], SENSORS["1"].pdc_noise)
-        add("PAC in a hold, std [counts]", finger, part["pac"], PAC_NOISE / np.sqrt(1 - PAC_COLOUR**2))
-        add("PAC in a hold, lag-1 correlation", finger, part["lag"], PAC_COLOUR)
+    held = holds(data)
+    shared = held.pop(None, None)
+    for finger, (real, mine) in held.items():
+        for name, value in real.items():
+            add(name, finger, value, mine[name])
     for path in sorted(data.rglob("*.btd*")):
-        mine = pac_from_counts(PAC_NOISE / np.sqrt(1 - PAC_COLOUR**2) + counts_from_pac(0.0))
-        add("PAC at rest [Pa RMS]", path.name, floor(path)["floor_rms_pa"], float(mine))
+        real, mine = resting(path)
+        for name, one in (("std [counts]", np.std), ("lag-1 correlation", _lag)):
+            add(f"PAC at rest, {name}", path.name, float(one(real)), float(one(mine)))
     with tempfile.TemporaryDirectory() as folder:
         pressed, free = presses(data, folder)
     for name, recording in free.items():
@@ -173,8 +243,10 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[d
         add("warm-up of an unloaded sensor, ln Z", name, float((warm[-n:] - warm[:n]).mean()), 0.0)
     if pressed:
         material = "calibrated" if calibrated else "default"
-        response = table(skin, material, {"electrode_radius": CALIBRATED_RADIUS} if calibrated else {})
+        response = table(skin, material, read_film(None, PRESETS[material].electrode_radius))
         modulus = PRESETS[material].youngs_modulus
+        for finger, pair in firm_holds(data, response, modulus).items():
+            add("PDC in a firm hold over a soft one [counts]", finger, *pair)
     for name, recording in pressed.items():
         taken = rows_of(recording.counts()[0], recording.force, every)
         const, found = fit_constants(response, taken, Setup(gains=0.0, modulus=modulus, hold_modulus=True))
@@ -187,9 +259,14 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> list[d
                 add(key, name, real[key], mine[key])
     for row in rows.values():
         real = row["real"]
-        apart = max(real.values()) - min(real.values()) if len(real) > 1 else _ALONE * abs(min(real.values()))
-        row["inside"] = all(abs(v - real[k]) <= apart for k, v in row["simulated"].items())
-    return list(rows.values())
+        low, high = min(real.values()), max(real.values())
+        if pressed.keys() & real.keys():
+            apart = high - low if len(real) > 1 else _ALONE * abs(low)
+            row["inside"] = all(abs(v - real[k]) <= apart for k, v in row["simulated"].items())
+        else:
+            low, high = low - _ALONE * abs(low), high + _ALONE * abs(high)
+            row["inside"] = all(low <= v <= high for v in row["simulated"].values())
+    return list(rows.values()), shared
 
 
 def draw(path: pathlib.Path, rows: list[dict]) -> None:
@@ -247,18 +324,27 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--every", type=int, default=20, help="of the loaded rows one is taken")
     parser.add_argument("--calibrated", action="store_true", help="rubber and electrodes that were fitted")
     given = parser.parse_args(argv)
-    rows = build(given.data, given.skin, given.every, given.calibrated) if given.data.is_dir() else []
+    rows, shared = [], None
+    if given.data.is_dir():
+        rows, shared = build(given.data, given.skin, given.every, given.calibrated)
     if not rows:
         parser.error(
             f"{given.data} has no recordings: ForceData.txt with SynImp*.txt, *_HOLD.mat "
             "or *.btd are looked for"
         )
-    given.json.write_text(json.dumps({"rows": rows, "inside": sum(r["inside"] for r in rows)}, indent=1))
+    given.json.write_text(
+        json.dumps({"rows": rows, "inside": sum(r["inside"] for r in rows), "shared": shared}, indent=1)
+    )
     for row in rows:
         real, mine = ([f"{v:.4g}" for v in row[key].values()] for key in ("real", "simulated"))
         print(
             f"{row['name']:46s} {', '.join(real):34s} | {', '.join(mine):34s} "
             f"{'' if row['inside'] else 'outside'}"
+        )
+    for what, one in (shared or {}).items():
+        print(
+            f"PAC below 20 Hz in {what} holds: {one['mean_square']:.1f} counts^2, "
+            f"coherence of the fingers {one['coherence']:.2f}"
         )
     if given.figure:
         draw(given.figure, rows)

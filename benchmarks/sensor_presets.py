@@ -72,7 +72,7 @@ def of_holds(folder: pathlib.Path) -> dict:
         for name in ("pdc", "tac", "tdc"):
             one[f"{name}_rest"] = float(np.median([np.median(t[name]) for t in soft]))
             one[f"{name}_noise"] = float(np.median([noise(t[name]) for t in all_]))
-        seconds = [t["pac"].reshape(-1, _FRAME * t["pac"].shape[1]) for t in all_]
+        seconds = [t["pac"].reshape(-1, _FRAME * t["pac"].shape[1]) for t in soft]
         quiet = np.array([min(blocks, key=np.std) for blocks in seconds])
         keep, white = colour(quiet)
         out[finger] = one | {"pac_rest": float(quiet.mean()), "pac_colour": keep, "pac_noise": white}

@@ -94,13 +94,12 @@ def _spectrum(blocks):
     return f[inside], power.mean(0)[inside]
 
 
-def floor(path: pathlib.Path, frames: int = 4000) -> dict:
-    """The resting blocks' spectrum, that of the simulated sensor, and the colour fitted anew."""
+def resting(path: pathlib.Path, frames: int = 4000) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks (n, 88) of PAC [counts], those of a log that rest and those of the simulated sensor."""
     blocks = read_log(path)
     blocks = blocks[(blocks > 0).all(1)]
     level = np.median(blocks)
     quiet = (blocks.std(1) < _RESTING) & (np.abs(blocks.mean(1) - level) < _RESTING)
-    f, real = _spectrum(blocks[quiet])
     sensor = Acquisition(seed=1)
     state, rest = np.zeros(sensor.nstate), impedance_from_counts(np.full(19, 3000.0))
     sensor.reset(state, rest)
@@ -109,7 +108,13 @@ def floor(path: pathlib.Path, frames: int = 4000) -> dict:
         sensor.advance(state, i * 0.01, 0.01, rest)
         rows.append(np.roll(sensor.readings(state)["pac"], -1))  # the first is the next frame's already
     mine = np.ravel(rows)
-    _, model = _spectrum(mine[: len(mine) // _BLOCK * _BLOCK].reshape(-1, _BLOCK).astype(float))
+    return blocks[quiet], mine[: len(mine) // _BLOCK * _BLOCK].reshape(-1, _BLOCK).astype(float)
+
+
+def floor(path: pathlib.Path) -> dict:
+    """The resting blocks' spectrum, that of the simulated sensor, and the colour fitted anew."""
+    blocks, mine = resting(path)
+    (f, real), (_, model) = _spectrum(blocks), _spectrum(mine)
     error = 10 * np.log10(model / real)
 
     def colour(q):
@@ -120,8 +125,8 @@ def floor(path: pathlib.Path, frames: int = 4000) -> dict:
     return {
         "floor_error_db": float(np.abs(error).max()),
         "floor_error_db_rms": float(np.sqrt((error**2).mean())),
-        "floor_seconds": float(quiet.sum() * _BLOCK / RATE),
-        "floor_rms_pa": float(pac_from_counts(blocks[quiet].std() + counts_from_pac(0.0))),
+        "floor_seconds": blocks.size / RATE,
+        "floor_rms_pa": float(pac_from_counts(blocks.std() + counts_from_pac(0.0))),
         "floor_fit": {"colour": float(best[1]), "noise": float(np.exp(best[0] / 2))},
     }
 

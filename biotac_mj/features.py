@@ -215,8 +215,10 @@ SENSES = (
           "electrodes", 0.5),
     Sense("drift of counts", '`randomise=["drift"]`', {"randomise": {"drift": 40.0}},
           "electrodes", 5),
+    Sense("constants of the film: electrodes' radius, residual film, place of X1 to X4", "`options.film`",
+          {"options": {"film": {"residual_film": 3e-4, "electrode_radius": 9e-4}}}, "electrodes", 5),
     Sense("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
-          {"thermal": {"touched": "steel at -20000"}}, "tac", 3),
+          {"thermal": {"touched": "steel at 20000"}}, "tac", 3),
     Sense("vibration: PAC by texture, slip and taps", "`textures=` (press, generate: `texture`)",
           {"textures": {"touched": {"roughness": 5e-5}}}, "pac", 10,
           cells=_NO_MODES),
@@ -245,7 +247,9 @@ _TRAVEL = """\
 `material` is a preset's name, a dict of Material's fields, a `.json` file of them or a Material; `options` is
 `{"skin": {...}, "modulus": [...]}`, in Python a dict (with SkinOptions, a ContactLaw or arrays in it, if you
 like), on the command line `--options`, JSON or a file of it. `modulus` is a factor for each element, a `.npy`
-file of them or, in Python, a function of positions. `attach` writes all of it into the model as JSON.
+file of them or, in Python, a function of positions. On paths with a sensor `options` may have "film" too.
+`attach` writes all of it into the model as JSON. `material="calibrated"` is the one name for what was fitted
+to real sensors (docs/real_match.md), rubber, filling and electrodes, on every path.
 
 Rubber that relaxes, and inertia, take their time step from: `mj_step`'s timestep (attach, batch, press),
 `time_s` of an indentation (calibrate, compare; planned ones have 20 ms a sample), 1 / rate (generate), `time`

@@ -529,6 +529,11 @@ def settings():
         ("--thermal mithril", "no material is known by 'mithril'"),
         ("--thermal steel mithril", "no material is known by 'mithril'"),
         ('--texture {"height":1}', "give a material, pitch and height, or roughness"),
+        ('--thermal {"material":["steel"]}', "thermal is {'material': ['steel']}: give a material's name"),
+        ('--thermal {"effusivity":[500]}', "holds something that is not a number"),
+        ('--thermal {"material":"steel","temperature":-300}', "temperature of a body is -300.0 C: give"),
+        ('--texture {"material":["cork"]}', "texture is {'material': ['cork']}: give a material's name"),
+        ('--texture {"roughness":[1e-6]}', "roughness of a texture is [1e-06]"),
     ):
         yield Row(f"press --quiet --skin coarse {given}", said)
         yield Row(f"generate --quiet --count 1 --labelled 0 {given}", said)
@@ -819,7 +824,7 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"effects": []}, "options has 'effects': choose from skin, modulus, readings"),
+        ({"effects": []}, "options has 'effects': choose from skin, modulus, film, readings"),
         ({"skn": {}}, "options has 'skn': did you mean 'skin'?"),
         ({"skin": {"sample": 3}}, r"options\['skin'\] has 'sample': did you mean 'samples'?"),
         ({"skin": {"samples": 2.5}}, "samples is 2.5: pass a whole number"),
@@ -827,6 +832,7 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
         ({"readings": {"nose": True}}, r"options\['readings'\] has 'nose': did you mean 'noise'?"),
         ({"readings": {"noise": 1}}, r"noise of options\['readings'\] is 1: pass true or false"),
         ({"readings": 3}, r"options\['readings'\] is 3: a dict is needed"),
+        ({"readings": {"temperature": -280.0}}, "temperature is -280.0 C: give a finite number above -273"),
         ({"modulus": "nowhere.npy"}, "no modulus at nowhere.npy"),
         ({"modulus": [1.0, -1.0]}, "pass a positive factor"),
     ],

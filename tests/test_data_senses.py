@@ -21,12 +21,12 @@ PLAIN = GenerateOptions(
     count=2, labelled=0, steps=16, rate=25.0, seed=4, objects=("cube_14mm",), kinds=("slide",), skin="coarse",
     material={"friction": 0.1},
 )  # fmt: skip
-COLD = "steel at -400"  # so that it tells within a second
+HOT = "steel at 400"  # so that it tells within a second
 FELT = dataclasses.replace(
     PLAIN,
     sensor="random",
     randomise=("dead", "crosstalk"),
-    thermal=(COLD, "foam"),
+    thermal=(HOT, "foam"),
     texture={"roughness": 4e-5},
 )
 
@@ -42,7 +42,7 @@ def sets(tmp_path_factory):
 def test_sensors_of_a_set_differ_and_are_kept(sets):
     with TactileSet(sets / "felt") as data, TactileSet(sets / "plain") as plain:
         rest = [data.parameters(i)["sensor"]["rest"] for i in range(2)]
-        assert rest[0] != rest[1] and {data.parameters(i)["thermal"] for i in range(2)} <= {COLD, "foam"}
+        assert rest[0] != rest[1] and {data.parameters(i)["thermal"] for i in range(2)} <= {HOT, "foam"}
         for i in range(2):
             row = data["counts"][data.start[i]]
             np.testing.assert_allclose(row[:NELECTRODE], rest[i], atol=35)
@@ -78,7 +78,7 @@ def test_heat_moves_tac_and_only_where_it_is(sets):
 
     with TactileSet(sets / "felt") as data, TactileSet(sets / "plain") as plain:
         assert max(moved(plain, i) for i in range(2)) < 6  # noise
-        steel = [i for i in range(2) if data.parameters(i)["thermal"] == COLD]
+        steel = [i for i in range(2) if data.parameters(i)["thermal"] == HOT]
         assert all(moved(data, i) > 12 for i in steel) and steel
 
 
@@ -98,7 +98,7 @@ def test_order_of_the_samples():
 def test_a_press_has_the_sensor_and_feels_what_it_touches():
     options = dict(depth=1e-3, skin="coarse", tier="condensed", hold=0.5, timestep=1e-2)
     plain = press(PressOptions(**options), progress=False)[0]
-    felt = press(PressOptions(**options, sensor="phac_f0", thermal=COLD), progress=False)[0]
+    felt = press(PressOptions(**options, sensor="phac_f0", thermal=HOT), progress=False)[0]
     np.testing.assert_allclose(felt.counts[0, :NELECTRODE], SENSORS["phac_f0"].rest, atol=3)
     assert np.ptp(felt.counts[:, TAC]) > 8 > np.ptp(plain.counts[:, TAC])
 

@@ -20,7 +20,7 @@ from biotac_mj.data.vary import draw_sense
 from biotac_mj.features import SENSE_PATHS, SENSES
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE
-from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.sensor.film import FilmConduction, read_film
 
 DT, N, SEED = 8e-3, 45, 3
 WAY = np.stack(
@@ -54,9 +54,10 @@ def scene():
 
 def by_attach(settings, file, tier="full"):
     spec = scene()
+    mine = named(settings, "pin")
+    mine["options"] = {"readings": {"noise": False}, **mine.get("options", {})}
     handle = biotac_mj.attach(
-        spec, body="world", skin=file, tier=tier, material=MATERIAL, coupling="one-way", seed=SEED,
-        options={"readings": {"noise": False}}, **named(settings, "pin"),
+        spec, body="world", skin=file, tier=tier, material=MATERIAL, coupling="one-way", seed=SEED, **mine
     )  # fmt: skip
     model = spec.compile()
     data, rows = mujoco.MjData(model), []
@@ -144,7 +145,7 @@ def by_generate(settings, file, tier="full"):
     mine = {key: value["it"] if key in ("texture", "thermal") else value for key, value in mine.items()}
     options = dataclasses.replace(maker.options, **mine)
     sense, _ = draw_sense(options, [SEED, 0, 3], maker.few)
-    film = FilmConduction(maker.geometry)
+    film = FilmConduction(maker.geometry, **read_film((options.options or {}).get("film")))
     x = fields.vert_xpos(maker.geometry.vert, 0)
     read = read_motion(film, x, maker.time, fields.pressure[0], 1, sense, fields.touch(0))
     return _by_channel(read.counts, read.pac)
@@ -181,7 +182,7 @@ def cells():
     """All of the table; an environment takes some seconds, so of tasks three."""
     for path in SENSE_PATHS:
         for sense in SENSES:
-            quick = path != "tasks" or sense.settings.keys() & {"sensor", "thermal", "textures"}
+            quick = path != "tasks" or sense.settings.keys() & {"sensor", "thermal", "textures", "options"}
             marks = () if quick else pytest.mark.slow
             yield pytest.param(path, sense, id=f"{path}-{sense.name}", marks=marks)
 

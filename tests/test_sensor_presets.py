@@ -170,7 +170,7 @@ def test_resets_of_a_batch_draw_again():
     again = BatchAcquisition(FILM, 3, seed=5, noise=False, sensor=sensors, redraw=True)
     mask = wp.array([True, False, True], dtype=bool)
     seen = [batch.state.numpy().copy()]
-    for _ in range(4):
+    for _ in range(6):  # the first is the beginning
         batch.reset(mask)
         again.reset(mask)
         seen.append(batch.state.numpy().copy())

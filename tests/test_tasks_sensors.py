@@ -79,6 +79,14 @@ def test_materials_are_drawn_at_a_reset():
     assert len(np.unique(states, axis=0)) > 1
     with pytest.raises(ValueError, match="no material is known by 'unobtainium'"):
         made(thermal={"plate": ["steel", "unobtainium"]})
+    with pytest.raises(ValueError, match="thermal is .'steel'.: give a dict"):
+        made(thermal=["steel"])
+
+
+@pytest.mark.parametrize("sense", ["thermal", "textures"])
+def test_a_geom_that_is_not_there_is_said(sense):
+    with pytest.raises(ValueError, match="no geom 'plait' to touch: the model has"):
+        made(**{sense: {"plait": "cork"}})
 
 
 def test_gymnasium_draws_by_the_seed_of_its_reset():

@@ -14,13 +14,14 @@ from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _colli
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
+from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import SIGNALS
 from ..coupling.structs import ModelView
-from ..coupling.touching import Touching
+from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
-from ..sensor.materials import check_choices, read_thermal
+from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..skin.per_world import make_room
 from ..skin.rubber.material import Material
@@ -152,10 +153,11 @@ def attach(
         dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
         `SensorBioTac(...).batch()` gives.
       sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is drawn,
-        every reset of a world draws again, by its seed. sensor, thermal and textures may be lists of one for
+        world w begins with what a single sensor of its seed and prefix has, and every reset draws again, by
+        its seed. sensor, thermal and textures may be lists of one for
         each world, which resets leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
-        elements}, as for `biotac_mj.attach`, of all worlds.
+        elements, "film": of the electrodes}, as for `biotac_mj.attach`, of all worlds.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
         adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
         a number or (nworld,), and modulus (nworld, nelem). `batch.skin.data` changes them later.
@@ -190,7 +192,7 @@ def attach(
     felt = sensor, randomise, thermal, textures
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
     skin = skin_of(bool(slots) or textures is not None)
-    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
@@ -251,7 +253,7 @@ def make(
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
     felt = sensor, randomise, thermal, textures
     skin = skin_of(textures is not None)
-    senses = _senses(readings, felt, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     return PoseBatch(mjm, touching, skin, senses)
 
 
@@ -275,6 +277,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     geometry = skin_reference(skin)[1]
     config = Config(
+        name=prefix,
         skin=skin_reference(skin)[0],
         material=plain(chosen),
         liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
@@ -427,7 +430,7 @@ def _slots(mjm, m, d, touching, prefix):
     return {g: place[root] for g, root in enumerate(roots) if root in needed}
 
 
-def _senses(choice, felt, geometry, seed, skin, touching, mjm):
+def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     """The sensors of the worlds, or None."""
     nworld, device = skin.nworld, str(skin.model.device)
     sensor, randomise, thermal, textures = felt
@@ -449,27 +452,21 @@ def _senses(choice, felt, geometry, seed, skin, touching, mjm):
         check_settings(
             {k: v for k, v in {**settings, "sensor": one}.items() if v is not None}, known, "readings"
         )
-    for wanted, read in ((thermal, read_thermal), (textures, read_texture)):
-        for one in wanted if isinstance(wanted, list) else [wanted or {}]:
-            for name, value in one.items():
-                _resolve_geom(mjm, name)
-                check_choices(value, read)
-    rows, redraw = draws(nworld, seed, settings, thermal, textures, touching.geoms)
+    for what, wanted, read in (("thermal", thermal, read_thermal), ("textures", textures, read_texture)):
+        for one in wanted if isinstance(wanted, list) else [wanted]:
+            check_geoms(what, one, read)
+            find_geoms(ModelView(mjm._address), one or ())
+    rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms)
     signal, weights = settings.pop("signal", "physics"), settings.pop("weights", None)
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
     if signal != "physics":
+        if "film" in config.options:
+            raise ValueError("a network stands in the film's place: leave options['film'] out")
         from ..learning.serve import LearnedBatchFilm
 
         film = LearnedBatchFilm(geometry, nworld, device, weights)
     else:
-        film = BatchFilm(FilmConduction(geometry), nworld, device)
+        film = BatchFilm(FilmConduction(geometry, **film_of(config)), nworld, device)
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
     return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)
-
-
-def _resolve_geom(mjm, name):
-    names = [mjm.geom(i).name for i in range(mjm.ngeom)]
-    if not any(n == name or n.endswith(name) for n in names):
-        found = ", ".join(n for n in names if n) or "no named geom"
-        raise ValueError(f"no geom {name!r} to touch: the model has {found}")

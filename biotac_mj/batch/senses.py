@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..coupling.config import Config
 from ..coupling.readings import materials_of, textures_of
 from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
@@ -36,6 +37,7 @@ class Draw(NamedTuple):
 def draws(
     nworld: int,
     seed: ArrayLike,
+    config: Config,
     settings: dict,
     thermal: dict | list | None,
     textures: dict | list | None,
@@ -44,7 +46,8 @@ def draws(
     """What worlds begin with, or what their resets draw from.
 
     Args:
-      nworld: number of worlds. seed: of what is drawn, one or (nworld,), of which the first counts.
+      nworld: number of worlds. seed: of world 0, world w has seed + w; or (nworld,).
+      config: of the single sensor with which each world begins that has the world's seed.
       settings: of the readings; its "sensor", thermal and textures may be lists of one for each world.
       geoms: that can touch.
 
@@ -60,11 +63,15 @@ def draws(
         if len(value) != nworld:
             raise ValueError(f"{len(value)} {name} for {nworld} worlds: pass one for each, or a single one")
 
+    seeds = [int(s) for s in np.ravel(seed)]
+    if np.ndim(seed) == 0:
+        seeds = [seeds[0] + w for w in range(nworld)]
+
     def row(i):
         mine = {**settings, "sensor": lists["sensor"][i]} if "sensor" in lists else settings
         made, brushed = (v[i] if isinstance(v, list) else v for v in (thermal, textures))
-        key = [int(np.ravel(seed)[0]), i]
-        sensor, _, drawn = take_sensor(mine, key)
+        key = seeds[i] if i < len(seeds) else max(seeds) + 1 + i - len(seeds)
+        sensor, _, drawn = take_sensor(mine, config.own_seed(key))
         bodies = None if made is None else materials_of(geoms, made, key)
         surfaces = None if brushed is None else textures_of(geoms, brushed, key)
         choices = [*(made or {}).values(), *(brushed or {}).values()]

@@ -15,7 +15,7 @@ from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
-from ..sensor.materials import check_choices, read_thermal
+from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
@@ -64,7 +64,7 @@ class Handle:
     @property
     def numbers(self) -> Sensor:
         """The sensor's own numbers by its settings: rest counts, noise, levels."""
-        return take_sensor(self.config.options.get("readings", {}), self.config.seed)[0]
+        return take_sensor(self.config.options.get("readings", {}), self.config.own_seed())[0]
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
         """Puts another sensor at rest in the place of this one, until the next reset, where the settings
@@ -149,14 +149,17 @@ def attach(
       skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
       slots: how many bodies may touch two-way; None counts the bodies of `spec`.
       material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
+        "calibrated" is what was fitted to real sensors, rubber and electrodes.
       liquid, friction: None takes the material's choice.
       options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
         element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "readings": of the sensor (noise, sensor, randomise, film_every_step,
+        elements' centroids; "film": residual_film, electrode_radius [m], excitation, see
+        `sensor.film.read_film`; "readings": of the sensor (noise, sensor, randomise, film_every_step,
         temperature, cold; weights).
-      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by the
-        seed), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for options["readings"].
-      randomise: names of effects that are drawn by the seed ("dead", "crosstalk", "relax"), or {name: size};
+      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by seed
+        and prefix), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for
+        options["readings"].
+      randomise: names of effects that are drawn likewise ("dead", "crosstalk", "relax"), or {name: size};
         see `effects.sensors.RANDOM`. Short for options["readings"].
       effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
         (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,
@@ -206,16 +209,15 @@ def attach(
         textures=textures,
         priority=priority,
         seed=seed,
+        name=prefix,
         device=device,
         options=options,
         on_error=on_error,
         **({} if friction is None else {"friction": friction}),
     )
     _check(config, geometry)
-    for value in (config.thermal or {}).values():
-        check_choices(value, read_thermal)
-    for value in (config.textures or {}).values():
-        check_choices(value, read_texture)
+    check_geoms("thermal", config.thermal, read_thermal)
+    check_geoms("textures", config.textures, read_texture)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
     if slots is not None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import numbers
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -61,10 +62,11 @@ class Config:
       friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
         the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
       priority: contact priority of the skin.
-      seed: of the sensor's noise.
+      seed: of the sensor's noise, and of what is drawn. name: of the sensor; sensors of one seed that have
+        other names are drawn apart.
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
-        and "readings".
+        "film" between skin and core (`sensor.film.read_film`), and "readings".
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
@@ -83,6 +85,7 @@ class Config:
     friction: float = 0.783414394
     priority: int = 0
     seed: int = 0
+    name: str = ""
     device: str = "cpu"
     options: dict = dataclasses.field(default_factory=dict)
     on_error: str = "warn"
@@ -91,7 +94,7 @@ class Config:
         for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
             if (value := getattr(self, name)) not in choices:
                 raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(choices)}")
-        for name in ("skin", "stepper", "readings", "device"):
+        for name in ("skin", "stepper", "readings", "device", "name"):
             if not isinstance(value := getattr(self, name), str):
                 raise ValueError(f"{name} is {value!r}: give its name")
         if self.tier != "full" and self.stepper != "fem":
@@ -117,10 +120,14 @@ class Config:
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
         self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
-            refuse_unknown(self.options, ("skin", "modulus", "readings"), "options")
+            refuse_unknown(self.options, ("skin", "modulus", "film", "readings"), "options")
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
+
+    def own_seed(self, seed: int | None = None) -> list[int]:
+        """What this sensor is drawn by: a seed, by default its own, and its name."""
+        return [self.seed if seed is None else int(seed), zlib.crc32(self.name.encode())]
 
     def _set(self, name, value):
         object.__setattr__(self, name, value)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.acquisition import Acquisition
-from ..sensor.film import FilmConduction
+from ..sensor.film import FilmConduction, read_film
 from ..sensor.heat import state_size
 from ..sensor.materials import Material, read_thermal
 from ..sensor.presets import Sensor
@@ -16,12 +16,13 @@ from ..sensor.readings import PhysicsReadings, check_settings
 from ..sensor.vibration import Texture, Vibration, read_texture
 from ..sensor.vibration import state_size as vibration_size
 from ..skin.modes import NMODE
+from ..skin.settings import read_material
 from .config import Config
 from .fem import FemStepper, rest_geometry
 from .stepper import Geom, SkinResult
 from .vibration import Shaking
 
-__all__ = ["SensorReadings", "materials_of", "textures_of"]
+__all__ = ["SensorReadings", "film_of", "materials_of", "textures_of"]
 
 
 class SensorReadings:
@@ -36,7 +37,8 @@ class SensorReadings:
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
         settings = check_settings(config.options.get("readings", {}), {"cold": bool})
-        self.sensor, self._options, _ = take_sensor(settings, config.seed)
+        self._film = film_of(config)
+        self.sensor, self._options, _ = take_sensor(settings, config.own_seed())
         self._bodies: list[Material] | None = None
         self._textures: list[Texture] | None = None
         self._geoms: list[Geom] = []
@@ -64,7 +66,7 @@ class SensorReadings:
         geometry = (
             rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
         )
-        film = _film(_Skin(geometry))
+        film = _film(_Skin(geometry, self._film))
         sound = self._shaking and Vibration(self._shaking.modes, self._textures, seed=self._seed)
         more = {"film": film, "bodies": self._bodies, "vibration": sound, "sensor": self.sensor}
         more["textures"] = self._textures
@@ -81,7 +83,7 @@ class SensorReadings:
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
         """Resets to another sensor, other materials and textures, where the settings leave them open."""
-        sensor = take_sensor(self._config.options.get("readings", {}), seed)[0]
+        sensor = take_sensor(self._config.options.get("readings", {}), self._config.own_seed(seed))[0]
         bodies = self._bodies and materials_of(self._geoms, self._config.thermal, seed)
         textures = self._textures and textures_of(self._geoms, self._config.textures, seed)
         self._physics.reset(state, sensor=sensor, bodies=bodies, textures=textures)
@@ -100,6 +102,12 @@ class SensorReadings:
     ) -> dict:
         self._physics.advance(state, time, dt, vert_xpos, pressure, area, force, shaking)
         return self._physics.readings(state)
+
+
+def film_of(config: Config) -> dict:
+    """Settings of the film of a BioTac, for `FilmConduction`."""
+    radius = read_material(config.material).electrode_radius if config.stepper == "fem" else None
+    return read_film(config.options.get("film"), radius)
 
 
 def materials_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Material]:
@@ -130,11 +138,12 @@ def _is(name, key):
 
 
 class _Skin:
-    """A geometry, hashable by content."""
+    """A geometry and settings of its film, hashable by content."""
 
-    def __init__(self, geometry):
-        self.geometry = geometry
-        self.key = (geometry.vert.tobytes(), geometry.core_vert.tobytes(), geometry.electrode_pos.tobytes())
+    def __init__(self, geometry, settings):
+        self.geometry, self.settings = geometry, settings
+        arrays = geometry.vert, geometry.core_vert, geometry.electrode_pos
+        self.key = (*(array.tobytes() for array in arrays), repr(settings))
 
     def __hash__(self):
         return hash(self.key)
@@ -145,4 +154,4 @@ class _Skin:
 
 @functools.lru_cache(maxsize=4)
 def _film(skin):
-    return FilmConduction(skin.geometry)
+    return FilmConduction(skin.geometry, **skin.settings)

@@ -3,6 +3,7 @@
 import functools
 import math
 import warnings
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ from .config import SOLID, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "forget_notes"]
+__all__ = ["Touching", "find_geoms", "forget_notes"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -45,6 +46,7 @@ class Touching:
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
         self.core = core
+        find_geoms(model, {**(config.thermal or {}), **(config.textures or {})})
         ids = _select(model, core, config.geoms)
         if (
             config.geoms is None and not compiling
@@ -179,11 +181,24 @@ def _not_excluded(model, core, ids):
     )
 
 
-def _resolve(model, name):
+def find_geoms(model: ModelView, wanted: Iterable[str]) -> None:
+    """Raises ValueError for the name of a geom that the model has not."""
+    for name in wanted:
+        names, matches = _matches(model, name)
+        if not matches:
+            found = ", ".join(n for n in names if n) or "no named geom"
+            raise ValueError(f"no geom {name!r} to touch: the model has {found}")
+
+
+def _matches(model, name):
+    """Names of all geoms, and the numbers of those that a name of the settings means."""
     names = [model.name("geom", i) for i in range(model.ngeom)]
-    matches = [i for i, n in enumerate(names) if n == name] or [
-        i for i, n in enumerate(names) if n.endswith(name)
-    ]  # after a further attach
+    exact = [i for i, n in enumerate(names) if n == name]
+    return names, exact or [i for i, n in enumerate(names) if n.endswith(name)]  # after a further attach
+
+
+def _resolve(model, name):
+    names, matches = _matches(model, name)
     if len(matches) != 1:
         found = "none" if not matches else ", ".join(names[i] for i in matches)
         raise ValueError(

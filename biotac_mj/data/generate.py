@@ -14,6 +14,7 @@ from ..fields import check_types
 from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
+from ..sensor.film import read_film
 from ..sensor.materials import check_choices, read_thermal
 from ..sensor.vibration import read_texture
 from ..skin.settings import plain, read_dict, read_settings
@@ -45,7 +46,7 @@ class GenerateOptions:
       skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
         None: the material's. The material may be a dict of Material's fields, or a .json file of them.
       options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus of the elements,
-        or a .npy file}, or a .json file of it.
+        or a .npy file, "film": see `sensor.film.read_film`}, or a .json file of it.
       vary: {name: (low, high)}, what is drawn anew for each interaction: youngs_modulus, poissons_ratio,
         friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
         can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
@@ -232,7 +233,8 @@ def generate(
     from .making import make_shards
 
     out = pathlib.Path(out)
-    read_settings(options.material, options.options)  # these refuse what is wrong or not there
+    read_settings(options.material, options.options, ("film",))  # these refuse what is wrong or not there
+    read_film((options.options or {}).get("film"))
     for skin in (
         {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
     ):

@@ -164,7 +164,7 @@ class Maker:
       update: called with time steps done. tell: called with a line on each batch.
 
     Attributes:
-      seconds: of each stage.
+      seconds: of each stage. film: settings of the skin's FilmConduction.
     """
 
     def __init__(
@@ -177,6 +177,7 @@ class Maker:
         tell: Callable[[str], object] = lambda text: None,
     ):
         from ..geometry import load_skin
+        from ..sensor.film import read_film
         from ..skin import SkinModel
         from ..skin.condensed.refusals import refuse
         from ..skin.per_world import NAMES, make_room
@@ -193,7 +194,8 @@ class Maker:
         clock = time.perf_counter()
         self.geometry = load_skin(options.skin)
         chosen = {name: getattr(options, name) for name in ("element", "liquid")}
-        rubber, skin, modulus = read_settings(options.material, options.options, **chosen)
+        rubber, skin, modulus = read_settings(options.material, options.options, ("film",), **chosen)
+        self.film = read_film((options.options or {}).get("film"), rubber.electrode_radius)
         self.vary = options.vary or {}
         refuse_impossible(self.vary, rubber)
         between = {name: self.vary[name] for name in NAMES if name in self.vary}
@@ -242,7 +244,7 @@ class Maker:
         from . import readings, synthetic_sensor
 
         rest = None if self._rest is self.geometry else self._rest.vert
-        args = (self.geometry, self.measured and self.measured.meter(), rest)
+        args = (self.geometry, self.measured and self.measured.meter(), rest, self.film)
         with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:

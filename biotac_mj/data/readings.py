@@ -173,11 +173,14 @@ def read_motion(
 _here = {}  # what a worker keeps: the film of the set's skin
 
 
-def prepare_worker(geometry: SkinGeometry, rest_vert: np.ndarray | None = None) -> None:
-    """Makes the film of a skin in this process; rest_vert (nvert, 3) [m] is where it rests on its filling."""
+def prepare_worker(
+    geometry: SkinGeometry, rest_vert: np.ndarray | None = None, film: dict | None = None
+) -> None:
+    """Makes the film of a skin in this process; rest_vert (nvert, 3) [m] is where it rests on its filling,
+    film: settings of FilmConduction."""
     _here["vert"] = geometry.vert
     rest = geometry if rest_vert is None else dataclasses.replace(geometry, vert=rest_vert)
-    _here["film"] = FilmConduction(rest)
+    _here["film"] = FilmConduction(rest, **(film or {}))
 
 
 def read_in_worker(

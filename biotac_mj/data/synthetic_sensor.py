@@ -232,12 +232,14 @@ def relax(time: np.ndarray, value: np.ndarray, share: float, tau: float) -> np.n
 _meter = {}  # what a worker keeps
 
 
-def start_worker(geometry: SkinGeometry, meter: Meter | None, rest_vert: np.ndarray | None = None) -> None:
+def start_worker(
+    geometry: SkinGeometry, meter: Meter | None, rest_vert: np.ndarray | None = None, film: dict | None = None
+) -> None:
     """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to
     make."""
     from . import readings
 
-    readings.prepare_worker(geometry, rest_vert)
+    readings.prepare_worker(geometry, rest_vert, film)
     _meter["one"] = meter
 
 

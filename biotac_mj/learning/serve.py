@@ -109,9 +109,11 @@ class LearnedReadings:
     it."""
 
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
+        if "film" in config.options:
+            raise ValueError("a network stands in the film's place: leave options['film'] out")
         settings = check_settings(config.options.get("readings", {}), more={"weights": str | None})
-        self._settings = settings
-        sensor, settings, _ = take_sensor(settings, config.seed)
+        self._settings, self._config = settings, config
+        sensor, settings, _ = take_sensor(settings, config.own_seed())
         self._network = NetworkReadings(geometry, seed=config.seed, sensor=sensor, **settings)
         self.nstate = self._network.nstate
 
@@ -126,7 +128,7 @@ class LearnedReadings:
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
         """Resets to another sensor, where the settings leave it open."""
-        sensor = take_sensor(self._settings, seed)[0]
+        sensor = take_sensor(self._settings, self._config.own_seed(seed))[0]
         self._network.reset(state, sensor=sensor)
         return sensor
 

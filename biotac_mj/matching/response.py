@@ -24,12 +24,13 @@ class Response:
       states: the table. log_z: (npitch, nroll, nway, nload, 19) change of ln Z in its states.
 
     Attributes:
+      states, log_z: as given.
       axes: nodes of pitch and roll (both sides). ways: (nway, 2) drags. nodes: (ndirection, nway, 4)
         states of the table. low, high: (4,) ends of a state.
     """
 
     def __init__(self, states: PlateStates, log_z: np.ndarray):
-        grid = states.grid
+        self.states, self.log_z, grid = states, log_z, states.grid
         here = np.concatenate([log_z, states.force[..., :2]], -1)
         order = np.concatenate([_MIRRORED, [19, 20]])
         other = (

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from ..skin.cache import kept
+from ..skin.model import filled
 
 __all__ = ["PlateGrid", "PlateStates", "plate_states"]
 
@@ -99,12 +100,12 @@ def plate_states(
     quiet: bool = False,
 ) -> PlateStates:
     """The table of a skin, kept on disk pitch by pitch: stopped, it goes on where it was. Skins that differ
-    in Young's modulus alone share it.
+    in Young's modulus alone share it; of a filled one the table holds for a filling in proportion to E.
 
     Raises:
       ValueError: a material that depends on time: states of a plate are those of rest.
     """
-    grid, options = grid or PlateGrid(), options or SkinOptions()
+    grid, options = grid or PlateGrid(), filled(options or SkinOptions(), material)
     if material.remembers:
         raise ValueError("a table of states knows no time: leave prony, mullins and hysteresis out")
     if not options.rest_pressure and options.contact_stiffness is None:  # else shapes do not go with E alone

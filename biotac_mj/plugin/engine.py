@@ -5,37 +5,20 @@ lock for each call. What they raise comes back by way of `errors`, and the statu
 
 import atexit
 import ctypes
+import dataclasses
 import threading
 
 import mujoco
 
 from ..coupling import structs
-from ..coupling.config import PLUGIN_NAME
+from ..coupling.config import PLUGIN_NAME, Config
 from .errors import guarded, watch_interrupts
 
 __all__ = ["ATTRIBUTES", "PLUGIN_NAME", "register"]
 
 # Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
 # `biotac_mj.coupling.config`.
-ATTRIBUTES = (
-    "skin",
-    "stepper",
-    "readings",
-    "material",
-    "liquid",
-    "coupling",
-    "geoms",
-    "rounding",
-    "thermal",
-    "textures",
-    "friction",
-    "priority",
-    "tier",
-    "seed",
-    "device",
-    "options",
-    "on_error",
-)
+ATTRIBUTES = tuple(field.name for field in dataclasses.fields(Config))
 
 _INT, _PTR = ctypes.c_int, ctypes.c_void_p
 _PASSIVE = int(mujoco.mjtPluginCapabilityBit.mjPLUGIN_PASSIVE)

@@ -33,8 +33,8 @@ class PressOptions:
       slide: travel along slide_direction after the press [m].
       slide_direction: (3,), of which the part across `direction` counts.
       material: of the skin: a preset's name, a dict of Material's fields, or a .json file of them.
-      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus, or a .npy file},
-        or a .json file of it.
+      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus, or a .npy file,
+        "film": see `sensor.film.read_film`}, or a .json file of it.
       liquid: whether there is liquid under the skin; None takes the material's choice.
       skin: "coarse", "default", "fine" or a file.
       tier: of the skin's solution, "full" or "condensed".

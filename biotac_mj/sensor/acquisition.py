@@ -367,13 +367,15 @@ def reset_states(
     temperature_out: wp.array(dtype=real),
     state_out: wp.array2d(dtype=real),
 ):
-    """Rest states of worlds: row w of `rest`, or with `redraw` one that seed and number of the reset tell."""
+    """Rest states of worlds: row w of `rest`, with `redraw` after the first reset one that seed and number of
+    the reset tell."""
     w = wp.tid()
     if not mask[w]:
         return
     row = w
     if redraw == 1:
-        row = wp.int32(philox(wp.uint64(drawn[w]), ~seed[w])[0] % wp.uint64(rest.shape[0]))
+        if drawn[w] > 0:
+            row = wp.int32(philox(wp.uint64(drawn[w]), ~seed[w])[0] % wp.uint64(rest.shape[0]))
         drawn[w] = drawn[w] + 1
     for i in range(state_out.shape[1]):
         state_out[w, i] = rest[row, i]
@@ -646,8 +648,8 @@ class BatchAcquisition:
       film_every_step: see `Acquisition.needs_impedance`.
       temperature: of the core at rest [C]; None: each sensor's own. liquid: how much warmer the liquid is
         then than at the impedances [C]. One, or one for each sensor.
-      sensor: Sensor of all worlds, or a list: one for each world, or (`redraw`) those that every reset of a
-        world draws from, by seed and number of the reset.
+      sensor: Sensor of all worlds, or a list: one for each world, and (`redraw`) more that every later reset
+        of a world draws from, by seed and number of the reset.
       heat: see `Acquisition`.
       device: Warp device.
 
@@ -711,6 +713,7 @@ class BatchAcquisition:
             self.due = wp.zeros(nworld, dtype=int)
             self._still = wp.zeros((nworld, 0), dtype=real)
             self.reset(wp.full(nworld, True, dtype=bool))
+            self._drawn.zero_()  # the first reset by whoever has it is the beginning, and draws nothing
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""

@@ -43,6 +43,7 @@ __all__ = [
     "thermistor_counts",
     "check_counts",
     "check_force",
+    "check_temperature",
 ]
 
 NELECTRODE, NPAC = 19, 22  # sensing electrodes; PAC's samples of a frame
@@ -233,3 +234,9 @@ def check_force(force: np.ndarray, where: str) -> None:
             f"{where}: the force reaches {largest:.4g}: a BioTac bears {_MOST_FORCE:g} N; give newtons, "
             "these look like mN or raw counts"
         )
+
+
+def check_temperature(what: str, value: float) -> None:
+    """Raises ValueError for a temperature [C] that nothing can have."""
+    if not -_ZERO_CELSIUS < value < np.inf:
+        raise ValueError(f"{what} is {value} C: give a finite number above {-_ZERO_CELSIUS}")

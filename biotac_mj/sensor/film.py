@@ -18,6 +18,7 @@ triangles, the sheet Laplacian as a band of tiles, its Cholesky factor by one th
 solution costs some 20 million operations per world; conjugate gradients would need tens of iterations, since
 a film pressed to a twentieth of its thickness is far from the one at rest."""
 
+import reprlib
 import threading
 
 import numpy as np
@@ -27,6 +28,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.special import j1
 
+from biotac_mj.fields import check_entries, refuse_unknown
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor import film_kernels as kernels
@@ -35,11 +37,11 @@ from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
 
 __all__ = [
-    "CALIBRATED_RADIUS",
     "CONDUCTIVITY",
     "EXCITATION",
     "BatchFilm",
     "FilmConduction",
+    "read_film",
     "sheet_laplacian",
     "spreading_resistance",
 ]
@@ -51,9 +53,6 @@ EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 
 # [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at
 # 25 C
 CONDUCTIVITY = 0.367
-# [m] of all electrodes, FITTED to two real sensors pressed on a plate (docs/real_match.md): 0.8 and 1.1 mm
-# leave less than 0.5 mm on rows kept aside. Not the default: X1..X4 and learned weights belong to that
-CALIBRATED_RADIUS = 0.9e-3
 # [m], published cylinder about the x axis; only says where to look for the core's surface
 _CORE_RADIUS = 5.325e-3
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
@@ -96,25 +95,14 @@ class FilmConduction:
         excitation: ArrayLike = EXCITATION,
         sensor: str | None = "1",
     ):
-        for name, value in (
-            ("conductivity", conductivity),
-            ("residual_film", residual_film),
-            ("electrode_radius", electrode_radius),
-        ):
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}: pass a positive number in SI units")
+        settings = {"residual_film": residual_film, "electrode_radius": electrode_radius}
+        _check_numbers({"conductivity": conductivity, **settings})
         if sensor is not None and sensor not in REST_COUNTS:
             raise ValueError(
                 f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
                 "calibration"
             )
-        excitation = np.asarray(excitation, dtype=float)
-        if excitation.shape != (NEXCITATION, 2) or not np.all(np.isfinite(excitation)):
-            raise ValueError(
-                f"excitation has shape {excitation.shape}: pass ({NEXCITATION}, 2) finite numbers, position "
-                "x [m] and angle [rad] of each electrode"
-            )
-
+        excitation = _read_excitation(excitation)
         self.geometry, self.conductivity, self.residual_film, self.electrode_radius = (
             geometry,
             conductivity,
@@ -259,6 +247,45 @@ class FilmConduction:
         # A face on the far side of the finger projects onto the disc too: it lies several millimetres under
         # it.
         self._pair = np.nonzero((tangential < reach) & (np.abs(height) < _SLACK))
+
+
+def read_film(given: object, electrode_radius: float | None = None) -> dict:
+    """What `options["film"]` says of the film, as settings of `FilmConduction`.
+
+    Args:
+      given: dict of residual_film, electrode_radius [m], excitation; None is empty.
+      electrode_radius: taken where it has none [m]; None: the film's own.
+
+    Raises:
+      ValueError: no dict, another name, or a value that cannot be.
+    """
+    kinds = {"residual_film": float, "electrode_radius": float, "excitation": list}
+    out = dict(check_entries("options['film']", {} if given is None else given, kinds, kinds))
+    refuse_unknown(out, kinds, "options['film']")
+    if electrode_radius is not None:
+        out = {"electrode_radius": electrode_radius, **out}
+    _check_numbers({name: value for name, value in out.items() if name != "excitation"})
+    _read_excitation(out.get("excitation", EXCITATION))
+    return out
+
+
+def _check_numbers(given):
+    for name, value in given.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} is {value}: pass a positive number in SI units")
+
+
+def _read_excitation(given):
+    try:
+        excitation = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        excitation = np.empty(0)
+    if excitation.shape != (NEXCITATION, 2) or not np.isfinite(excitation).all():
+        raise ValueError(
+            f"excitation is {reprlib.repr(given)}: pass ({NEXCITATION}, 2) finite numbers, position x [m] "
+            "and angle [rad] of each electrode"
+        )
+    return excitation
 
 
 class BatchFilm:

@@ -6,10 +6,22 @@ users say of a geom."""
 import dataclasses
 import math
 import re
+import reprlib
 import statistics
 from collections.abc import Callable, Mapping
 
-__all__ = ["MATERIALS", "ROOM", "SKIN", "Material", "check_choices", "material_of", "read_thermal"]
+from biotac_mj.sensor.channels import check_temperature
+
+__all__ = [
+    "MATERIALS",
+    "ROOM",
+    "SKIN",
+    "Material",
+    "check_choices",
+    "check_geoms",
+    "material_of",
+    "read_thermal",
+]
 
 ROOM, SKIN = 23.0, 33.0  # [C] of things that lie about, of a living hand
 
@@ -199,6 +211,14 @@ def check_choices(value: object, read: Callable) -> None:
         read(one)
 
 
+def check_geoms(what: str, given: object, read: Callable) -> None:
+    """Raises ValueError for anything but None or {geom's name: what `read` reads, or a list of choices}."""
+    if not isinstance(given, dict | None) or not all(isinstance(name, str) for name in given or ()):
+        raise ValueError(f"{what} is {reprlib.repr(given)}: give a dict, of geoms' names")
+    for value in (given or {}).values():
+        check_choices(value, read)
+
+
 def read_thermal(value: str | Material | Mapping) -> Material:
     """A material of what a user says of a geom.
 
@@ -215,6 +235,8 @@ def read_thermal(value: str | Material | Mapping) -> Material:
     if isinstance(value, str):
         name, _, temperature = value.partition(" at ")
         value = {"material": name} | ({"temperature": temperature} if temperature else {})
+    if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
+        raise ValueError(f"thermal is {reprlib.repr(value)}: give a material's name, or a dict of numbers")
     unknown = set(value) - {"material", "effusivity", "conductivity", "temperature"}
     if unknown or not {"material", "effusivity"} & set(value):
         raise ValueError(
@@ -231,6 +253,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         raise ValueError(
             f"thermal {dict(value)!r}: effusivity and conductivity must be positive, temperature finite"
         )
+    check_temperature("temperature of a body", numbers.get("temperature", ROOM))
     material = material_of(value["material"]) if "material" in value else None
     temperature = numbers.get("temperature", material.temperature if material else ROOM)
     if not {"effusivity", "conductivity"} & set(numbers):

@@ -18,6 +18,7 @@ join and a replay is equal to the bit."""
 
 import dataclasses
 import math
+import reprlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -90,7 +91,10 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
     """
     if isinstance(value, Texture):
         return value
-    value = {"material": value} if isinstance(value, str) else dict(value)
+    value = {"material": value} if isinstance(value, str) else value
+    if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
+        raise ValueError(f"texture is {reprlib.repr(value)}: give a material's name, or a dict of numbers")
+    value = dict(value)
     names = [f.name for f in dataclasses.fields(Texture)]
     unknown = set(value) - {"material", *names}
     if unknown or not value or ("height" in value) != ("pitch" in value):

@@ -408,6 +408,12 @@ class SkinData:
 def _refuse_other_kinds(materials, own, options):
     """Worlds share the code that is compiled: what they have beyond the law differs in numbers alone."""
     for m in materials:
+        for name in ("rest_pressure", "electrode_radius"):
+            if getattr(m, name) != getattr(own, name):
+                raise ValueError(
+                    f"a world's material has a {name} of {getattr(m, name)} and the model's of "
+                    f"{getattr(own, name)}: these belong to all worlds; fill worlds by fill_volume"
+                )
         missing = [name for name in m.extensions if name not in options]
         if missing:
             raise ValueError(

@@ -28,7 +28,7 @@ from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
 from .types import real, vec3
 
-__all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "solved_geometry"]
+__all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "filled", "solved_geometry"]
 
 # (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
 solve_rest = None
@@ -51,7 +51,8 @@ class SkinOptions:
       bulk_modulus: of the liquid [Pa]; water has 2.2e9; math.inf keeps its volume.
       fill_volume: liquid beyond what the unstressed skin holds [m^3]; less where negative. It inflates the
         skin at rest.
-      rest_pressure: instead, the liquid's pressure at rest above the surroundings [Pa].
+      rest_pressure: instead, the liquid's pressure at rest above the surroundings [Pa]; None takes the
+        material preset's choice where fill_volume is 0.
       core_contact: whether the inner surface can touch the rigid core.
       core_clearance: inner faces that start nearer to the core than this lie on it and are left out of core
         contact [m].
@@ -77,7 +78,7 @@ class SkinOptions:
     liquid: bool | None = None
     bulk_modulus: float = 2.2e9
     fill_volume: float = 0.0
-    rest_pressure: float = 0.0
+    rest_pressure: float | None = None
     core_contact: bool = True
     core_clearance: float = 2e-5
     max_core_depth: float = 5e-4
@@ -107,7 +108,7 @@ class SkinOptions:
             raise ValueError(
                 f"bulk_modulus is {self.bulk_modulus}: pass a positive finite number of Pa, or math.inf"
             )
-        if not (math.isfinite(self.fill_volume) and math.isfinite(self.rest_pressure)) or (
+        if not math.isfinite(self.fill_volume + (self.rest_pressure or 0.0)) or (
             self.fill_volume and self.rest_pressure
         ):
             raise ValueError(
@@ -146,6 +147,15 @@ class SkinOptions:
 def stiffness_of_contact(material: Material) -> float:
     """Pressure per overclosure [Pa/m]: 180 E per millimetre, the reference solutions' ratio."""
     return 180e3 * material.youngs_modulus
+
+
+def filled(options: SkinOptions, material: Material) -> SkinOptions:
+    """The options with the material's filling, where they leave it to the material."""
+    if options.rest_pressure is not None:
+        return options
+    liquid = material.liquid if options.liquid is None else options.liquid
+    wanted = material.rest_pressure if liquid and not options.fill_volume else 0.0
+    return dataclasses.replace(options, rest_pressure=wanted)
 
 
 def solved_geometry(
@@ -221,7 +231,7 @@ class SkinModel:
         modulus: ArrayLike | Callable | None = None,
     ):
         self.material: Material = material(material_choice)
-        self.options = options or SkinOptions()
+        self.options = filled(options or SkinOptions(), self.material)
         self.device = wp.get_device(device)
         announce_compilation(self.device)
         self._cores, self._rest = {}, None

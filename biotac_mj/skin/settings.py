@@ -14,7 +14,7 @@ from ..fields import refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import read_json, reading
 from .contact.law import ContactLaw
-from .model import SkinOptions
+from .model import SkinOptions, filled
 from .rubber.material import PRESETS, Material
 
 __all__ = ["Settings", "plain", "read_dict", "read_material", "read_modulus", "read_settings"]
@@ -33,6 +33,7 @@ class Settings(NamedTuple):
 def read_settings(
     material: Material | dict | str | pathlib.Path | None = None,
     options: dict | None = None,
+    also: tuple = (),
     **defaults: object,
 ) -> Settings:
     """Settings of a skin.
@@ -40,19 +41,21 @@ def read_settings(
     Args:
       material: see `read_material`.
       options: {"skin": {...} or SkinOptions, "modulus": see `read_modulus`}, a JSON text of it or a file.
+      also: further keys of `options` that somebody else reads.
       defaults: of SkinOptions, where `options` has no word on it.
 
     Raises:
       ValueError: unknown keys, or values that cannot be. FileNotFoundError: no such file.
     """
     given = read_dict(options, "options")
-    refuse_unknown(given, _KEYS, "options")
+    refuse_unknown(given, (*_KEYS, *also), "options")
     skin = given.get("skin")
     if not isinstance(skin, SkinOptions):
         skin = SkinOptions(
             **{**defaults, **_known(read_dict(skin, "options['skin']"), SkinOptions, "options['skin']")}
         )
-    return Settings(read_material(material), skin, read_modulus(given.get("modulus")))
+    rubber = read_material(material)
+    return Settings(rubber, filled(skin, rubber), read_modulus(given.get("modulus")))
 
 
 def read_material(choice: Material | dict | str | pathlib.Path | None) -> Material:

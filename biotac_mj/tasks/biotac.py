@@ -12,7 +12,7 @@ from dm_control.composer.observation import observable
 from .. import plugin
 from ..effects.sensors import take_sensor
 from ..sensor.channels import FULL_SCALE
-from ..sensor.materials import check_choices, read_thermal
+from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 
@@ -103,6 +103,8 @@ class BioTac(composer.Entity):
                     f"BioTac got {key}={settings[key]!r}: "
                     "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
+        check_geoms("thermal", thermal, read_thermal)
+        check_geoms("textures", textures, read_texture)
         if isinstance(options or {}, dict):  # else `attach` says what is wrong
             own = (options or {}).get("readings", {})
             options = {
@@ -134,9 +136,6 @@ class BioTac(composer.Entity):
         for element in root.find_all("default"):
             if (element.dclass or "").startswith(_PREFIX):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
-        for named, reads in ((thermal, read_thermal), (textures, read_texture)):
-            for value in (named or {}).values():
-                check_choices(value, reads)
         self._name_geoms(root, geoms, rounding, thermal, textures)
         self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
         self._outer = _outer_nodes(skin)
@@ -144,7 +143,7 @@ class BioTac(composer.Entity):
     def _name_geoms(self, root, geoms, rounding, thermal, textures):
         """Settings about geoms that are not here yet, but in the arena."""
         named = {"geoms": None if geoms is None else tuple(geoms), "rounding": dict(rounding or {})}
-        named |= {"thermal": thermal, "textures": textures}
+        named |= {"thermal": thermal, "textures": textures, "name": root.model}
         self.handle = dataclasses.replace(
             self.handle, config=dataclasses.replace(self.handle.config, **named)
         )

@@ -14,7 +14,6 @@ import numpy as np
 
 from ...effects.in_film import RoughFilm, drain, left
 from ...effects.in_skin import memory_of
-from ...skin.settings import read_settings
 from .simulator import Simulator, _impedance, placed
 
 if typing.TYPE_CHECKING:
@@ -178,7 +177,7 @@ class _Remembering(Simulator):
                 )
             options = dataclasses.replace(plain.options, **changes)
             modulus = self.inside.model.get("modulus")
-            factors = _product(read_settings(self.material, self.options).modulus, modulus, plain.geometry)
+            factors = _product(self._read()[0].modulus, modulus, plain.geometry)
             self._models[bubble] = SkinModel(plain.geometry, rubber, options, plain.device, modulus=factors)
         return super()._model(log_friction, bubble)
 

@@ -21,7 +21,8 @@ from ...fields import check_types
 from ...files import write_npz
 from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
-from ...skin.settings import plain, read_material, read_settings
+from ...sensor.film import read_film
+from ...skin.settings import plain, read_dict, read_material, read_settings
 from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
 
 if typing.TYPE_CHECKING:
@@ -44,7 +45,8 @@ class Simulator:
       skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
       material: may also be a dict of Material's fields or a .json file.
-      options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`.
+      options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`, and "film", see
+        `sensor.film.read_film`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
@@ -70,7 +72,7 @@ class Simulator:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
         if not 0 < self.modulus < np.inf:
             raise ValueError(f"the factor on the modulus is {self.modulus}: pass a positive finite number")
-        read_settings(self.material, self.options)  # refuses what cannot be
+        self._read()  # refuses what cannot be
 
     def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
         """A copy with these effects added."""
@@ -80,6 +82,12 @@ class Simulator:
         return other
 
     # --- the skin  ---
+
+    def _read(self, **defaults):
+        """Settings of the skin, and of its film."""
+        settings = read_settings(self.material, self.options, ("film",), **defaults)
+        given = read_dict(self.options, "options").get("film")
+        return settings, read_film(given, settings.material.electrode_radius)
 
     def solve(
         self,
@@ -171,7 +179,7 @@ class Simulator:
         store = self.__dict__.setdefault("_models", {})
         if bubble not in store:
             geometry = load_skin(self.skin)
-            rubber, options, modulus = read_settings(self.material, self.options, liquid=True)
+            (rubber, options, modulus), film = self._read(liquid=True)
             if bubble:
                 volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
                 # liquid and air in series: V / K + V0 / p0
@@ -184,7 +192,7 @@ class Simulator:
                 filled = options.fill_volume or options.rest_pressure
                 solved = model.geometry  # with all nodes that are solved
                 rest = dataclasses.replace(solved, vert=model.rest.vert) if filled else solved
-                store["film"] = FilmConduction(rest, sensor=self.sensor)
+                store["film"] = FilmConduction(rest, sensor=self.sensor, **film)
         model = store[bubble]
         if log_friction:
             model = copy.copy(model)
