@@ -5,6 +5,8 @@ what the rubber bears: with a displacement-controlled object and an elastic fiel
 separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
 exact for linear materials while the contact grows)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import erf
 
@@ -138,10 +140,17 @@ class Inhomogeneity(Effect):
     }
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
-        "sensor"
+        "sensor",
+        "gain": "force over depth from place to place: gains of electrodes leave it alone",
     }
 
     def apply(self, run: Run, theta: dict) -> None:
+        if "along" in run.answers:  # the skin was solved with a modulus that varies
+            for way, slope in ((w, run.answers[w]) for w in self.params):
+                run.force = run.force + theta[way] * run.modulus * slope["force"]
+                run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
+                run.log_z = run.log_z + theta[way] * slope["log_z"]
+            return
         x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
         run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
 
@@ -206,17 +215,28 @@ class Adhesion(Effect):
 
 
 class Radius(Effect):
+    """Of each spherical tool among the trajectories that are compared, else of all alike."""
+
     id, name, stage = "radius", "radius of the tool", "S"
     physics = "the sphere is larger or smaller than it says"
-    params = {"log_radius": Param("1", -0.4, 0.4, "+-25 %", 0.1)}
     confusable = {"mount": "light load", "stiffen": "another tool"}
+
+    def __init__(self, tools: tuple = ()):
+        of = Param("1", -0.4, 0.4, "+-25 %", 0.1)
+        self.params = dict.fromkeys(tools if len(tools) > 1 else ("log_radius",), of)
+
+    def among(self, trajectories: list) -> "Effect":
+        return Radius(tuple(sorted({t.tool for t in trajectories if "sphere" in t.tool})))
+
+    def given(self, names: Sequence[str]) -> "Effect":
+        return Radius(tuple(name for name in names if "sphere" in name))
 
     def applicable(self, trajectories: list) -> str | None:
         return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
 
     def apply(self, run: Run, theta: dict) -> None:
         if "sphere" in run.tool:
-            run.log_radius = run.log_radius + theta["log_radius"]
+            run.log_radius = run.log_radius + theta.get("log_radius", theta.get(run.tool, 0.0))
 
 
 class Misalignment(Effect):

@@ -16,9 +16,11 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
+from ...effects.in_skin import modulus_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...fields import check_types
 from ...files import write_npz
+from ...geometry.skins import load_skin
 from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...skin.settings import plain, read_material, read_settings
@@ -31,7 +33,9 @@ __all__ = ["Fields", "Simulator", "placed"]
 
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
-_RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
+_DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
+_RADIUS, _FRICTION, _BUBBLE = 0.15, 0.2, 8e-9
+_UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
 
@@ -77,6 +81,13 @@ class Simulator:
         other = copy.copy(self)
         other.effects = [*self.effects, *effects]
         other.modulus = self.modulus if modulus is None else modulus
+        return other
+
+    def _but(self, **changes):
+        """A copy with other fields, its skin not made yet."""
+        other = copy.copy(self)
+        other.__dict__.pop("_models", None)
+        other.__dict__.update(changes)
         return other
 
     # --- the skin  ---
@@ -164,7 +175,6 @@ class Simulator:
                 progress()
 
     def _model(self, log_friction, bubble):
-        from ...geometry.skins import load_skin
         from ...sensor.film import FilmConduction
         from ...skin.model import SkinModel
 
@@ -194,18 +204,18 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in
-        `cache`."""
+        """The skin along the trajectories and its differences: 13 solutions of the data set, three of them by
+        finite elements, kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
         with tqdm.tqdm(
-            total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+            total=(12 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
         ) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
             slopes = {}
             if self.skin in OTHER_MESH:
                 here, there = (
-                    dataclasses.replace(self, skin=skin, tier="condensed").solve(trajectories)
+                    self._but(skin=skin, tier="condensed").solve(trajectories)
                     for skin in (self.skin, OTHER_MESH[self.skin])
                 )
                 slopes["mesh"] = [
@@ -221,19 +231,54 @@ class Simulator:
                     progress=tick,
                 )
                 slopes["xyz"[axis]] = _difference(moved, base, _SHIFT)
+            slopes |= self._bending(trajectories, base, slopes, tick)
             if spheres:
                 slopes["radius"] = _difference(
                     self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
                     base,
                     _RADIUS,
                 )
+            slopes |= self._uneven(trajectories, tick)
             slopes["friction"] = _difference(
-                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, _FRICTION
+                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, np.expm1(_FRICTION)
             )
             slopes["bubble"] = _difference(
                 self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
             )
         return Fields(base, slopes, trajectories)
+
+    def _bending(self, trajectories, base, slopes, tick):
+        """What linear differences miss along the press: "press" per m, "bend" per m^2."""
+        deeper, shallower = (
+            self.solve(
+                trajectories,
+                offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
+                progress=tick,
+            )
+            for by in (_DEEPER, -_DEEPER)
+        )
+        out = {"press": [], "bend": []}
+        for i, t in enumerate(trajectories):
+            a, b, c = shallower[i], base[i], deeper[i]
+            linear = {k: sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz")) for k in b}
+            out["press"].append({k: (c[k] - a[k]) / (2 * _DEEPER) - linear[k] for k in b})
+            out["bend"].append({k: (a[k] + c[k] - 2 * b[k]) / (2 * _DEEPER**2) for k in b})
+        return out
+
+    def _uneven(self, trajectories, tick):
+        """Differences by a modulus that varies along and across the finger, which only elements can have."""
+        given = read_settings(self.material, self.options).modulus
+        geometry = load_skin(self.skin)
+        at = geometry.vert[geometry.elem[:, :4]].mean(1)
+        factors = {"": np.ones(len(at))} | {
+            way: modulus_of({"along": 0.0, "across": 0.0, way: _UNEVEN})(at) for way in _MAPS
+        }
+        solved = {}
+        for way, factor in factors.items():
+            own = 1.0 if given is None else np.asarray(given(at) if callable(given) else given)
+            other = self._but(tier="full", options=self.options | {"modulus": own * factor})
+            solved[way] = other.solve(trajectories, progress=tick)
+        return {way: _difference(solved[way], solved[""], _UNEVEN) for way in _MAPS}
 
     # --- all stages  ---
 
@@ -267,10 +312,13 @@ class Simulator:
         for i, t in enumerate(trajectories):
             run = _begin(i, t, base[i], session, first)
             run.scale_load(modulus)
+            run.modulus = modulus
             run.stiffness = modulus * _stiffness(
                 base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t
             )
             run.log_friction = nuisance.log_friction
+            if fields is not None:
+                run.answers = {way: fields.slopes[way][i] for way in _MAPS if way in fields.slopes}
             if offsets is not None:
                 run.offset = run.offset + offsets[i]
             for effect, theta in before:
@@ -333,11 +381,13 @@ class Simulator:
                 ("y", run.offset[:, 1]),
                 ("z", run.offset[:, 2]),
                 ("radius", run.log_radius),
-                ("friction", run.log_friction),
+                ("press", run.offset @ run.heading),
+                ("bend", (run.offset @ run.heading) ** 2),
+                ("friction", np.expm1(run.log_friction)),
                 ("bubble", run.bubble),
             ]
             for name, amount in parts:
-                if name in fields.slopes and np.any(amount):
+                if name in fields.slopes and (amount.any() if np.ndim(amount) else amount):
                     for k in change:
                         slope = fields.slopes[name][i][k]
                         change[k] = change[k] + (
@@ -361,7 +411,8 @@ class Simulator:
 @dataclasses.dataclass
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
-    (radius, friction), per m3; "mesh": of another mesh, about rest."""
+    (radius), per factor (friction), per m3 (bubble), per 1/cm (along, across); "press" per metre and "bend"
+    per m^2, along the heading beyond those; "mesh": of another mesh, about rest."""
 
     base: list
     slopes: dict
