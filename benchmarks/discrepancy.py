@@ -25,7 +25,7 @@ from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator, plan
 from discrepancy_rivals import cells, f1, rivals
 from discrepancy_table import confusion, table
 
-SEEDS = {"development": 0, "practice": 10_000, "blind": 700_000}
+SEEDS = {"development": 0, "practice": 10_000, "blind": 1_400_000}
 KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
 # Of wrong bases: footprint, mesh, modulus, and the last two at once.
 BASES = (

@@ -205,12 +205,12 @@ class Generator:
                 if name in _BEFORE:
                     _BEFORE[name](s, size, form)
         poses = [s.one["pos"] + s.offset for s in states]
-        for _ in range(5 if states[0].give else 1):
+        for _ in range(4 if states[0].give else 1):
             for s, solved in zip(states, self.skin(plans, poses, [s.radius for s in states])):
                 s.force, s.pressure, s.impedance = solved
-            if states[0].give:  # most of the way to balance each time
+            if states[0].give:
                 wanted = [s.one["pos"] + s.offset + s.give(self.modulus * s.force) for s in states]
-                poses = [0.8 * new + 0.2 * old for new, old in zip(wanted, poses)]
+                poses = [0.9 * new + 0.1 * old for new, old in zip(wanted, poses)]
         if states[0].slip:
             self._rub(plans, poses, states)
         if states[0].stiff:

@@ -1,6 +1,8 @@
 """Recordings with poses on their way to a diagnosis (synthetic: nobody measured them)."""
 
 import dataclasses
+import pathlib
+import sys
 
 import numpy as np
 import pytest
@@ -111,3 +113,18 @@ def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch)
     for a, b in zip(seen["data"], expected):
         np.testing.assert_allclose(a.pos, b.pos, atol=1e-8)
         np.testing.assert_allclose(a.electrodes, b.electrodes)
+
+
+def test_rivals_find_what_is_linear_and_planted():
+    """Blocks of noise as a library: sparse regression and BIC take the two that are in the data, and sparse
+    regression, which asks trajectories left out, takes none where there is none."""
+    sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
+    from discrepancy_rivals import _bic, _sparse, f1
+
+    rng = np.random.default_rng(0)
+    library = [(None, {}, rng.standard_normal((600, 2))) for _ in range(8)]
+    noise, owner = rng.standard_normal(600), np.arange(600) // 50
+    planted = 2 * library[2][2][:, 0] - 1.5 * library[5][2][:, 1] + noise
+    assert set(_sparse(library, planted, owner)) == set(_bic(library, planted)) == {2, 5}
+    assert _sparse(library, noise, owner) == _bic(library, noise) == []
+    assert f1({1, 2}, {2, 3}) == 0.5 and f1(set(), set()) == 1.0

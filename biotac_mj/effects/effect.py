@@ -124,6 +124,7 @@ class Effect(abc.ABC):
     # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
     # interval
     law = 0.0
+    kin: tuple = ()  # ids of other laws for what looks alike: told apart only by much
     grid: tuple = ({},)
 
     @abc.abstractmethod

@@ -29,7 +29,7 @@ class FluidLoss(Effect):
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)
     }
-    law = LAW
+    law, kin = LAW, ("warmup",)
     confusable = {
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
@@ -66,7 +66,7 @@ class WarmUp(Effect):
         "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
     }
     grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
-    law = LAW
+    law, kin = LAW, ("fluidloss",)
     confusable = {
         "thermal": "log TDC",
         "fluidloss": "wait an hour",
@@ -93,6 +93,7 @@ class Gain(Effect):
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
     params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
+    kin = ("inhomog",)
     confusable = {
         "asper": "one electrode or all",
         "crosstalk": "drive one electrode alone",

@@ -39,7 +39,7 @@ class Relaxation(Effect):
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    law = LAW
+    law, kin = LAW, ("creep",)
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
@@ -54,7 +54,7 @@ class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04)}
-    law = LAW
+    law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -138,6 +138,7 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
+    kin = ("gain",)
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
         "sensor",
@@ -169,6 +170,7 @@ class Friction(Effect):
     id, name, stage = "friction", "friction level", "K"
     physics = "Coulomb's coefficient times a factor"
     params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
+    kin = ("fric_load",)
     confusable = {"fric_load": "slides at three normal loads with two radii"}
 
     def applicable(self, trajectories: list) -> str | None:
@@ -186,6 +188,7 @@ class FrictionLoad(Effect):
         "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
     )
     params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
+    kin = ("friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
 

@@ -97,7 +97,11 @@ def compose(
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
         zero = null.evidence(comparison)[chosen]
-        found[0].ties = [t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero)]
+        found[0].ties = [
+            t
+            for t in found[0].ties
+            if t not in ends or _tied(score - zero, ends[t][3] - zero, t in found[0].effect.kin)
+        ]
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
@@ -118,10 +122,11 @@ def _ahead(lead, by=None):
     )
 
 
-def _tied(gain, other) -> bool:
+def _tied(gain, other, kin) -> bool:
     """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than
-    laws are known."""
-    return not _ahead(gain - other) or other.mean() > THRESHOLDS["alike"] * gain.mean()
+    laws are known; less so of kin."""
+    alike = THRESHOLDS["kin" if kin else "alike"]
+    return not _ahead(gain - other) or other.mean() > alike * gain.mean()
 
 
 def _rank(best, step):
@@ -130,7 +135,9 @@ def _rank(best, step):
     best.ties = [
         c.effect.id
         for c in step
-        if c is not best and c.nats >= THRESHOLDS["gain"] and _tied(best.gain, c.gain)
+        if c is not best
+        and c.nats >= THRESHOLDS["gain"]
+        and _tied(best.gain, c.gain, c.effect.id in best.effect.kin)
     ]
     best.lead = min(
         (float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0
@@ -141,14 +148,16 @@ def _round(comparison, current, null, effects, chosen, seed):
     """Screen, then refit the short list with cross-validation by trajectory; Candidates, best first."""
     known = {e.id for e, _ in current.effects}
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
-    short = ranked[: THRESHOLDS["refit"]] + [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
+    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
+    asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
+    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in _SETUP]
+    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
     reference, square, square_null = (
         current.evidence(comparison),
         current.mean_square(comparison)[chosen],
         null.mean_square(comparison)[chosen],
     )
     excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
-    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     out = []
     for _, effect, start in short:
         trial = [*current.effects, (effect, start)]
@@ -181,7 +190,7 @@ def _left_out(comparison, whole, chosen, seed, folds=3):
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
-        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole)
+        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, near=True)
         out[chosen[fold == f]] = fit.evidence(comparison)[chosen[fold == f]]
     return out
 

@@ -63,12 +63,17 @@ class Fit:
 
 
 def fit_effects(
-    comparison: "Comparison", effects: list, keep: np.ndarray | None = None, start: Fit | None = None
+    comparison: "Comparison",
+    effects: list,
+    keep: np.ndarray | None = None,
+    start: Fit | None = None,
+    near: bool = False,
 ) -> Fit:
     """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
 
     Args:
       keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
+      near: the start is nearly the answer already, as with a part of the same trajectories.
     """
     keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
     names, scale, low, high, x0 = [], [], [], [], []
@@ -131,7 +136,7 @@ def fit_effects(
         return np.concatenate([*parts, penalty])
 
     rows = np.array([len(t.time) for t in comparison.trajectories])
-    for round_ in range(2):
+    for evaluations in (4,) if near else (8, 6):
         c = np.array([r @ r for r in comparison.vectors(*unpack(x))])
         weight = rows / np.maximum(c, 0.5)
         out = least_squares(
@@ -140,10 +145,10 @@ def fit_effects(
             bounds=bounds,
             method="trf",
             diff_step=1e-3,
-            max_nfev=8 if round_ == 0 else 6,
+            max_nfev=evaluations,
             x_scale="jac",
-            ftol=1e-5,
-            xtol=1e-5,
+            ftol=3e-4,  # a tenth of a nat
+            xtol=3e-4,
         )
         x = out.x
     filled, nuisance = unpack(x)

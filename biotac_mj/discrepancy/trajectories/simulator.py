@@ -34,7 +34,8 @@ __all__ = ["Fields", "Simulator", "placed"]
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
 _DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
-_RADIUS, _FRICTION, _BUBBLE = 0.15, 0.2, 8e-9
+_FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
+_RADIUS, _BUBBLE = 0.15, 8e-9
 _UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
@@ -204,11 +205,11 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 13 solutions of the data set, three of them by
+        """The skin along the trajectories and its differences: 14 solutions of the data set, three of them by
         finite elements, kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
         with tqdm.tqdm(
-            total=(12 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+            total=(13 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
         ) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
@@ -239,9 +240,8 @@ class Simulator:
                     _RADIUS,
                 )
             slopes |= self._uneven(trajectories, tick)
-            slopes["friction"] = _difference(
-                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, np.expm1(_FRICTION)
-            )
+            less, more = (self.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
+            slopes["friction"], slopes["friction2"] = _parabola(less, base, more, *_FRICTION)
             slopes["bubble"] = _difference(
                 self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
             )
@@ -257,13 +257,11 @@ class Simulator:
             )
             for by in (_DEEPER, -_DEEPER)
         )
-        out = {"press": [], "bend": []}
-        for i, t in enumerate(trajectories):
-            a, b, c = shallower[i], base[i], deeper[i]
-            linear = {k: sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz")) for k in b}
-            out["press"].append({k: (c[k] - a[k]) / (2 * _DEEPER) - linear[k] for k in b})
-            out["bend"].append({k: (a[k] + c[k] - 2 * b[k]) / (2 * _DEEPER**2) for k in b})
-        return out
+        press, bend = _parabola(shallower, base, deeper, -_DEEPER, _DEEPER)
+        for i, t in enumerate(trajectories):  # beyond what differences in x, y and z already say of it
+            for k, slope in press[i].items():
+                press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
+        return {"press": press, "bend": bend}
 
     def _uneven(self, trajectories, tick):
         """Differences by a modulus that varies along and across the finger, which only elements can have."""
@@ -383,7 +381,8 @@ class Simulator:
                 ("radius", run.log_radius),
                 ("press", run.offset @ run.heading),
                 ("bend", (run.offset @ run.heading) ** 2),
-                ("friction", np.expm1(run.log_friction)),
+                ("friction", run.log_friction),
+                ("friction2", run.log_friction**2),
                 ("bubble", run.bubble),
             ]
             for name, amount in parts:
@@ -411,8 +410,8 @@ class Simulator:
 @dataclasses.dataclass
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
-    (radius), per factor (friction), per m3 (bubble), per 1/cm (along, across); "press" per metre and "bend"
-    per m^2, along the heading beyond those; "mesh": of another mesh, about rest."""
+    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
+    and "bend" per m^2, along the heading beyond those; "mesh": of another mesh, about rest."""
 
     base: list
     slopes: dict
@@ -479,6 +478,13 @@ def _impedance(film, vert_xpos):
 
 def _difference(moved, base, by):
     return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+
+
+def _parabola(before, base, after, low, high):
+    """Slopes and curvatures of solutions at low, 0 and high."""
+    first, second = _difference(before, base, low), _difference(after, base, high)
+    bend = [{k: (b[k] - a[k]) / (high - low) for k in a} for a, b in zip(first, second)]
+    return [{k: a[k] - low * c[k] for k in a} for a, c in zip(first, bend)], bend
 
 
 def _sphere_radius(tool):
