@@ -303,12 +303,12 @@ def main(argv=None):
         return
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text()) if path.exists() else []
-    done = {(r["case"], r["seeds"], r["tier"], r["code"]) for r in rows}
+    done = {(r["case"], r["plan"], r["seeds"], r["tier"], r["code"]) for r in rows}
     i, n = (int(v) for v in args.share.split("/"))
     todo = [
         c
         for c in cases(args.counts, args.seeds, args.plans)[i::n]
-        if (c["case"], args.seeds, args.tier, code_hash()) not in done
+        if (c["case"], c["plan"], args.seeds, args.tier, code_hash()) not in done
     ]
     print(f"code {code_hash()}, {len(todo)} cases to do", flush=True)
     if todo:

@@ -309,7 +309,9 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     parameter = report.effects[0]["parameters"][0]
     assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
     assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
-    assert report.ranking[0][0] == name and any(
+    assert report.ranking[0][0] == name
+    # what a sideways shift does changes its sign from place to place: no cell has a mean
+    assert name == "misalign" or any(
         c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where
     )
     amended = report.apply(Springs())

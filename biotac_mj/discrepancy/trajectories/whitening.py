@@ -117,9 +117,10 @@ class Comparison:
         return [self._stack(r.counts - rest, r.pdc - rest_pdc, r.force) for r in runs]
 
     def whiten(self, i: int, residual: np.ndarray) -> np.ndarray:
-        """(n, width) of unit variance under noise and resolution, without what an error of the pose makes."""
-        r, u = (residual / self.sigma).ravel(), self._basis[i][0]
-        return (r - u @ (u.T @ r)).reshape(residual.shape)
+        """(n, width) with unit covariance under noise, resolution and repeatability."""
+        r = (residual / self.sigma).ravel()
+        u, s, _ = self._basis[i]
+        return (r - u @ ((1 - 1 / np.sqrt(1 + s**2)) * (u.T @ r))).reshape(residual.shape)
 
     def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
