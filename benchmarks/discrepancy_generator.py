@@ -47,6 +47,9 @@ def plan(seed, count, skin="coarse"):
         heading = -normal
         depth, speed = rng.uniform(0.5e-3, 1.5e-3), np.exp(rng.uniform(np.log(0.5e-3), np.log(20e-3)))
         hold, slide = np.exp(rng.uniform(np.log(0.2), np.log(6))), rng.choice([0.0, 0.8e-3])
+        hold = min(
+            hold, 60 * depth / speed
+        )  # rows of one trajectory lie no further apart than a hundred others
         side = np.cross(heading, [1.0, 0, 0])
         side /= np.linalg.norm(side)
         legs = [(0.2, -0.02e-3, 0, 3), (depth / speed, depth, 0, 6), (hold, depth, 0, 5)]
