@@ -1,6 +1,7 @@
 """Recordings with poses on their way to a diagnosis (synthetic: nobody measured them)."""
 
 import dataclasses
+import json
 import pathlib
 import sys
 
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from biotac_mj.discrepancy import Trajectory
 from biotac_mj.discrepancy.trajectories.recorded import trajectories_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
 from biotac_mj.recordings import Recording, load
 from biotac_mj.sensor.channels import REST_COUNTS
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
 
 DEPTHS = (0.6e-3, 1.0e-3, 0.8e-3)
 
@@ -115,10 +119,27 @@ def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch)
         np.testing.assert_allclose(a.electrodes, b.electrodes)
 
 
+def test_plans_of_the_generator_are_trajectories():
+    """A clock with a gap is refused, so no plan of any seed may have one."""
+    from discrepancy_generator import plan
+
+    for one in (p for seed in range(12) for p in plan(seed, 16)):
+        n = len(one["time"])
+        Trajectory(
+            one["id"],
+            one["tool"],
+            one["clock"],
+            one["time"],
+            one["pos"],
+            np.tile(one["turn"], (n, 1, 1)),
+            np.full((n, 19), 2000.0),
+        )
+        np.testing.assert_allclose(one["turn"][:, 1], one["heading"], atol=1e-6)
+
+
 def test_rivals_find_what_is_linear_and_planted():
     """Blocks of noise as a library: sparse regression and BIC take the two that are in the data, and sparse
     regression, which asks trajectories left out, takes none where there is none."""
-    sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
     from discrepancy_rivals import _bic, _sparse, f1
 
     rng = np.random.default_rng(0)
@@ -128,3 +149,41 @@ def test_rivals_find_what_is_linear_and_planted():
     assert set(_sparse(library, planted, owner)) == set(_bic(library, planted)) == {2, 5}
     assert _sparse(library, noise, owner) == _bic(library, noise) == []
     assert f1({1, 2}, {2, 3}) == 0.5 and f1(set(), set()) == 1.0
+
+
+@pytest.mark.slow
+def test_a_csv_with_poses_is_diagnosed(tmp_path):
+    """From a CSV (synthetic: this project's skin, a hidden latency, another modulus) to the verdict."""
+    from biotac_mj.cli import main
+    from biotac_mj.discrepancy import Simulator
+    from biotac_mj.effects.catalogue import by_id
+
+    sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "examples"))
+    from find_the_missing_effect import measure, presses
+
+    data = measure(Simulator(), presses(16, 0)[::2], (by_id("latency"), {"delay": 0.08}), 1)
+    rows = [
+        np.column_stack(
+            [
+                t.clock + t.time,
+                t.electrodes,
+                t.pdc,
+                -t.force,
+                t.pos,
+                np.roll(Rotation.from_matrix(t.mat).as_quat(), 1, axis=1),
+            ]
+        )
+        for t in data
+    ]
+    names = ["time", *(f"e{k + 1}" for k in range(19)), "pdc", "Fx", "Fy", "Fz"]
+    names += [f"object_pos_{a}" for a in "xyz"] + [f"object_q{a}" for a in "wxyz"]
+    path, out = tmp_path / "log.csv", tmp_path / "report"
+    np.savetxt(path, np.concatenate(rows), delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    settings = ["--object", "sphere_7mm", "--skin", "coarse", "--repeatability", "0.03"]
+    assert main(["diagnose", str(path), *settings, "--out", str(out), "--quiet"]) == 0
+    verdict = json.loads((out / "verdict.json").read_text())
+    assert [e["id"] for e in verdict["effects"]] == ["latency"] and verdict["share_closed"] > 0.8
+    assert verdict["repeatability_m"] >= 3e-5  # trials may scatter more than stated
+    assert any("turned round" in note for note in verdict["cannot_be_known"])
+    value = verdict["effects"][0]["parameters"][0]
+    assert value["interval95"][0] < 0.08 < value["interval95"][1]
