@@ -6,13 +6,14 @@ mildly wrong base model.
     none=60,single=10,outside=40,pair=40,wrong-base=20
 
 Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed (a hash of the truth stands in
-its record); run again, it goes on where it stopped. Beside the verdicts stand two baselines: least RMS in
-sample, and BIC with samples taken as independent.
+its record); run again, it goes on where it stopped. Beside the verdicts stand the answers of rivals
+(`discrepancy_rivals`).
 Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the
 catalogue, for calibration. Counts are for each effect with single and left-out, else for the kind. Kernels
 are compiled and fields of the plans solved before the work is shared out."""
 
 import argparse
+import functools
 import hashlib
 import json
 import multiprocessing
@@ -20,11 +21,19 @@ import pathlib
 import time
 
 import numpy as np
-from discrepancy_generator import HIDDEN, OUTSIDE, Generator, plan
+from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator, plan
+from discrepancy_rivals import cells, f1, rivals
 from discrepancy_table import confusion, table
 
-SEEDS = {"development": 0, "practice": 10_000, "blind": 700_000}
+SEEDS = {"development": 0, "practice": 10_000, "blind": 1_400_000}
 KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
+# Of wrong bases: footprint, mesh, modulus, and the last two at once.
+BASES = (
+    {"footprint": 0.05},
+    {"skin": "default"},
+    {"modulus": 1.7},
+    {"skin": "default", "modulus": 1 / 1.7},
+)
 
 
 def cases(counts, seeds, plans=4):
@@ -46,14 +55,17 @@ def cases(counts, seeds, plans=4):
             rng = np.random.default_rng([seed, SEEDS[seeds]])
             settings = {"modulus": float(rng.uniform(0.85, 1.15)), "skin": "coarse", "footprint": 0.0}
             if kind == "wrong-base":
-                settings.update({"skin": "default"} if i % 2 else {"footprint": 0.05})
+                settings.update(BASES[i % len(BASES)])
             hidden = {
                 "pair": list(rng.choice(list(HIDDEN), 2, replace=False)),
                 "none": [],
                 "wrong-base": [],
             }.get(kind, [name])
             sizes = {**HIDDEN, **OUTSIDE}
-            effects = [(str(n), float(np.exp(rng.uniform(*np.log(sizes[n]))))) for n in hidden]
+            effects = [
+                (str(n), float(np.exp(rng.uniform(*np.log(sizes[n])))), int(rng.integers(FORMS.get(n, 1))))
+                for n in hidden
+            ]
             out.append(
                 {
                     "kind": kind,
@@ -68,43 +80,23 @@ def cases(counts, seeds, plans=4):
     return sorted(out, key=lambda c: c["at"])
 
 
-def baselines(comparison, chosen):
-    """Names by least RMS in sample and by BIC with every sample independent, both on the linearised
-    signatures."""
-    from biotac_mj.discrepancy.trajectories.fitting import fit_effects
-    from biotac_mj.discrepancy.trajectories.screening import columns, nuisance_space
-    from biotac_mj.effects.catalogue import CATALOGUE
+@functools.lru_cache(maxsize=1)
+def code_hash() -> str:
+    """Names the code that is judged: effects, their evidence, thresholds, and the rivals."""
+    import biotac_mj
 
-    null = fit_effects(comparison, [], chosen)
-    base = null.residuals(comparison)
-    q = nuisance_space(comparison, null, base, chosen)
-    y = np.concatenate([base[i].ravel() for i in chosen])
-    y = y - q @ (q.T @ y)
-    out = []
-    for effect in CATALOGUE:
-        if effect.applicable([comparison.trajectories[i] for i in chosen]):
-            continue
-        for shape in effect.grid:
-            S = columns(comparison, null, effect, shape, base, chosen)
-            S = S - q @ (q.T @ S)
-            w, *_ = np.linalg.lstsq(S, y, rcond=None)
-            rss = float(((y - S @ w) ** 2).sum())
-            out.append((rss, len(y) * np.log(rss / len(y)) + S.shape[1] * np.log(len(y)), effect.id))
-    none = len(y) * np.log(float(y @ y) / len(y))
-    best = min(out, key=lambda o: o[1])
-    return min(out)[2], best[2] if best[1] < none else "none"
+    home = pathlib.Path(biotac_mj.__file__).parent
+    files = [*(home / "effects").glob("*.py"), *(home / "discrepancy/trajectories").glob("*.py")]
+    files += [home / "discrepancy/evidence.py", pathlib.Path(__file__).with_name("discrepancy_rivals.py")]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in sorted(files))).hexdigest()[:12]
 
 
 def comparable(name, size) -> dict:
-    """True values of the catalogue's parameters; (value, whether both laws are the same). Cross-talk,
-    saturation and adhesion have none."""
+    """True values of the catalogue's parameters where the hidden law has them; (value, whether both laws are
+    the same)."""
     same = {
         "asper": {"log_p": np.log(1 + size)},
         "latency": {"delay": size},
-        "radius": {"log_radius": np.log(1 + size)},
-        "mount": {"compliance": size},
-        "depth0": {"dz": size},
-        "misalign": {"x": size, "z": 0.6 * size},
         "gain": {
             f"e{k + 1}": g
             for k, g in enumerate(size * np.random.default_rng(int(size * 1e6)).standard_normal(19))
@@ -176,7 +168,6 @@ class Worker:
     def run(self, case) -> dict:
         """The record of a case: truth, verdict and all numbers that thresholds are set on."""
         from biotac_mj.discrepancy import CATALOGUE, diagnose
-        from biotac_mj.discrepancy.trajectories.workflow import threshold_hash
 
         began = time.process_time()
         effects, settings = case["effects"], case["settings"]
@@ -189,22 +180,22 @@ class Worker:
         report = diagnose(
             self.sim, data, effects=catalogue, fields=self.fields_of(case["plan"]), progress=False
         )
-        least, bic = (
-            ("", "")
-            if self.args.no_baselines or case["kind"] == "left-out"
-            else baselines(report.comparison, report.selection)
+        used = time.process_time() - began
+        answers = (
+            {} if self.args.no_rivals or case["kind"] == "left-out" else self.judge(case, report, generator)
         )
         return {
             "case": case["case"],
             "kind": case["kind"],
             "seeds": self.args.seeds,
             "tier": self.args.tier,
-            "thresholds": threshold_hash(),
+            "code": code_hash(),
             "plan": case["plan"],
             "seed": case["seed"],
             "settings": settings,
-            "truth": [e for e, _ in effects],
-            "sizes": [s for _, s in effects],
+            "truth": [e for e, *_ in effects],
+            "sizes": [s for _, s, _ in effects],
+            "forms": [f for *_, f in effects],
             "seal": hashlib.sha256(json.dumps([effects, settings, case["seed"]]).encode()).hexdigest()[:12],
             "verdict": report.verdict,
             "named": [e["id"] for e in report.effects],
@@ -219,11 +210,39 @@ class Worker:
             "parameters": [
                 {p["name"]: [p["value"], *p["interval95"]] for p in e["parameters"]} for e in report.effects
             ],
-            "comparable": {e: comparable(e, s) for e, s in effects},
-            "least_rms": least,
-            "bic": bic,
-            "seconds": time.process_time() - began,
+            "comparable": {e: comparable(e, s) for e, s, _ in effects},
+            "answers": answers,
+            "seconds": used,
         }
+
+    def judge(self, case, report, generator):
+        """What each method names, how well it tells where (F1 of channel x phase), and by how much its
+        modulus is off without and with what it names (logarithms); our own beside the rivals."""
+        from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+
+        c, chosen = report.comparison, report.selection
+        plans, seed = self.plans[case["plan"]], case["seed"]
+        with_, without = (generator.clean(plans, some, seed) for some in (case["effects"], []))
+        truth = {}
+        for i in range(len(plans)):
+            parts = [np.column_stack(one[i]) for one in (with_, without)]
+            truth[i] = (parts[0] - parts[0][0]) - (parts[1] - parts[1][0])
+        truth = cells(c, chosen, truth)
+        null = fit_effects(c, [], chosen)
+        base = null.raw(c)
+        true = np.log(case["settings"]["modulus"])
+        out = {}
+        for name, (effects, modulus) in {"ours": (report.fit.effects, None), **rivals(c, chosen)}.items():
+            change = [a - b for a, b in zip(base, c.raw(effects, null.nuisance))]
+            if modulus is None:
+                start = report.fit if name == "ours" else fit_effects(c, effects, chosen, null)
+                modulus = start.nuisance.log_modulus
+            out[name] = {
+                "named": [e.id for e, _ in effects],
+                "f1": f1(cells(c, chosen, change), truth),
+                "bias": [null.nuisance.log_modulus - true, modulus - true],
+            }
+        return out
 
 
 _worker = None
@@ -269,31 +288,29 @@ def main(argv=None):
     args.add_argument("--cache", default="out/discrepancy_fields")
     args.add_argument("--json", default="out/discrepancy.json")
     args.add_argument("--figure", default="", help="PNG of the confusion matrix")
-    args.add_argument("--no-baselines", action="store_true")
+    args.add_argument("--no-rivals", action="store_true")
     args.add_argument("--table", nargs="+", metavar="JSON", help="only count what these files hold")
     args = args.parse_args(argv)
     if args.table:
         rows = [r for f in args.table for r in json.loads(pathlib.Path(f).read_text())]
         print(
-            f"thresholds {', '.join(sorted({r['thresholds'] for r in rows}))}; tier "
+            f"code {', '.join(sorted({r['code'] for r in rows}))}; tier "
             f"{', '.join(sorted({r['tier'] for r in rows}))}"
         )
         print(table(rows))
         if args.figure:
             confusion(rows, args.figure)
         return
-    from biotac_mj.discrepancy.trajectories.workflow import threshold_hash
-
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text()) if path.exists() else []
-    done = {(r["case"], r["seeds"], r["tier"], r["thresholds"]) for r in rows}
+    done = {(r["case"], r["plan"], r["seeds"], r["tier"], r["code"]) for r in rows}
     i, n = (int(v) for v in args.share.split("/"))
     todo = [
         c
         for c in cases(args.counts, args.seeds, args.plans)[i::n]
-        if (c["case"], args.seeds, args.tier, threshold_hash()) not in done
+        if (c["case"], c["plan"], args.seeds, args.tier, code_hash()) not in done
     ]
-    print(f"thresholds {threshold_hash()}, {len(todo)} cases to do", flush=True)
+    print(f"code {code_hash()}, {len(todo)} cases to do", flush=True)
     if todo:
         began = time.time()
         _begin(args)  # compiles kernels and fills the first plan's cache before anybody else needs them
@@ -307,11 +324,7 @@ def main(argv=None):
                 _collect(pool.imap_unordered(_one, todo, chunksize=1), rows, path)
         else:
             _collect(map(_one, todo), rows, path)
-    rows = [
-        r
-        for r in rows
-        if (r["seeds"], r["tier"], r["thresholds"]) == (args.seeds, args.tier, threshold_hash())
-    ]
+    rows = [r for r in rows if (r["seeds"], r["tier"], r["code"]) == (args.seeds, args.tier, code_hash())]
     print(table(rows))
     if args.figure:
         confusion(rows, args.figure)
@@ -325,8 +338,8 @@ def _collect(results, rows, path):
         rows.append(row)
         _write(path, rows)
         print(
-            f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:100]} | "
-            f"{row['least_rms']}, {row['bic']}",
+            f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:110]} | "
+            + ", ".join(f"{k}: {' '.join(a['named'][:3])}" for k, a in row["answers"].items() if k != "ours"),
             flush=True,
         )
 

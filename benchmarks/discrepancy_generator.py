@@ -3,13 +3,14 @@ imports.
 
 The skin and film are the project's, solved on a mesh of the generator's choice with its own way through the
 poses; every effect is written anew, in another form than the catalogue's (Euler integration instead of closed
-recursions, two time constants where one is fitted, a second-order filter, nearest neighbours instead of a
-kernel, tanh instead of a bent line, Dahl's law instead of a play operator)."""
+recursions, two time constants where one is fitted, a second-order filter, tanh instead of a bent line, Dahl's
+law instead of a play operator). Effects of the set-up and the contact, cross-talk and local stiffness have
+three forms each (FORMS), none of them the fitter's."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-__all__ = ["HIDDEN", "OUTSIDE", "Generator", "plan"]
+__all__ = ["FORMS", "HIDDEN", "OUTSIDE", "Generator", "plan"]
 
 _E_NEAR = {
     0: (1, 3, 7),
@@ -45,7 +46,10 @@ def plan(seed, count, skin="coarse"):
         point, normal = approach.surface_point(geometry, rng.uniform(-0.014, -0.004), rng.uniform(-0.5, 0.5))
         heading = -normal
         depth, speed = rng.uniform(0.5e-3, 1.5e-3), np.exp(rng.uniform(np.log(0.5e-3), np.log(20e-3)))
-        hold, slide = np.exp(rng.uniform(np.log(0.2), np.log(6))), rng.choice([0.0, 0.0, 0.8e-3])
+        hold, slide = np.exp(rng.uniform(np.log(0.2), np.log(6))), rng.choice([0.0, 0.8e-3])
+        hold = min(
+            hold, 60 * depth / speed
+        )  # rows of one trajectory lie no further apart than a hundred others
         side = np.cross(heading, [1.0, 0, 0])
         side /= np.linalg.norm(side)
         legs = [(0.2, -0.02e-3, 0, 3), (depth / speed, depth, 0, 6), (hold, depth, 0, 5)]
@@ -98,26 +102,49 @@ class Generator:
         )
         self.modulus, self.footprint, self.tier = modulus, footprint, tier
 
-    def skin(self, plans, poses, radii) -> list:
+    def skin(self, plans, poses, radii, friction=1.0) -> list:
         """Per plan force (n, 3) [N], pressure (n,) [Pa], impedance (n, 19) [ohm]; poses: lists of (n, 3);
-        radii: factors or None."""
+        radii: factors or None; friction: factor on its coefficient."""
         from biotac_mj.data.objects import make_object
 
         size = [
             float(make_object(one["tool"]).size[0]) * (radius or 1.0) for one, radius in zip(plans, radii)
         ]
         if self.tier == "condensed":
-            return [self._condensed(one, pos, r) for one, pos, r in zip(plans, poses, size)]
-        return self._full(plans, poses, size)
+            return [self._condensed(one, pos, r, friction) for one, pos, r in zip(plans, poses, size)]
+        return self._full(self.model, plans, poses, size, friction)
 
-    def _condensed(self, one, pos, r):
+    def uneven(self, plans, poses, radii, factor) -> list:
+        """Per plan what a modulus that varies adds to force, pressure and the impedances' logarithms; factor:
+        of positions (n, 3) [m], on it."""
+        from biotac_mj.data.objects import make_object
+        from biotac_mj.skin.model import SkinModel
+
+        size = [float(make_object(p["tool"]).size[0]) * (radius or 1.0) for p, radius in zip(plans, radii)]
+        at = self.geometry.vert[self.geometry.elem[:, :4]].mean(1)
+        plain, stiff = (
+            self._full(
+                SkinModel(
+                    self.geometry, self.model.material, self.model.options, self.model.device, modulus=values
+                ),
+                plans,
+                poses,
+                size,
+                1.0,
+            )
+            for values in (np.ones(len(at)), factor(at))
+        )
+        return [(b[0] - a[0], b[1] - a[1], np.log(b[2] / a[2])) for a, b in zip(plain, stiff)]
+
+    def _condensed(self, one, pos, r, friction):
         from biotac_mj.skin.condensed import CondensedSkin, Memory
         from biotac_mj.skin.geoms import GeomSet
 
-        skin = self.__dict__.setdefault("_skins", {}).get(r)
+        skin = self.__dict__.setdefault("_skins", {}).get((r, friction))
         if skin is None:
-            skin = self._skins[r] = CondensedSkin(
-                self.model, GeomSet(["sphere"], [(r,)], friction=[self.model.material.friction], device="cpu")
+            mu = friction * self.model.material.friction
+            skin = self._skins[r, friction] = CondensedSkin(
+                self.model, GeomSet(["sphere"], [(r,)], friction=[mu], device="cpu")
             )
             while len(self._skins) > 4:
                 del self._skins[next(iter(self._skins))]
@@ -130,7 +157,7 @@ class Generator:
                 impedance.append(self.film.impedance(out.vert_xpos[: self.geometry.nvert]))
         return np.array(force), np.array(pressure), np.array(impedance)
 
-    def _full(self, plans, poses, size):
+    def _full(self, model, plans, poses, size, friction):
         """Full finite elements, every plan a world; spheres of all sizes are in every world, those not used a
         metre away."""
         from biotac_mj.skin import GeomSet, SkinData, step
@@ -139,11 +166,11 @@ class Generator:
         geoms = GeomSet(
             ["sphere"] * len(kinds),
             [(r,) for r in kinds],
-            friction=[self.model.material.friction] * len(kinds),
+            friction=[friction * model.material.friction] * len(kinds),
             nworld=len(plans),
-            device=self.model.device,
+            device=model.device,
         )
-        data = SkinData(self.model, len(plans))
+        data = SkinData(model, len(plans))
         ways = [list(_way(one, pos, r)) for one, pos, r in zip(plans, poses, size)]
         out = [([], [], []) for _ in plans]
         for k in range(max(map(len, ways))):
@@ -151,7 +178,7 @@ class Generator:
             for w, way in enumerate(ways):
                 centre[w, kinds.index(size[w])] = way[min(k, len(way) - 1)][0]
             geoms.set_pose(centre, np.tile(np.eye(3), (len(plans), len(kinds), 1, 1)))
-            step(self.model, data, geoms)
+            step(model, data, geoms)
             if any(k < len(way) and way[k][1] for way in ways):
                 x, force, pressure = data.vert_xpos, data.wrench, data.pressure
                 for w, way in enumerate(ways):
@@ -162,26 +189,38 @@ class Generator:
 
     def measure(self, plans, effects, seed, repeatability=0.02e-3):
         """Per plan: counts (n, 19), pdc (n,), force (n, 3) with noise and rounding; effects: list of (name,
-        size)."""
+        size, form)."""
+        rng = np.random.default_rng([seed, 1])
+        out = []
+        for counts, pdc, force in self.clean(plans, effects, seed, repeatability):
+            noisy = np.clip(np.rint(counts + 3.5 * rng.standard_normal(counts.shape)), 0, 4095)
+            pressed = np.rint(pdc + rng.standard_normal(len(pdc)))
+            out.append((noisy, pressed, force + 0.006 * rng.standard_normal(force.shape)))
+        return out
+
+    def clean(self, plans, effects, seed, repeatability=0.02e-3):
+        """`measure` without noise and rounding; the poses slip as they do there."""
         rng = np.random.default_rng(seed)
-        memory, out = {}, []
+        memory, out = {"end": max(one["clock"] for one in plans)}, []
         states = [_State(one, self, rng.normal(0, repeatability, 3), memory) for one in plans]
         for s in states:
-            for name, size in effects:
+            for name, size, form in effects:
                 if name in _BEFORE:
-                    _BEFORE[name](s, size)
+                    _BEFORE[name](s, size, form)
         poses = [s.one["pos"] + s.offset for s in states]
-        for _ in range(4 if states[0].compliance else 1):
+        for _ in range(4 if states[0].give else 1):
             for s, solved in zip(states, self.skin(plans, poses, [s.radius for s in states])):
                 s.force, s.pressure, s.impedance = solved
-            wanted = [
-                s.one["pos"]
-                + s.offset
-                - s.compliance * np.outer(np.maximum(-s.force @ s.one["heading"], 0), s.one["heading"])
-                for s in states
-            ]
-            # the mount gives way: most of the way to balance each time
-            poses = [0.8 * new + 0.2 * old for new, old in zip(wanted, poses)]
+            if states[0].give:
+                wanted = [s.one["pos"] + s.offset + s.give(self.modulus * s.force) for s in states]
+                poses = [0.9 * new + 0.1 * old for new, old in zip(wanted, poses)]
+        if states[0].slip:
+            self._rub(plans, poses, states)
+        if states[0].stiff:
+            added = self.uneven(plans, poses, [s.radius for s in states], states[0].stiff)
+            for s, (force, pressure, log_z) in zip(states, added):
+                s.force, s.pressure = s.force + force, s.pressure + pressure
+                s.impedance = s.impedance * np.exp(log_z)
         for s in states:
             s.force, s.pressure = self.modulus * s.force, self.modulus * s.pressure
             s.rest = s.impedance[0]
@@ -191,23 +230,31 @@ class Generator:
                 for k, near in _E_NEAR.items():
                     smear[k, list(near)] = self.footprint / len(near)
                 s.impedance = s.rest * np.exp(change @ smear.T)
-            for name, size in effects:
+            for name, size, _ in effects:
                 if name in _LOAD:
                     _LOAD[name](s, size)
             s.counts, s.pdc = 4095 / (s.impedance / 1e4 + 1), 2000 + s.pressure / 36.5
             s.zero = 4095 / (s.rest / 1e4 + 1)
-            for name, size in effects:
-                if name in _READ:
+            for name, size, form in effects:
+                if name == "crosstalk":
+                    _crosstalk(s, size, form)
+                elif name in _READ:
                     _READ[name](s, size)
-            counts = np.clip(np.rint(s.counts + 3.5 * rng.standard_normal(s.counts.shape)), 0, 4095)
-            out.append(
-                (
-                    counts,
-                    np.rint(s.pdc + rng.standard_normal(len(s.pdc))),
-                    s.force + 0.006 * rng.standard_normal(s.force.shape),
-                )
-            )
+            out.append((s.counts, s.pdc, s.force))
         return out
+
+    def _rub(self, plans, poses, states):
+        """Friction that changes from row to row: quadratic between solutions at three levels of it."""
+        levels = np.log([0.4, 0.8, 1.6])
+        radii = [s.radius for s in states]
+        solved = [self.skin(plans, poses, radii, float(np.exp(level))) for level in levels]
+        for i, s in enumerate(states):
+            at = np.clip(np.log(s.slip(s)), levels[0], levels[-1])
+            weight = [np.prod([(at - b) / (a - b) for b in levels if b != a], axis=0) for a in levels]
+            force, pressure, impedance = zip(*(one[i] for one in solved))
+            s.force = sum(w[:, None] * f for w, f in zip(weight, force))
+            s.pressure = sum(w * p for w, p in zip(weight, pressure))
+            s.impedance = np.exp(sum(w[:, None] * np.log(z) for w, z in zip(weight, impedance)))
 
 
 def _way(one, pos, r):
@@ -224,7 +271,9 @@ def _way(one, pos, r):
 class _State:
     def __init__(self, one, generator, slip, memory):
         self.one, self.generator, self.offset, self.memory = one, generator, slip, memory
-        self.radius, self.compliance = None, 0.0
+        # give(force (n, 3)): how poses yield [m]; slip(state): factor on friction; stiff(positions): on E
+        self.radius, self.give, self.slip, self.stiff = None, None, None, None
+        self.session = one["clock"] / max(memory["end"], 1.0)  # 0 at its beginning, 1 at its end
         self.t, self.clock, self.depth = one["time"], one["clock"] + one["time"], np.maximum(one["depth"], 0)
 
 
@@ -296,11 +345,18 @@ def _gain(s, size):
     s.counts = s.zero + (s.counts - s.zero) * (1 + g)
 
 
-def _crosstalk(s, size):
-    m = np.zeros((19, 19))
-    for k, near in _E_NEAR.items():
-        m[k, list(near)] = size
-    s.counts = s.counts + (s.counts - s.zero) @ m.T
+def _crosstalk(s, size, form):
+    change = s.counts - s.zero
+    if form == 0:  # neighbours alike, however far apart
+        m = np.zeros((19, 19))
+        for k, near in _E_NEAR.items():
+            m[k, list(near)] = size
+        added = change @ m.T
+    elif form == 1:  # the multiplexer holds what it sampled before, and some of what was before that
+        added = size * (1.4 * np.roll(change, 1, axis=1) + 0.6 * np.roll(change, 2, axis=1))
+    else:  # the supply gives way
+        added = -150 * size * np.tanh(change.mean(1, keepdims=True) / 100)
+    s.counts = s.counts + added
 
 
 def _saturate(s, size):
@@ -321,18 +377,103 @@ def _drift(s, size):
     s.counts = s.counts + (size * (s.t - s.t[0]) ** 0.9)[:, None]
 
 
-def _set(name):
-    def change(s, size):
-        if name == "radius":
-            s.radius = 1 + size
-        elif name == "compliance":
-            s.compliance = size
-        elif name == "depth0":
-            s.offset = s.offset + size * s.one["heading"]
-        else:
-            s.offset = s.offset + np.array([size, 0, 0.6 * size])
+def _small(s):
+    return s.one["tool"] == "sphere_7mm"
 
-    return change
+
+def _radius(s, size, form):
+    """One tool; both, unlike; worn over the session."""
+    grown = ((size, 0.0)[not _small(s)], (0.6 * size, 1.2 * size)[_small(s)], -size * (0.6 + 0.6 * s.session))
+    s.radius = 1 + grown[form]
+
+
+def _depth0(s, size, form):
+    """Along the finger's own axis; creeping over the session; each tool's length."""
+    along = (
+        np.array([0.0, s.one["heading"][1], 0.0]),
+        (0.6 + 0.8 * s.session) * s.one["heading"],
+        (1.25, 0.75)[_small(s)] * s.one["heading"],
+    )
+    s.offset = s.offset + size * along[form]
+
+
+def _misalign(s, size, form):
+    """Turned about the clamp; along the finger and a roll about its axis; each tool beside its axis."""
+    place = s.one["pos"][len(s.t) // 2]
+    yaw = size / 12e-3 * np.cross([0.3, 1.0, 0.0], place - [6e-3, 0.0, 0.0])
+    roll = size * np.array([1.0, 0, 0]) + size / 8e-3 * np.cross([1.0, 0, 0], place)
+    s.offset = s.offset + (yaw, roll, size * np.array([0.9, 0, (0.9, 0.4)[_small(s)]]))[form]
+
+
+def _mount(s, size, form):
+    """It stiffens with load; backlash and a spring; a lever that is longer at the tip."""
+
+    def give(force):
+        load = np.maximum(-force @ s.one["heading"], 0)
+        by = (
+            1.5 * size * load / (1 + load / 4),
+            0.8 * size * load + 0.3 * size * (1 - np.exp(-load / 0.3)),
+            size * load * (1 - (s.one["pos"][0, 0] + 9e-3) / 12e-3),
+        )[form]
+        return -np.outer(by, s.one["heading"])
+
+    s.give = give
+
+
+def _rocking(s, size, form):
+    """Sideways with load: less and less; with a lever from the clamp; after a little play."""
+
+    def give(force):
+        load = np.maximum(-force @ s.one["heading"], 0)
+        by = (
+            size * load / (1 + load / 6),
+            size * load * (6e-3 - s.one["pos"][0, 0]) / 15e-3,
+            1.2 * size * np.maximum(load - 0.15, 0),
+        )[form]
+        return np.outer(by, (0.8, 0.0, 0.6))
+
+    s.give = give
+
+
+def _friction(s, size, form):
+    """One tool more than the other; dust over the session; slower slides rub more."""
+
+    def slip(state):
+        speed = np.linalg.norm(np.gradient(s.one["pos"], s.t, axis=0), axis=1)
+        by = (
+            np.full(len(s.t), (0.75, 1.25)[_small(s)]),
+            np.full(len(s.t), 0.7 + 0.6 * s.session),
+            1 - 0.12 * np.log(np.maximum(speed, 1e-4) / 2e-3),
+        )[form]
+        return np.exp(-size * by)
+
+    s.slip = slip
+
+
+def _fric_load(s, size, form):
+    """Shear strength times an area: a power; a plateau; a constant beside a part of the load."""
+
+    def slip(state):
+        load = np.maximum(-s.generator.modulus * s.force @ s.one["heading"], 0.05)
+        by = (
+            1.3 * load ** (-2 * size / 3),
+            np.minimum(1.4, 1.4 * (0.6 / load) ** size),
+            0.6 + 2 * size / (load + 1),
+        )
+        return by[form]
+
+    s.slip = slip
+
+
+def _inhomog(s, size, form):
+    """A stiff patch; a step towards the tip; a soft tip that hardens behind it."""
+
+    def stiff(at):
+        patch = np.exp(-(((at - [-9e-3, -7e-3, 1e-3]) / 5e-3) ** 2).sum(1))
+        by = (1.6 * patch, 1.6 * (at[:, 0] < -9e-3) - 0.3, -1.6 * np.exp((-15e-3 - at[:, 0]) / 5e-3))
+        return np.exp(size * by[form])
+
+    s.stiff = stiff
 
 
 def _ripple(s, size):
@@ -358,11 +499,16 @@ def _squeeze(s, size):
 
 
 _BEFORE = {
-    "radius": _set("radius"),
-    "mount": _set("compliance"),
-    "depth0": _set("depth0"),
-    "misalign": _set("misalign"),
+    "radius": _radius,
+    "mount": _mount,
+    "depth0": _depth0,
+    "misalign": _misalign,
+    "rocking": _rocking,
+    "friction": _friction,
+    "fric_load": _fric_load,
+    "inhomog": _inhomog,
 }
+FORMS = dict.fromkeys((*_BEFORE, "crosstalk"), 3)  # of all others one
 _LOAD = {
     "relax": _relax,
     "hyster": _hyster,
@@ -375,7 +521,6 @@ _LOAD = {
 }
 _READ = {
     "gain": _gain,
-    "crosstalk": _crosstalk,
     "saturate": _saturate,
     "lowpass": _lowpass,
     "latency": _latency,
@@ -405,5 +550,9 @@ HIDDEN = {
     "mount": (4e-5, 12e-5),
     "depth0": (6e-5, 15e-5),
     "misalign": (1.5e-4, 4e-4),
+    "rocking": (1e-4, 3e-4),
+    "friction": (0.4, 0.9),
+    "fric_load": (0.4, 1.0),
+    "inhomog": (0.3, 0.6),
 }
 OUTSIDE = {"ripple": (20, 60), "leak": (40, 120), "ring": (0.1, 0.3), "squeeze": (10, 40)}

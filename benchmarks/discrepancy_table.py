@@ -62,18 +62,13 @@ def table(rows) -> str:
         lines.append(f"  with ties {_share(sum(bool(r['named']) and right(r, 0) for r in some), len(some))}, "
                      f"exactly it {_share(sum(r['named'] == r['truth'] for r in some), len(some))}, "
                      f"abstained {_share(sum(answer(r) == 'unknown' for r in some), len(some))}")  # fmt: skip
-        for name in ("least_rms", "bic"):
-            lines.append(
-                f"  baseline {name}: {_share(sum([r[name]] == r['truth'] for r in some), len(some))}"
-            )
     for kind in ("none", "wrong-base"):
         some = by[kind]
         named = [r for r in some if answer(r) not in ("unknown", "no disagreement")]
         lines.append(
             f"{kind}: named something {_share(len(named), len(some))}, "
             f"unhedged {_share(sum(any(not t for t in r['ties']) for r in named), len(some))}, "
-            f"unknown {_share(sum(answer(r) == 'unknown' for r in some), len(some))}; "
-            f"BIC names {_share(sum(r['bic'] not in ('none', '') for r in some), len(some))}"
+            f"unknown {_share(sum(answer(r) == 'unknown' for r in some), len(some))}"
         )
     for kind in ("outside", "left-out"):
         some = by[kind]
@@ -98,8 +93,46 @@ def table(rows) -> str:
     for law, same in (("same law", True), ("another law", False)):
         inside = _covered(single, same)
         lines.append(f"95 % intervals, {law}: {_share(sum(inside), len(inside))}")
-    lines.append(reliability(judged))
+    lines += [reliability(judged), *_rivals(judged), *_by_effect(single)]
     return "\n".join(lines)
+
+
+def _rivals(rows):
+    """Every method on the same cases: first name, false names, where (F1), and the modulus that it leaves."""
+    rows = [r for r in rows if r["answers"]]
+    lines = [f"methods, {len(rows)} cases:"] if rows else []
+    for name in rows[0]["answers"] if rows else ():
+        of = [(r, _given(r) if name == "ours" else r["answers"][name]["named"]) for r in rows]
+        single, quiet = (
+            [(r, n) for r, n in of if r["kind"] in kinds] for kinds in (("single",), ("none", "wrong-base"))
+        )
+        named = [(r, n) for r, some in of for n in some]
+        false = sum(n not in r["truth"] for r, n in named)
+        shown = [a for r, _ in of if r["truth"] for a in [r["answers"][name]]]
+        bias = np.array([a["bias"] for r in rows if r["kind"] == "single" for a in [r["answers"][name]]])
+        size = np.exp(np.median(np.abs(bias), axis=0)) - 1 if len(bias) else [np.nan] * 2
+        lines.append(
+            f"  {name}: first name right {_share(sum(n[:1] == r['truth'] for r, n in single), len(single))}, "
+            f"names that are wrong {_share(false, len(named))}, "
+            f"named where nothing is {_share(sum(bool(n) for _, n in quiet), len(quiet))}, "
+            f"where: F1 {np.mean([a['f1'] for a in shown] or [np.nan]):.2f}, "
+            f"modulus off by {size[0]:.1%} without, {size[1]:.1%} with what is named (median)"
+        )
+    return lines
+
+
+def _given(row):
+    return row["named"] if answer(row) not in ("unknown", "no disagreement") else []
+
+
+def _by_effect(rows):
+    """What became of every single effect, form by form."""
+    by = collections.defaultdict(list)
+    for r in rows:
+        by[r["truth"][0]].append(
+            f"{r['forms'][0]} {answer(r)}{'' if not r['named'] or right(r, 0) else ' (wrong)'}"
+        )
+    return [f"  {name}: {'; '.join(sorted(found))}" for name, found in sorted(by.items())]
 
 
 def _covered(rows, same):

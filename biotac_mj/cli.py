@@ -631,8 +631,22 @@ def _add_diagnose(verbs):
         "Name what the simulation misses in measured data; writes report.html and verdict.json.",
     )
     verb.add_argument(
-        "data", nargs="?", metavar="DATA", help="HDF5 of measured trajectories (docs/discrepancy.md)"
+        "data",
+        nargs="?",
+        metavar="DATA",
+        help="HDF5 of measured trajectories, or a recording, with the object's poses or without "
+        "(docs/discrepancy.md)",
     )
+    verb.add_argument(
+        "--object", metavar="NAME", help="what touched in DATA, where it does not say, as sphere_7mm"
+    )
+    verb.add_argument(
+        "--repeatability",
+        type=real(1e-4, 5),
+        metavar="MM",
+        help="by which poses differ from trial to trial (default: 0.05)",
+    )
+    verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --sensor says)")
     verb.add_argument(
         "--sensor",
         metavar="FILE.yaml",

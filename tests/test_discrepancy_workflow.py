@@ -2,6 +2,7 @@
 that costs nothing."""
 
 import ast
+import dataclasses
 import pathlib
 
 import numpy as np
@@ -83,13 +84,13 @@ def plans(n=14, seed=0, unload=True):
     return out
 
 
-def measured(effects, seed=1, **kw):
+def measured(effects, seed=1, modulus=1.07, **kw):
     """What the springs with effects would read, with noise, slips of the pose and another modulus
     (synthetic)."""
     rng = np.random.default_rng(seed)
     data = plans(**kw)
     slips = [rng.normal(0, 15e-6, 3) for _ in data]
-    runs = Springs().run(data, None, True, effects, 1.07, slips)
+    runs = Springs().run(data, None, True, effects, modulus, slips)
     return [
         Trajectory(
             t.id,
@@ -245,6 +246,26 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
+def test_a_base_of_another_modulus_is_calibrated_and_takes_no_effects_name():
+    report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
+    assert not report.effects and abs(report.fit.nuisance.modulus / 1.7 - 1) < 0.05
+    assert any("modulus times 1.7" in note for note in report.notes)
+
+
+def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
+    data = measured([])
+    rng = np.random.default_rng(5)
+    data = [
+        Trajectory(
+            **{**t.__dict__, "pos": t.pos + rng.normal(0, 0.2e-3) * t.heading * (t.depth > 0)[:, None]}
+        )
+        for t in data
+    ]
+    report = diagnose(Springs(), data, progress=False)
+    assert 0.1e-3 < report.comparison.repeatability < 0.4e-3 and not report.effects
+    assert any("poses scatter by 0." in note for note in report.notes)
+
+
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
 
@@ -272,7 +293,13 @@ def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
 
 @pytest.mark.parametrize(
     "name, size",
-    [("latency", {"delay": 0.06}), ("relax", {"g": 0.25, "tau": 0.5}), ("mount", {"compliance": 1.2e-4})],
+    [
+        ("latency", {"delay": 0.06}),
+        ("relax", {"g": 0.25, "tau": 0.5}),
+        ("mount", {"compliance": 1.2e-4}),
+        ("depth0", {"dz": 1.2e-4}),
+        ("misalign", {"x": 2.5e-4, "z": 0.0}),
+    ],
 )
 def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path):
     effect = by_id(name)
@@ -282,7 +309,9 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     parameter = report.effects[0]["parameters"][0]
     assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
     assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
-    assert report.ranking[0][0] == name and any(
+    assert report.ranking[0][0] == name
+    # what a sideways shift does changes its sign from place to place: no cell has a mean
+    assert name == "misalign" or any(
         c["condition"] in ("approach", "hold", "unload", "deep", "light") for c in report.where
     )
     amended = report.apply(Springs())
@@ -292,6 +321,22 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path
     files = write_report(report, Springs(), tmp_path)
     assert all(f.exists() for f in files) and "kept aside" in summary(report)
     assert load_simulator(tmp_path / "sensor_amended.yaml").effects[0][0].id == name
+
+
+def test_each_tool_has_a_radius_of_its_own(tmp_path):
+    radius = by_id("radius").among(
+        [dataclasses.replace(t, tool=f"sphere_{k}mm") for t, k in zip(plans(2), (7, 14))]
+    )
+    assert list(radius.params) == ["sphere_14mm", "sphere_7mm"]
+    theta = {"sphere_14mm": 0.2, "sphere_7mm": 0.0}
+    for tool, grown in (("sphere_14mm", 0.2), ("sphere_7mm", 0.0), ("ring_7mm", 0.0)):
+        run = run_of()
+        run.tool = tool
+        radius.apply(run, theta)
+        assert run.log_radius == grown
+    Simulator(effects=[(radius, theta)]).save(tmp_path / "s.yaml")
+    assert load_simulator(tmp_path / "s.yaml").effects[0][1] == theta
+    assert list(by_id("radius").among(plans(2)).params) == ["log_radius"]
 
 
 def test_an_effect_of_your_own_in_ten_lines():
@@ -372,7 +417,9 @@ def imports(path):
 
 def test_generator_and_fitter_share_no_code():
     assert not any("discrepancy" in name for name in imports(ROOT / "benchmarks/discrepancy_generator.py"))
-    for path in (ROOT / "biotac_mj/discrepancy").glob("*.py"):
+    judged = [*(ROOT / "biotac_mj/discrepancy").rglob("*.py"), *(ROOT / "biotac_mj/effects").glob("*.py")]
+    assert len(judged) > 30
+    for path in judged:
         assert not any("benchmark" in name or "generator" in name for name in imports(path)), path
 
 

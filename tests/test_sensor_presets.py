@@ -112,7 +112,7 @@ def rows_of_effect(effect, theta, impedance, pressure):
 THETA = {
     "gain": {f"e{k + 1}": 0.3 * np.sin(k) for k in range(19)},
     "dead": {f"e{k + 1}": float(k in (3, 11)) for k in range(19)},
-    "crosstalk": {"kappa": 0.15, "length": 3.0},
+    "crosstalk": {"kappa": 0.15, "length": 3.0, "scan": 0.1, "common": -0.1},
     "pdc_gain": {"gain": 0.4},
     "relax": {"g": 0.3, "tau": 0.4},
     "warmup": {"a": -0.2, "tau": 0.5},

@@ -15,8 +15,13 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 "
             "columns of raw counts)"
         )
+    recordings = []
     if args.data and _is_recording(args.data):
-        args.electrodes = args.data
+        from ..recordings import load
+
+        recordings = load(args.data, force=args.force, tdc=args.tdc, rate=args.rate, object_name=args.object)
+        if all(one.object_pos is None for one in recordings):
+            args.electrodes = args.data
     if args.electrodes:
         from .recordings.recording import read_recording
         from .recordings.report import summary, write_report
@@ -30,7 +35,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         return
     from .trajectories.report import diagnose_data
 
-    diagnose_data(args)
+    diagnose_data(args, recordings)
 
 
 def _is_recording(path):

@@ -17,6 +17,7 @@ Your own in ten lines:
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,6 +66,8 @@ class Run:
       solved those without effects. counts (n, 19), pdc (n,): after the converter, before rounding.
       temperature: (n,) above the first row of the session [C], or None.
       stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
+      answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) by unit of it,
+        where that has been solved; modulus: factor on the material's since.
       session: dict that the effects of one simulation share from trajectory to trajectory.
     """
 
@@ -88,6 +91,8 @@ class Run:
     counts: np.ndarray | None = None
     pdc: np.ndarray | None = None
     stiffness: np.ndarray | None = None
+    answers: dict = dataclasses.field(default_factory=dict)
+    modulus: float = 1.0
 
     @property
     def normal_force(self) -> np.ndarray:
@@ -119,6 +124,7 @@ class Effect(abc.ABC):
     # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
     # interval
     law = 0.0
+    kin: tuple = ()  # ids of other laws for what looks alike: told apart only by much
     grid: tuple = ({},)
 
     @abc.abstractmethod
@@ -128,6 +134,14 @@ class Effect(abc.ABC):
     def applicable(self, trajectories: list) -> str | None:
         """Why the data cannot show the effect, or None."""
         return None
+
+    def among(self, trajectories: list) -> "Effect":
+        """The effect with the parameters that these trajectories can have."""
+        return self
+
+    def given(self, names: Sequence[str]) -> "Effect":
+        """The effect with parameters of these names, where it takes its own from the data."""
+        return self
 
     def doubt(self, theta: dict) -> str | None:
         """Why fitted parameters are not what the effect could be, or None."""

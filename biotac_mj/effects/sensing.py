@@ -29,7 +29,7 @@ class FluidLoss(Effect):
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)
     }
-    law = LAW
+    law, kin = LAW, ("warmup",)
     confusable = {
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
@@ -66,7 +66,7 @@ class WarmUp(Effect):
         "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
     }
     grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
-    law = LAW
+    law, kin = LAW, ("fluidloss",)
     confusable = {
         "thermal": "log TDC",
         "fluidloss": "wait an hour",
@@ -93,6 +93,7 @@ class Gain(Effect):
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
     params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
+    kin = ("inhomog",)
     confusable = {
         "asper": "one electrode or all",
         "crosstalk": "drive one electrode alone",
@@ -130,9 +131,14 @@ class DeadTaxels(Effect):
 
 class CrossTalk(Effect):
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
-    physics = "V = (I + kappa K) U with K falling off with distance"
+    physics = (
+        "V = (I + kappa K + scan S + common M) U: "
+        "K falls off with distance, S is the channel sampled before, M the mean of all"
+    )
     params = {
         "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
+        "scan": Param("1", -0.4, 0.4, "what a multiplexer holds: CHOSEN, as kappa", 0.05),
+        "common": Param("1", -0.6, 0.6, "a supply or reference that sags: CHOSEN, as kappa", 0.05),
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
@@ -146,8 +152,9 @@ class CrossTalk(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         p = electrode_positions()
         K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
+        M = theta["kappa"] * K + theta["scan"] * np.eye(19, k=-1) + theta["common"] / 19
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
-        run.counts = run.counts + theta["kappa"] * (run.counts - rest) @ K.T
+        run.counts = run.counts + (run.counts - rest) @ M.T
 
 
 class Saturation(Effect):

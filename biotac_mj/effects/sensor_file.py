@@ -96,7 +96,7 @@ def _effect(where, stage, item, extra):
     """Effect, values of its parameters, and the intervals of those that have one."""
     check_entries(f"an effect of {where}", item, _EFFECT, ("name",))
     refuse_unknown(item, _EFFECT, f"an effect of {where}")
-    effect = by_id(item["effect"], extra)
+    effect = by_id(item["effect"], extra).given(list(item["parameters"]))
     where = f"{effect.id!r} of {where}"
     if STAGES[effect.stage] != stage:
         raise ValueError(f"effect {where} acts at the stage {STAGES[effect.stage]!r}")

@@ -5,6 +5,8 @@ what the rubber bears: with a displacement-controlled object and an elastic fiel
 separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
 exact for linear materials while the contact grows)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import erf
 
@@ -37,7 +39,7 @@ class Relaxation(Effect):
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    law = LAW
+    law, kin = LAW, ("creep",)
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
@@ -52,7 +54,7 @@ class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04)}
-    law = LAW
+    law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -136,12 +138,20 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
+    kin = ("gain",)
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
-        "sensor"
+        "sensor",
+        "gain": "force over depth from place to place: gains of electrodes leave it alone",
     }
 
     def apply(self, run: Run, theta: dict) -> None:
+        if "along" in run.answers:  # the skin was solved with a modulus that varies
+            for way, slope in ((w, run.answers[w]) for w in self.params):
+                run.force = run.force + theta[way] * run.modulus * slope["force"]
+                run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
+                run.log_z = run.log_z + theta[way] * slope["log_z"]
+            return
         x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
         run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
 
@@ -160,6 +170,7 @@ class Friction(Effect):
     id, name, stage = "friction", "friction level", "K"
     physics = "Coulomb's coefficient times a factor"
     params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
+    kin = ("fric_load",)
     confusable = {"fric_load": "slides at three normal loads with two radii"}
 
     def applicable(self, trajectories: list) -> str | None:
@@ -177,6 +188,7 @@ class FrictionLoad(Effect):
         "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
     )
     params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
+    kin = ("friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
 
@@ -206,17 +218,28 @@ class Adhesion(Effect):
 
 
 class Radius(Effect):
+    """Of each spherical tool among the trajectories that are compared, else of all alike."""
+
     id, name, stage = "radius", "radius of the tool", "S"
     physics = "the sphere is larger or smaller than it says"
-    params = {"log_radius": Param("1", -0.4, 0.4, "+-25 %", 0.1)}
     confusable = {"mount": "light load", "stiffen": "another tool"}
+
+    def __init__(self, tools: tuple = ()):
+        of = Param("1", -0.4, 0.4, "+-25 %", 0.1)
+        self.params = dict.fromkeys(tools if len(tools) > 1 else ("log_radius",), of)
+
+    def among(self, trajectories: list) -> "Effect":
+        return Radius(tuple(sorted({t.tool for t in trajectories if "sphere" in t.tool})))
+
+    def given(self, names: Sequence[str]) -> "Effect":
+        return Radius(tuple(name for name in names if "sphere" in name))
 
     def applicable(self, trajectories: list) -> str | None:
         return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
 
     def apply(self, run: Run, theta: dict) -> None:
         if "sphere" in run.tool:
-            run.log_radius = run.log_radius + theta["log_radius"]
+            run.log_radius = run.log_radius + theta.get("log_radius", theta.get(run.tool, 0.0))
 
 
 class Misalignment(Effect):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..evidence import benjamini_hochberg, sign_flip
-from .fitting import Fit, evidence, fit_effects, mean_square
+from .fitting import Fit, fit_effects
 from .screening import screen
 from .thresholds import THRESHOLDS
 
@@ -96,8 +96,12 @@ def compose(
     if found and found[0].effect.id == winner:
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
-        zero = evidence(null.residuals(comparison))[chosen]
-        found[0].ties = [t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero)]
+        zero = null.evidence(comparison)[chosen]
+        found[0].ties = [
+            t
+            for t in found[0].ties
+            if t not in ends or _tied(score - zero, ends[t][3] - zero, t in found[0].effect.kin)
+        ]
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
@@ -118,10 +122,11 @@ def _ahead(lead, by=None):
     )
 
 
-def _tied(gain, other) -> bool:
+def _tied(gain, other, kin) -> bool:
     """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than
-    laws are known."""
-    return not _ahead(gain - other) or other.mean() > THRESHOLDS["alike"] * gain.mean()
+    laws are known; less so of kin."""
+    alike = THRESHOLDS["kin" if kin else "alike"]
+    return not _ahead(gain - other) or other.mean() > alike * gain.mean()
 
 
 def _rank(best, step):
@@ -130,7 +135,9 @@ def _rank(best, step):
     best.ties = [
         c.effect.id
         for c in step
-        if c is not best and c.nats >= THRESHOLDS["gain"] and _tied(best.gain, c.gain)
+        if c is not best
+        and c.nats >= THRESHOLDS["gain"]
+        and _tied(best.gain, c.gain, c.effect.id in best.effect.kin)
     ]
     best.lead = min(
         (float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0
@@ -141,22 +148,23 @@ def _round(comparison, current, null, effects, chosen, seed):
     """Screen, then refit the short list with cross-validation by trajectory; Candidates, best first."""
     known = {e.id for e, _ in current.effects}
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
-    short = ranked[: THRESHOLDS["refit"]] + [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
-    now = current.residuals(comparison)
+    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
+    asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
+    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in _SETUP]
+    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
     reference, square, square_null = (
-        evidence(now),
-        mean_square(now)[chosen],
-        mean_square(null.residuals(comparison))[chosen],
+        current.evidence(comparison),
+        current.mean_square(comparison)[chosen],
+        null.mean_square(comparison)[chosen],
     )
     excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
-    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     out = []
     for _, effect, start in short:
         trial = [*current.effects, (effect, start)]
         fit = fit_effects(comparison, trial, chosen, current)
         held = _left_out(comparison, fit, chosen, seed)[chosen]
         gain = held - reference[chosen]
-        left = mean_square(fit.residuals(comparison))[chosen]
+        left = fit.mean_square(comparison)[chosen]
         energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
         one = Candidate(
             effect,
@@ -182,9 +190,8 @@ def _left_out(comparison, whole, chosen, seed, folds=3):
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
-        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole)
-        values = evidence(fit.residuals(comparison))
-        out[chosen[fold == f]] = values[chosen[fold == f]]
+        fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, near=True)
+        out[chosen[fold == f]] = fit.evidence(comparison)[chosen[fold == f]]
     return out
 
 
@@ -217,9 +224,7 @@ def _needed(comparison, current, found, chosen):
     for item in list(found) if len(found) > 1 else ():
         rest = [(e, th) for e, th in current.effects if e.id != item.effect.id]
         reduced = fit_effects(comparison, rest, chosen, current)
-        loss = (
-            evidence(current.residuals(comparison))[chosen] - evidence(reduced.residuals(comparison))[chosen]
-        )
+        loss = (current.evidence(comparison) - reduced.evidence(comparison))[chosen]
         if sign_flip(loss) > THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
             current, found = reduced, [f for f in found if f is not item]
     return current, found

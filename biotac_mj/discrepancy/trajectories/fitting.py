@@ -12,7 +12,7 @@ from .nuisance import HIGH, LOW, PRIOR, Nuisance
 if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
-__all__ = ["Fit", "evidence", "fit_effects", "mean_square"]
+__all__ = ["Fit", "fit_effects"]
 
 _N = len(PRIOR)
 
@@ -36,6 +36,19 @@ class Fit:
     def residuals(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.residuals(self.effects, self.nuisance, exact)
 
+    def vectors(self, comparison: "Comparison") -> list:
+        return comparison.vectors(self.effects, self.nuisance)
+
+    def mean_square(self, comparison: "Comparison") -> np.ndarray:
+        """(trajectories,) c_i: mean square of rows, and of the pose's error."""
+        return np.array([v @ v for v in self.vectors(comparison)])
+
+    def evidence(self, comparison: "Comparison") -> np.ndarray:
+        """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share
+        their causes [nats]."""
+        rows = np.array([len(t.time) for t in comparison.trajectories])
+        return -0.5 * rows * np.log(np.maximum(self.mean_square(comparison), 0.05))
+
     def raw(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.raw(self.effects, self.nuisance, exact)
 
@@ -49,24 +62,18 @@ class Fit:
         return value - half, value + half
 
 
-def mean_square(residuals: list) -> np.ndarray:
-    """(trajectories,) c_i = |r|^2 / n."""
-    return np.array([float((r**2).mean()) for r in residuals])
-
-
-def evidence(residuals: list) -> np.ndarray:
-    """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share their
-    causes [nats]."""
-    return np.array([-0.5 * len(r) * np.log(max(float((r**2).mean()), 0.05)) for r in residuals])
-
-
 def fit_effects(
-    comparison: "Comparison", effects: list, keep: np.ndarray | None = None, start: Fit | None = None
+    comparison: "Comparison",
+    effects: list,
+    keep: np.ndarray | None = None,
+    start: Fit | None = None,
+    near: bool = False,
 ) -> Fit:
     """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
 
     Args:
       keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
+      near: the start is nearly the answer already, as with a part of the same trajectories.
     """
     keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
     names, scale, low, high, x0 = [], [], [], [], []
@@ -118,35 +125,35 @@ def fit_effects(
             )
         return filled, Nuisance(float(v[0]), 0.0 if sliding else float(v[1]), float(v[2]), float(v[3]))
 
-    weight = None
+    weight = np.ones(len(comparison.trajectories))
 
     def function(v):
-        r = comparison.residuals(*unpack(v))
-        parts = [r[i].ravel() * np.sqrt(weight[i] / r[i].shape[1]) for i in keep]
+        r = comparison.vectors(*unpack(v))
+        parts = [r[i] * np.sqrt(weight[i]) for i in keep]
         penalty = (
             np.concatenate([v[:_N] / PRIOR, (v[_N:] - centre) / prior]) if len(names) else v[:_N] / PRIOR
         )
         return np.concatenate([*parts, penalty])
 
-    weight = np.ones(len(comparison.trajectories))
-    for round_ in range(2):
-        c = mean_square(comparison.residuals(*unpack(x)))
-        weight = 1 / np.maximum(c, 0.5)
+    rows = np.array([len(t.time) for t in comparison.trajectories])
+    for evaluations in (4,) if near else (8, 6):
+        c = np.array([r @ r for r in comparison.vectors(*unpack(x))])
+        weight = rows / np.maximum(c, 0.5)
         out = least_squares(
             function,
             x,
             bounds=bounds,
             method="trf",
             diff_step=1e-3,
-            max_nfev=8 if round_ == 0 else 6,
+            max_nfev=evaluations,
             x_scale="jac",
-            ftol=1e-5,
-            xtol=1e-5,
+            ftol=3e-4,  # a tenth of a nat
+            xtol=3e-4,
         )
         x = out.x
     filled, nuisance = unpack(x)
     # Sandwich by trajectory: bread of Gauss-Newton, meat of the trajectories' own scores.
-    sizes = [comparison.measured[i].size for i in keep]
+    sizes = [len(comparison.vector(i, comparison.measured[i])) for i in keep]
     edges = np.concatenate([[0], np.cumsum(sizes)])
     J, r = out.jac, out.fun
     bread = np.linalg.pinv(J.T @ J)
@@ -155,7 +162,7 @@ def fit_effects(
     sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
     covariance = np.maximum(
         np.diag(sandwich)[_N:],
-        np.diag(bread)[_N:] * max(1.0, 2 * out.cost / max(sum(sizes) / comparison.width, 1)),
+        np.diag(bread)[_N:] * max(1.0, 2 * out.cost / rows[keep].sum()),
     )
     jacobian = np.array(
         [

@@ -11,9 +11,10 @@ import numpy as np
 
 __all__ = ["HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 
-# In the order of Nuisance's fields: standard deviations of the prior, bounds.
-PRIOR = np.array([0.4, 0.4, 0.05, 0.7])
-LOW, HIGH = np.array([-1.5, -1.5, -0.2, -1.0]), np.array([1.5, 1.5, 0.2, 2.0])
+# In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
+# is a finding (`skin_and_setup.Friction`).
+PRIOR = np.array([0.4, 0.1, 0.05, 0.7])
+LOW, HIGH = np.array([-1.5, -0.15, -0.2, -1.0]), np.array([1.5, 0.15, 0.2, 2.0])
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 

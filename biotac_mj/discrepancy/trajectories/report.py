@@ -6,27 +6,31 @@ import dataclasses
 import html
 import json
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
 from ...effects.effect import STAGES
 from ...files import replacing
+from ...recordings.recording import Recording
 from ...skin.settings import read_dict
 from ..plain_values import plain_values
 from .in_skin import InSkinSimulator
+from .recorded import trajectories_of
 from .sensor_file import load_simulator
 from .simulator import Simulator
 from .trajectory import read_trajectories
 from .where import conditions
+from .whitening import REPEATABILITY
 from .workflow import THRESHOLDS, Report, diagnose, threshold_hash
 
 __all__ = ["diagnose_data", "summary", "verdict_dict", "write_report"]
 
 
-def diagnose_data(args: argparse.Namespace) -> None:
-    """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`."""
-    out = pathlib.Path(args.out)
-    data = read_trajectories(args.data)
+def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()) -> None:
+    """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`; recordings: with poses, in place of a
+    file of trajectories."""
+    out, notes = pathlib.Path(args.out), []
     if args.sensor:
         sim = load_simulator(args.sensor)
     else:
@@ -37,6 +41,8 @@ def diagnose_data(args: argparse.Namespace) -> None:
             "in_skin` into it, or leave --in-skin out"
         )
     changes = {"device": args.device, "cache": str(out / "fields")}  # run again after an interruption
+    if args.skin:
+        changes["skin"] = args.skin
     if args.material:
         changes["material"] = args.material
     if args.options:
@@ -44,7 +50,18 @@ def diagnose_data(args: argparse.Namespace) -> None:
     sim = dataclasses.replace(sim, **changes)
     if args.device != "cpu" and sim.tier != "full":
         raise ValueError(f"--device {args.device} is for the full tier: add --tier full, or leave it out")
-    report = diagnose(sim, data, locked=0.25 if args.locked is None else args.locked, progress=not args.quiet)
+    if recordings:
+        data, notes = trajectories_of(list(recordings), sim.skin)
+    else:
+        data = read_trajectories(args.data)
+    report = diagnose(
+        sim,
+        data,
+        repeatability=1e-3 * args.repeatability if args.repeatability else REPEATABILITY,
+        locked=0.25 if args.locked is None else args.locked,
+        progress=not args.quiet,
+    )
+    report.notes[:0] = notes
     files = write_report(report, sim, out)
     print(summary(report))
     print("  " + " ".join(str(f) for f in files[:3]))

@@ -2,49 +2,59 @@
 experiment that tells them apart."""
 
 import typing
+from collections.abc import Iterator
 
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
-from .fitting import mean_square
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
     from .fitting import Fit
     from .whitening import Comparison
 
-__all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen"]
+__all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen", "sizes", "stacked"]
 
-_STEPS = {"log_modulus": 0.05, "log_friction": 0.1, "footprint": 0.02, "mesh": 0.2}
+# Friction is no part of it: what it is off by has a name.
+_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2}
+_RIDGE = 0.01  # of signatures, whose squares are nats
 
 
 def columns(
     comparison: "Comparison", current: "Fit", effect: "Effect", shape: dict, base: list, chosen: np.ndarray
 ) -> np.ndarray:
-    """(rows, free) signatures of an effect about the present model, whitened and stacked: secants at a
-    realistic size."""
+    """(rows, free) signatures of an effect about the present model: secants at a realistic size.
+
+    Args:
+      base: (rows of a trajectory,) `Fit.vectors` of the present model, of every trajectory.
+    """
     out = []
-    for name, size in _sizes(effect):
+    for name, size in sizes(effect):
         theta = {**effect.default(), **shape}
         theta[name] = theta[name] + size
-        r = comparison.residuals([*current.effects, (effect, theta)], current.nuisance)
-        out.append(np.concatenate([(base[i] - r[i]).ravel() for i in chosen]))
+        r = comparison.vectors([*current.effects, (effect, theta)], current.nuisance)
+        out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
     return np.stack(out, axis=1)
 
 
-def _sizes(effect):
-    """(name, step) of the free parameters."""
+def stacked(comparison: "Comparison", vectors: list, chosen: np.ndarray) -> np.ndarray:
+    """(rows,) of the chosen trajectories one after another, each with as many nats as it has rows."""
+    return np.concatenate([vectors[i] * np.sqrt(len(comparison.trajectories[i].time)) for i in chosen])
+
+
+def sizes(effect: "Effect") -> Iterator[tuple[str, float]]:
+    """(name, realistic size) of the free parameters."""
     for name in effect.free:
         p = effect.params[name]
         yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
 
 
 def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
-    """(rows, 4) orthonormal: what the nuisance parameters can mimic."""
+    """(rows, 3) orthonormal: what the nuisance parameters can mimic."""
     out = []
     for name, by in _STEPS.items():
-        r = comparison.residuals(current.effects, current.nuisance.moved(**{name: by}))
-        out.append(np.concatenate([(base[i] - r[i]).ravel() for i in chosen]))
+        r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))
+        out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
     q, r = np.linalg.qr(np.stack(out, axis=1))
     return q[:, np.abs(np.diag(r)) > 1e-9]
 
@@ -52,14 +62,14 @@ def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen:
 def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.ndarray) -> list[tuple]:
     """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
     start), best first."""
-    base = current.residuals(comparison)
+    base = current.vectors(comparison)
     q = nuisance_space(comparison, current, base, chosen)
-    sizes = [base[i].size for i in chosen]
-    edges = np.concatenate([[0], np.cumsum(sizes)])
+    counts = [base[i].size for i in chosen]
+    edges = np.concatenate([[0], np.cumsum(counts)])
     weight = np.concatenate(
-        [np.full(s, 1 / np.sqrt(max(m, 0.5))) for s, m in zip(sizes, mean_square(base)[chosen])]
+        [np.full(s, 1 / np.sqrt(max(base[i] @ base[i], 0.5))) for s, i in zip(counts, chosen)]
     )
-    y = np.concatenate([base[i].ravel() for i in chosen]) * weight
+    y = stacked(comparison, base, chosen) * weight
     q, _ = np.linalg.qr(q * weight[:, None])
     y = y - q @ (q.T @ y)
     folds = np.arange(len(chosen)) % 4
@@ -68,22 +78,21 @@ def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.n
         for shape in effect.grid:
             S = columns(comparison, current, effect, shape, base, chosen) * weight[:, None]
             S = S - q @ (q.T @ S)
-            gain = []
+            gain, ridge = [], np.eye(S.shape[1]) * _RIDGE
             for f in range(4):
                 train = np.concatenate(
                     [np.arange(a, b) for a, b, g in zip(edges[:-1], edges[1:], folds) if g != f]
                 )
-                ridge = np.eye(S.shape[1]) * 0.2
                 w = np.linalg.solve(S[train].T @ S[train] + ridge, S[train].T @ y[train])
                 for a, b, g in zip(edges[:-1], edges[1:], folds):
                     if g == f:
                         gain.append(
-                            np.log(max((y[a:b] ** 2).mean(), 1e-9))
-                            - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).mean(), 1e-9))
+                            np.log(max((y[a:b] ** 2).sum(), 1e-9))
+                            - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).sum(), 1e-9))
                         )
-            w = np.linalg.solve(S.T @ S + 0.2 * np.eye(S.shape[1]), S.T @ y)
+            w = np.linalg.solve(S.T @ S + ridge, S.T @ y)
             start = {**effect.default(), **shape}
-            for (name, size), share in zip(_sizes(effect), w):
+            for (name, size), share in zip(sizes(effect), w):
                 p = effect.params[name]
                 start[name] = float(
                     np.clip(
@@ -104,7 +113,7 @@ def isolability(
 ) -> dict:
     """M[i, j]: share of effect i's signature that effect j cannot mimic, on these trajectories; nats that i
     makes at a realistic size."""
-    base = current.residuals(comparison)
+    base = current.vectors(comparison)
     q = nuisance_space(comparison, current, base, chosen)
     ids, spaces, size = [], [], []
     for effect in usable:
@@ -112,7 +121,7 @@ def isolability(
         S = columns(comparison, current, effect, shape, base, chosen)
         S = S - q @ (q.T @ S)
         norms = np.linalg.norm(S, axis=0)
-        size.append(0.5 * float(norms.max() ** 2) / comparison.width / len(chosen))
+        size.append(0.5 * float(norms.max() ** 2) / len(chosen))
         ids.append(effect.id)
         spaces.append(S)
     n = len(ids)

@@ -16,9 +16,11 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
+from ...effects.in_skin import modulus_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...fields import check_types
 from ...files import write_npz
+from ...geometry.skins import load_skin
 from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
@@ -32,7 +34,10 @@ __all__ = ["Fields", "Simulator", "placed"]
 
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
-_RADIUS, _FRICTION, _BUBBLE = 0.05, 0.2, 8e-9
+_DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
+_FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
+_RADIUS, _BUBBLE = 0.15, 8e-9
+_UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
 
@@ -79,6 +84,13 @@ class Simulator:
         other = copy.copy(self)
         other.effects = [*self.effects, *effects]
         other.modulus = self.modulus if modulus is None else modulus
+        return other
+
+    def _but(self, **changes):
+        """A copy with other fields, its skin not made yet."""
+        other = copy.copy(self)
+        other.__dict__.pop("_models", None)
+        other.__dict__.update(changes)
         return other
 
     # --- the skin  ---
@@ -172,7 +184,6 @@ class Simulator:
                 progress()
 
     def _model(self, log_friction, bubble):
-        from ...geometry.skins import load_skin
         from ...sensor.film import FilmConduction
         from ...skin.model import SkinModel
 
@@ -202,18 +213,18 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 8 solutions of the data set, kept in
-        `cache`."""
+        """The skin along the trajectories and its differences: 14 solutions of the data set, three of them by
+        finite elements, kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
         with tqdm.tqdm(
-            total=(7 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+            total=(13 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
         ) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
             slopes = {}
             if self.skin in OTHER_MESH:
                 here, there = (
-                    dataclasses.replace(self, skin=skin, tier="condensed").solve(trajectories)
+                    self._but(skin=skin, tier="condensed").solve(trajectories)
                     for skin in (self.skin, OTHER_MESH[self.skin])
                 )
                 slopes["mesh"] = [
@@ -229,19 +240,51 @@ class Simulator:
                     progress=tick,
                 )
                 slopes["xyz"[axis]] = _difference(moved, base, _SHIFT)
+            slopes |= self._bending(trajectories, base, slopes, tick)
             if spheres:
                 slopes["radius"] = _difference(
                     self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
                     base,
                     _RADIUS,
                 )
-            slopes["friction"] = _difference(
-                self.solve(trajectories, log_friction=_FRICTION, progress=tick), base, _FRICTION
-            )
+            slopes |= self._uneven(trajectories, tick)
+            less, more = (self.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
+            slopes["friction"], slopes["friction2"] = _parabola(less, base, more, *_FRICTION)
             slopes["bubble"] = _difference(
                 self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
             )
         return Fields(base, slopes, trajectories)
+
+    def _bending(self, trajectories, base, slopes, tick):
+        """What linear differences miss along the press: "press" per m, "bend" per m^2."""
+        deeper, shallower = (
+            self.solve(
+                trajectories,
+                offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
+                progress=tick,
+            )
+            for by in (_DEEPER, -_DEEPER)
+        )
+        press, bend = _parabola(shallower, base, deeper, -_DEEPER, _DEEPER)
+        for i, t in enumerate(trajectories):  # beyond what differences in x, y and z already say of it
+            for k, slope in press[i].items():
+                press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
+        return {"press": press, "bend": bend}
+
+    def _uneven(self, trajectories, tick):
+        """Differences by a modulus that varies along and across the finger, which only elements can have."""
+        given = read_settings(self.material, self.options).modulus
+        geometry = load_skin(self.skin)
+        at = geometry.vert[geometry.elem[:, :4]].mean(1)
+        factors = {"": np.ones(len(at))} | {
+            way: modulus_of({"along": 0.0, "across": 0.0, way: _UNEVEN})(at) for way in _MAPS
+        }
+        solved = {}
+        for way, factor in factors.items():
+            own = 1.0 if given is None else np.asarray(given(at) if callable(given) else given)
+            other = self._but(tier="full", options=self.options | {"modulus": own * factor})
+            solved[way] = other.solve(trajectories, progress=tick)
+        return {way: _difference(solved[way], solved[""], _UNEVEN) for way in _MAPS}
 
     # --- all stages  ---
 
@@ -275,10 +318,13 @@ class Simulator:
         for i, t in enumerate(trajectories):
             run = _begin(i, t, base[i], session, first)
             run.scale_load(modulus)
+            run.modulus = modulus
             run.stiffness = modulus * _stiffness(
                 base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t
             )
             run.log_friction = nuisance.log_friction
+            if fields is not None:
+                run.answers = {way: fields.slopes[way][i] for way in _MAPS if way in fields.slopes}
             if offsets is not None:
                 run.offset = run.offset + offsets[i]
             for effect, theta in before:
@@ -341,11 +387,14 @@ class Simulator:
                 ("y", run.offset[:, 1]),
                 ("z", run.offset[:, 2]),
                 ("radius", run.log_radius),
+                ("press", run.offset @ run.heading),
+                ("bend", (run.offset @ run.heading) ** 2),
                 ("friction", run.log_friction),
+                ("friction2", run.log_friction**2),
                 ("bubble", run.bubble),
             ]
             for name, amount in parts:
-                if name in fields.slopes and np.any(amount):
+                if name in fields.slopes and (amount.any() if np.ndim(amount) else amount):
                     for k in change:
                         slope = fields.slopes[name][i][k]
                         change[k] = change[k] + (
@@ -369,7 +418,8 @@ class Simulator:
 @dataclasses.dataclass
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
-    (radius, friction), per m3; "mesh": of another mesh, about rest."""
+    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
+    and "bend" per m^2, along the heading beyond those; "mesh": of another mesh, about rest."""
 
     base: list
     slopes: dict
@@ -436,6 +486,13 @@ def _impedance(film, vert_xpos):
 
 def _difference(moved, base, by):
     return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+
+
+def _parabola(before, base, after, low, high):
+    """Slopes and curvatures of solutions at low, 0 and high."""
+    first, second = _difference(before, base, low), _difference(after, base, high)
+    bend = [{k: (b[k] - a[k]) / (high - low) for k in a} for a, b in zip(first, second)]
+    return [{k: a[k] - low * c[k] for k in a} for a, c in zip(first, bend)], bend
 
 
 def _sphere_radius(tool):

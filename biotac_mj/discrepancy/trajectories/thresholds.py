@@ -24,9 +24,11 @@ THRESHOLDS = {
     # standard errors over trajectories by which a name has to lead, else the other is named with it
     "tie": 1.64,
     "alike": 0.97,  # share of its evidence beyond which the other is named with it too
+    "kin": 0.8,  # the same where the other is another law for what looks alike
     "simpler": 0.75,  # standard errors within which the one with fewer parameters comes first
     "most": 3,  # effects
-    "refit": 6,  # effects that are refitted after the screen
+    "refit": 6,  # effects that are refitted after the screen, at most,
+    "screened": 0.25,  # if they reach this share of what is asked of them there
 }
 # Logistic of a confidence; terms: 1, log1p(nats), share of the excess closed, log of what is left, lead over
 # the runner-up [z], tied.

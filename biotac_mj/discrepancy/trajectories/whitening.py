@@ -20,9 +20,13 @@ _RESOLUTION = 0.01
 class Comparison:
     """Data against a simulator: trajectories, noise, fields.
 
-    Whitening marginalises the pose error b_i of every trial: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the
-    fields' differences (Woodbury, rank 3). Electrodes are compared about their rest: the mean over all
-    trajectories of row 0.
+    The pose error b_i of every trial is marginalised: C_i = diag(sigma^2) + J_i S_b J_i', with J_i the
+    fields' differences (Woodbury, rank 3). What lies in the span of J_i is kept apart from the rest of the
+    residual: three numbers of unit variance, each of which weighs as much as a row. So the scatter of poses
+    is nobody's finding, and an offset that all trials share is evidence. Electrodes are compared about their
+    rest: the mean over all trajectories of row 0.
+
+    modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     """
 
     sim: Simulator
@@ -30,6 +34,7 @@ class Comparison:
     fields: Fields
     noise: dict
     repeatability: float = REPEATABILITY
+    modulus: float = 1.0
 
     def __post_init__(self):
         free = np.array([t.electrodes[0] for t in self.trajectories])
@@ -70,8 +75,8 @@ class Comparison:
         )
 
     def _prepare(self):
-        """Whitened pose columns of every trajectory (orthonormal) and how much each is shrunk."""
-        self._basis = []
+        """Of every trajectory an orthonormal basis u of its whitened pose columns, u s v' = J."""
+        self._basis, scale = [], self.modulus * self.sim.modulus
         for i in range(len(self.trajectories)):
             base = self.fields.base[i]
             z = np.exp(base["log_z"]) / 1e4
@@ -80,12 +85,30 @@ class Comparison:
             for axis in "xyz":
                 slope = self.fields.slopes[axis][i]
                 columns.append(
-                    self._stack(counts_per_log * slope["log_z"], slope["pressure"] / 36.5, slope["force"])
+                    self._stack(
+                        counts_per_log * slope["log_z"],
+                        scale * slope["pressure"] / 36.5,
+                        scale * slope["force"],
+                    )
                     / self.sigma
                 )
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
-            u, s, _ = np.linalg.svd(J, full_matrices=False)
-            self._basis.append((u, 1 - 1 / np.sqrt(1 + s**2)))
+            self._basis.append(np.linalg.svd(J, full_matrices=False))
+
+    def calibrated(self, nuisance: Nuisance, chosen: np.ndarray) -> "Comparison":
+        """The same about a base model that was fitted to the chosen trajectories: its modulus, and the
+        scatter of their poses where it is larger than stated."""
+        new = dataclasses.replace(self, modulus=nuisance.modulus)
+        poses = new.poses([], nuisance)[chosen]
+        scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
+        return new if scatter < self.repeatability else dataclasses.replace(new, repeatability=float(scatter))
+
+    def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
+        """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
+        out = []
+        for (u, s, v), r in zip(self._basis, self._scaled(effects, nuisance)):
+            out.append(self.repeatability * v.T @ (s / (1 + s**2) * (u.T @ r.ravel())))
+        return np.array(out)
 
     def predict(self, runs: list) -> list:
         """Per trajectory (n, width) about rest."""
@@ -96,17 +119,30 @@ class Comparison:
     def whiten(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) with unit covariance under noise, resolution and repeatability."""
         r = (residual / self.sigma).ravel()
-        u, shrink = self._basis[i]
-        return (r - u @ (shrink * (u.T @ r))).reshape(residual.shape)
+        u, s, _ = self._basis[i]
+        return (r - u @ ((1 - 1 / np.sqrt(1 + s**2)) * (u.T @ r))).reshape(residual.shape)
 
-    def residuals(self, effects: list | None, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
-        """Whitened residuals of every trajectory."""
-        runs = self.sim.run(
-            self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance
-        )
-        return [self.whiten(i, m - p) for i, (m, p) in enumerate(zip(self.measured, self.predict(runs)))]
+    def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
+        """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
+        and the pose's error in units of its repeatability."""
+        r = (residual / self.sigma).ravel()
+        u, s, _ = self._basis[i]
+        along = u.T @ r
+        apart = np.concatenate([(r - u @ along) / np.sqrt(self.width), along / np.sqrt(1 + s**2)])
+        return apart / np.sqrt(len(residual))
 
-    def raw(self, effects: list | None, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
+    def _scaled(self, effects, nuisance):
+        return [r / self.sigma for r in self.raw(effects, nuisance)]
+
+    def residuals(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
+        """Whitened residuals (n, width) of every trajectory."""
+        return [self.whiten(i, r) for i, r in enumerate(self.raw(effects, nuisance, exact))]
+
+    def vectors(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
+        """`vector` of every trajectory."""
+        return [self.vector(i, r) for i, r in enumerate(self.raw(effects, nuisance, exact))]
+
+    def raw(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
         """Residuals (n, width) in counts, counts and newtons."""
         runs = self.sim.run(
             self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance

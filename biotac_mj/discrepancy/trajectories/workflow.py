@@ -10,7 +10,7 @@ import tqdm
 
 from ...effects.catalogue import CATALOGUE
 from .composition import compose
-from .fitting import Fit, fit_effects, mean_square
+from .fitting import Fit, fit_effects
 from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
 from .simulator import Simulator
@@ -107,8 +107,10 @@ def diagnose(
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")
         else:
-            usable.append(effect)
+            usable.append(effect.among([data[i] for i in chosen]))
     with tqdm.tqdm(total=2 + THRESHOLDS["most"], desc="diagnose", disable=not progress, leave=False) as bar:
+        # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
+        comparison = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance, chosen)
         null = fit_effects(comparison, [], chosen)
         bar.update()
         current, found, rounds = compose(comparison, null, usable, chosen, seed, bar.update)
@@ -117,12 +119,13 @@ def diagnose(
     return report
 
 
-def _levels(comparison, residuals, chosen) -> dict:
+def _levels(comparison, fit, chosen) -> dict:
     """level: mean square of a trajectory, peak: of the worst channel, both geometric means over
     trajectories."""
+    residuals = fit.residuals(comparison)
     square = np.array([(residuals[i] ** 2).mean(0) for i in chosen])
     return {
-        "level": float(np.exp(np.log(np.maximum(square.mean(1), 0.05)).mean())),
+        "level": float(np.exp(np.log(np.maximum(fit.mean_square(comparison)[chosen], 0.05)).mean())),
         "peak": float(np.exp(np.log(np.maximum(square, 0.05)).mean(0).max())),
     }
 
@@ -131,16 +134,16 @@ def _wrong(levels) -> bool:
     return levels["level"] > THRESHOLDS["significant"] or levels["peak"] > THRESHOLDS["peak"]
 
 
-def _excess(residuals, rows) -> float:
-    """Mean log mean square above that of noise."""
-    return float(np.mean(np.log(np.maximum(mean_square(residuals)[rows], 1.0))))
+def _excess(square) -> float:
+    """Mean log of mean squares (trajectories,) above that of noise."""
+    return float(np.mean(np.log(np.maximum(square, 1.0))))
 
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable):
-    residual, base = current.residuals(comparison), null.residuals(comparison)
-    before, after = _levels(comparison, base, chosen), _levels(comparison, residual, chosen)
-    inside = 1 - _excess(residual, chosen) / max(_excess(base, chosen), 1e-9)
-    left = _excess(residual, chosen)
+    square = [fit.mean_square(comparison)[chosen] for fit in (null, current)]
+    before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
+    left = _excess(square[1])
+    inside = 1 - left / max(_excess(square[0]), left, 1e-9)
     effects = [
         _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)))
         for item in found
@@ -169,9 +172,9 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
             )
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
     gap_before, gap_after = _gap(comparison, null, aside), _gap(comparison, current, aside)
-    outside = [np.log(np.maximum(g["mean_square"], 1.0)).mean() for g in (gap_before, gap_after)]
+    outside = [_excess(g["mean_square"]) for g in (gap_before, gap_after)]
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if found or _wrong(before) else float("nan")
-    notes = notes + _base(comparison, current.nuisance)
+    notes = notes + _base(comparison, current, chosen)
     table = isolability(comparison, current, usable, effects, chosen)
     trace = {
         "before": before,
@@ -179,7 +182,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "inside": inside,
         "left": left,
         "rounds": [[c.record() for c in step] for step in rounds],
-        "mean_square": [mean_square(r)[chosen].tolist() for r in (base, residual)],
+        "mean_square": [s.tolist() for s in square],
         "closed": closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
@@ -237,16 +240,32 @@ def _describe(item, current, certain) -> dict:
 
 def _gap(comparison, fit, rows):
     residual = fit.raw(comparison, exact=rows)
-    out = {"mean_square": [float((comparison.whiten(i, residual[i]) ** 2).mean()) for i in rows]}
+    out = {"mean_square": [float(np.sum(comparison.vector(i, residual[i]) ** 2)) for i in rows]}
     for name, part in comparison.groups.items():
         out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
     out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
     return out
 
 
-def _base(comparison, nuisance) -> list:
-    """What the fitted nuisance says of the base model; it takes no effect's name."""
-    notes = []
+def _base(comparison, fit, chosen) -> list:
+    """What the fitted nuisance says of the base model and of the poses; it takes no effect's name."""
+    nuisance, notes = fit.nuisance, []
+    if abs(nuisance.log_modulus) > 0.2:
+        notes.append(
+            f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
+        )
+    poses = comparison.poses(fit.effects, nuisance)[chosen]
+    mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
+    if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
+        notes.append(
+            f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
+            "effect found takes up: check the set-up, or the base model"
+        )
+    if comparison.repeatability > 2 * REPEATABILITY:
+        notes.append(
+            f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial: so much is "
+            "taken for granted, and smaller effects of the set-up stay unseen"
+        )
     if abs(nuisance.footprint) > 0.02:
         notes.append(
             f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
