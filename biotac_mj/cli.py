@@ -61,6 +61,7 @@ def parser() -> argparse.ArgumentParser:
     _add_generate(verbs)
     _add_data(verbs)
     _add_recordings(verbs)
+    _add_resimulation(verbs)
     _add_learning(verbs)
     return top
 
@@ -725,6 +726,12 @@ def _add_recordings(verbs):
     from .recordings.verbs import add_verbs
 
     add_verbs(verbs, _verb)
+
+
+def _add_resimulation(verbs):
+    from .resimulation.verbs import add_verb
+
+    add_verb(verbs, _verb)
 
 
 def _import_data(args):

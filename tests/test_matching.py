@@ -49,6 +49,7 @@ def response():
         force,
         load + 0 * along,
         force[..., -1, 2],
+        load + 0 * along,
     )
     return Response(states, np.broadcast_to(log_z, (*shape, 19)).copy())
 
