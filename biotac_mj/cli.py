@@ -718,6 +718,12 @@ def _add_data(verbs):
         action="store_true",
         help="measured counts, of interactions that have them, not simulated ones",
     )
+    verb.add_argument(
+        "--rate",
+        type=real(0.1, 1e4),
+        metavar="HZ",
+        help="of frames, which hold the nearest rows (default: the set's)",
+    )
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 

@@ -187,7 +187,7 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         <geom name="ball" type="sphere" size="0.0035"/></body>
         </worldbody></mujoco>"""
     )
-    sensor = biotac_mj.SensorBioTac(signal="latent_projection", weights=str(weights), noise=False)
+    sensor = biotac_mj.SensorBioTac(signal="learned", weights=str(weights), noise=False)
     handle = biotac_mj.attach(
         spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings()
     )
@@ -215,6 +215,16 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         biotac_mj.SensorBioTac(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
         biotac_mj.SensorBioTac(weights="a")
+    with pytest.warns(FutureWarning, match="is called 'learned'"):
+        assert biotac_mj.SensorBioTac(signal="latent_projection").signal == "learned"
+
+
+def test_attach_takes_the_file_of_a_model(weights):
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", signal=str(weights))
+    assert handle.config.readings == "learned" and handle.config.options["readings"]["weights"] == str(
+        weights
+    )
 
 
 def test_a_window_remembers_in_the_state_and_settles(tmp_path):

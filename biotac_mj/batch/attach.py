@@ -14,7 +14,7 @@ from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _colli
 from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
-from ..coupling.sensor_biotac import SIGNALS
+from ..coupling.sensor_biotac import read_signal
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..effects.amended import Model, amend
@@ -455,9 +455,7 @@ def _senses(choice, felt, geometry, seed, skin, touching, mjm):
                 _resolve_geom(mjm, name)
                 check_choices(value, read)
     rows, redraw = draws(nworld, seed, settings, thermal, textures, touching.geoms)
-    signal, weights = settings.pop("signal", "physics"), settings.pop("weights", None)
-    if signal not in SIGNALS:
-        raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
+    signal, weights = read_signal(settings.pop("signal", "physics"), settings.pop("weights", None))
     if signal != "physics":
         from ..learning.serve import LearnedBatchFilm
 

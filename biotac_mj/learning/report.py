@@ -12,7 +12,7 @@ from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import NELECTRODE, electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 
-__all__ = ["PAPER", "evaluate_models", "table"]
+__all__ = ["PAPER", "evaluate_models", "predictions_of", "report_of", "table"]
 
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
 PAPER = {
@@ -37,7 +37,7 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
       ValueError: seeds that were trained on different sets.
     """
     folder = pathlib.Path(folder)
-    reports = [_report(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
+    reports = [report_of(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
     if not reports:
         raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
@@ -88,7 +88,7 @@ _PREDICTIONS = {
 }
 
 
-def _report(path):
+def report_of(path: pathlib.Path) -> dict:
     """What `biotac train` says of one split and seed."""
     report = check_entries(str(path), read_json(path, "result of `biotac train`", _AGAIN), _REPORT)
     for code, found in report["mesh"].items():
@@ -101,7 +101,7 @@ def _report(path):
     return report
 
 
-def _predictions(path):
+def predictions_of(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Its predictions, each (n, 19)."""
     what = "file of predictions"
     found = read_npz(path, what, _AGAIN)
@@ -179,7 +179,7 @@ def _split(folder, split, reports):
     errors, pooled, seconds = {}, {}, {}
     coverage, intervals, noise, example = {}, {}, [], None
     for report in reports:
-        data = _predictions(folder / f"{split}-{report['seed']}.npz")
+        data = predictions_of(folder / f"{split}-{report['seed']}.npz")
         test = data["test"].astype(bool)
         truth, owner = data["truth"][test].astype(float), data["owner"][test]
         raw = truth + data["tare"][test]

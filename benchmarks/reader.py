@@ -1,0 +1,143 @@
+"""Intervals and novelty of a model that reads electrodes, on synthetic sets that are made here.
+
+python benchmarks/reader.py --out DIR --json OUT
+
+An ordinary set is divided by whole touches, several times; the model is fitted, its intervals are sized on
+touches kept aside, and unseen touches say how many rows they cover. What training did not have is told from
+those unseen touches by the median novelty of a touch: a skin with more liquid, two balls at once, an
+electrode that stays at rest or reads nothing. Everything is simulated."""
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import sys
+
+import numpy as np
+import trimesh
+
+from biotac_mj.data import Interaction, shard_path, write_shard
+from biotac_mj.data.generate import GenerateOptions, generate
+from biotac_mj.data.plan import plan_motions
+from biotac_mj.data.readings import read_motion
+from biotac_mj.data.simulate import simulate
+from biotac_mj.data.splits import assign
+from biotac_mj.geometry import load_skin
+from biotac_mj.learning.examples import Examples, from_set
+from biotac_mj.learning.reader import Reader, fit_reader
+from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin import SkinModel
+from biotac_mj.skin.settings import read_material
+
+OBJECTS = ("sphere_7mm", "cube_14mm", "cylinder_long_7mm", "table_edge")
+STEPS, RATE = 12, 20.0
+FILL = 5e-8  # [m3] more liquid than at rest
+BALL, APART = 2e-3, 8e-3  # [m] radius of two balls and how far apart their middles are
+SHARES = (0.6, 0.2, 0.2)  # of the touches: train, size the intervals, unseen
+
+
+def ordinary(folder: pathlib.Path, count: int, **more: object) -> Examples:
+    """A generated set, made where it is not there; more: of GenerateOptions."""
+    settings = dict(labelled=0, steps=STEPS, rate=RATE, skin="coarse", objects=OBJECTS, batch=8) | more
+    generate(folder, GenerateOptions(count=count, **settings), progress=True)
+    return from_set(folder)
+
+
+def two_contacts(folder: pathlib.Path, count: int) -> Examples:
+    """Touches of two balls at once, made where they are not there."""
+    path = shard_path(folder, 0)
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        balls = [trimesh.creation.icosphere(subdivisions=3, radius=BALL) for _ in range(2)]
+        for ball, side in zip(balls, (-0.5, 0.5)):
+            ball.apply_translation([side * APART, -BALL, 0])
+        trimesh.util.concatenate(balls).export(folder / "two_balls.obj")
+        name = f"mesh:{folder / 'two_balls.obj'}"
+        model = SkinModel(load_skin("coarse"), read_material("default"))
+        motions = plan_motions(model.geometry, name, [[7, k] for k in range(count)], STEPS)
+        time = np.arange(STEPS) / RATE
+        fields, film, ones = simulate(model, name, motions, time=time), FilmConduction(model.geometry), []
+        for k, motion in enumerate(motions):
+            vert = fields.vert_xpos(model.geometry.vert, k)
+            read = read_motion(film, vert, time, fields.pressure[k], k)
+            columns = {
+                "displacement": vert - model.geometry.vert,
+                "contact_force": fields.contact_force[k],
+                "wrench": fields.wrench[k],
+                "counts": read.counts,
+                "converged": fields.converged[k],
+            }
+            ones.append(Interaction(f"two-{k}", "two_balls", motion.kind, "test", k, {}, time, **columns))
+        write_shard(path, ones, model.geometry)
+    return from_set(folder)
+
+
+def dead(data: Examples, reads: str, seed: int = 0) -> Examples:
+    """The same with one electrode of each touch, drawn, that stays at its rest or reads nothing."""
+    rng = np.random.default_rng(seed)
+    which = rng.integers(19, size=data.owner.max() + 1)[data.owner]
+    counts, rows = data.counts.copy(), np.arange(len(data.owner))
+    counts[rows, which] = data.tare[rows, which] if reads == "rest" else 0
+    return dataclasses.replace(data, counts=counts)
+
+
+def strangeness(reader: Reader, data: Examples, touches: np.ndarray | None = None) -> np.ndarray:
+    """Median novelty of each touch (k,)."""
+    novelty = reader.predict(data.counts, data.tare).novelty
+    every = np.unique(data.owner) if touches is None else touches
+    return np.array([np.median(novelty[data.owner == k]) for k in every])
+
+
+def area(usual: np.ndarray, strange: np.ndarray) -> float:
+    """Share of pairs in which the strange one has the higher score."""
+    more = (strange[:, None] > usual).mean() + 0.5 * (strange[:, None] == usual).mean()
+    return float(more)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
+    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
+    parser.add_argument("--count", type=int, default=160, help="ordinary touches; an eighth of others")
+    parser.add_argument("--seeds", type=int, default=10, help="divisions")
+    given = parser.parse_args(argv)
+    data = ordinary(given.out / "ordinary", given.count)
+    few = max(8, given.count // 8)
+    filled = ordinary(given.out / "filled", few, seed=1, options={"skin": {"fill_volume": FILL}})
+    two = two_contacts(given.out / "two", few)
+    covered, areas, errors = {}, {}, {}
+    names = np.unique(data.owner)
+    for seed in range(given.seeds):
+        part = assign(len(names), seed, SHARES)
+        train, kept, test = (names[part == k] for k in ("train", "validation", "test"))
+        reader = fit_reader(data, train, kept, seed=seed)
+        rows = np.isin(data.owner, test)
+        found = reader.predict(data.counts[rows], data.tare[rows])
+        truth = data.targets | {"electrodes": data.counts}
+        for name, value in found.value.items():
+            error = np.abs(value - truth[name][rows])
+            there = np.isfinite(error).all(1)
+            covered.setdefault(name, []).append(float((error <= found.half[name])[there].mean()))
+            errors.setdefault(name, []).append(float(np.sqrt((error[there] ** 2).mean())))
+        unseen = dataclasses.replace(data, **{k: getattr(data, k)[rows] for k in ("counts", "tare", "owner")})
+        usual = strangeness(reader, unseen)
+        cases = {"more liquid": filled, "two contacts": two}
+        cases |= {f"an electrode reads {what}": dead(unseen, what, seed) for what in ("rest", "nothing")}
+        for name, case in cases.items():
+            areas.setdefault(name, []).append(area(usual, strangeness(reader, case)))
+    out = {
+        "touches": len(names),
+        "divisions": given.seeds,
+        "covered_by_90": {k: [float(np.mean(v)), float(np.std(v))] for k, v in covered.items()},
+        "rmse": {k: float(np.mean(v)) for k, v in errors.items()},
+        "novelty_area": {k: [float(np.mean(v)), float(np.min(v))] for k, v in areas.items()},
+    }
+    given.json.write_text(json.dumps(out, indent=1))
+    print(json.dumps(out, indent=1))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"reader: {error}")
