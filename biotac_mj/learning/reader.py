@@ -157,7 +157,7 @@ def fit_reader(
     Raises:
       ValueError: too few trajectories.
     """
-    least = int(np.ceil(level / (1 - level)))
+    least = int(np.ceil(level / (1 - level) - 1e-9))
     if len(kept) < least or len(train) < _FOLDS:
         raise ValueError(
             f"{len(train)} trajectories train and {len(kept)} are kept aside: intervals of "
