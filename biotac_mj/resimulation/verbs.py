@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from ..arguments import SEED, device, output_folder, real, whole
+from ..arguments import SEED, check_device, device, output_folder, real, whole
 from ..recordings.verbs import add_load_arguments
 
 __all__ = ["add_verb"]
@@ -61,6 +61,7 @@ def _resimulate(args):
     from ..recordings import load_one
     from .resimulate import ResimulateOptions, resimulate
 
+    check_device(args.device)
     recording, notes = load_one(
         args.recording, args.sensor, force=args.force, rate=args.rate, scale=args.scale
     )
