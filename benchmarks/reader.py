@@ -98,11 +98,11 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
-    parser.add_argument("--count", type=int, default=160, help="ordinary touches; an eighth of others")
+    parser.add_argument("--count", type=int, default=160, help="ordinary touches; a quarter of others")
     parser.add_argument("--seeds", type=int, default=10, help="divisions")
     given = parser.parse_args(argv)
     data = ordinary(given.out / "ordinary", given.count)
-    few = max(8, given.count // 8)
+    few = max(8, given.count // 4)
     filled = ordinary(given.out / "filled", few, seed=1, options={"skin": {"fill_volume": FILL}})
     two = two_contacts(given.out / "two", few)
     covered, areas, errors = {}, {}, {}

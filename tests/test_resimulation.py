@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from made_up_plate import made_up_states
 
 from biotac_mj import cli
 from biotac_mj.data import TactileSet
@@ -14,12 +15,17 @@ from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.data.simulate import simulate
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix, quaternion
+from biotac_mj.matching.match import SIGNS
+from biotac_mj.matching.response import Response
+from biotac_mj.matching.states import frame
 from biotac_mj.recordings import Recording, write
+from biotac_mj.resimulation import fitted
 from biotac_mj.resimulation.fitted import plate_way
 from biotac_mj.resimulation.resimulate import ResimulateOptions, resimulate
 from biotac_mj.resimulation.touch import biotac_poses
+from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import Material, SkinModel
+from biotac_mj.skin import Material, SkinModel, SkinOptions
 
 STEPS, REST = 12, 6
 MOUNT = (0.01, -0.02, 0.03, *np.array([1.0, 0.3, -0.2, 0.1]) / np.linalg.norm([1.0, 0.3, -0.2, 0.1]))
@@ -119,6 +125,44 @@ def test_what_cannot_be_resimulated_is_named(truth, tmp_path):
     refused("is no pose", recording, mount=(1.0, 2.0))
     refused("unknown poses", recording, poses="guessed")
     assert not (tmp_path / "o").exists()
+
+
+def test_a_hand_pressed_plate_is_found_from_force_and_electrodes(monkeypatch):
+    """A made-up sensor whose table is known: poses, rest and force of what its recording was made of."""
+    states, log_z = made_up_states()
+    monkeypatch.setattr(fitted, "plate_states", lambda *args, **kwargs: states)
+    monkeypatch.setattr(fitted, "log_changes", lambda *args: log_z)
+    n, modulus = 1200, 1e6
+    time = np.arange(n) / 100
+    state = np.column_stack(
+        [0.25 + 0.2 * np.sin(time), 0.4 * np.sin(0.7 * time), 0.5 * np.sin(1.1 * time), 0 * time]
+    )
+    pressing = 3 + 2 * np.sin(2 * time)
+    pressing[500:600] = 0.0  # two presses
+    value, _ = Response(states, log_z).at_load(pressing / modulus)(state, False)
+    rest = log_impedance(REST_COUNTS["2"])
+    force = np.column_stack([value[:, 19:] * modulus, pressing]) @ np.linalg.inv(SIGNS)
+    counts = np.rint(counts_from_log_impedance(rest + value[:, :19]))
+    one = Recording(time, electrodes=counts, force=force, name="synthetic", source="synthetic")
+    geometry = load_skin("coarse")
+    found, material, notes = fitted.fitted_touches(
+        one, geometry, Material(), SkinOptions(), rate=50.0, block=4.0, progress=False
+    )
+    assert len(found) == 4 and any("nobody measured either" in note for note in notes)
+    assert material.youngs_modulus == pytest.approx(modulus, rel=0.1)
+    outer = geometry.vert[np.unique(geometry.outer_face)]
+    for touch in found:
+        first, last = touch.motion.parameters["rows"]
+        rows = np.searchsorted(one.time, touch.time[1:] - 1e-9)
+        assert rows[0] == first and rows[-1] == last and touch.time[-1] - touch.time[0] < 4.1
+        assert np.abs(touch.counts[0, :19] - counts_from_log_impedance(rest)).max() < 60
+        inwards = touch.motion.mat[1:, :, 1]
+        wanted = np.array([frame(*angles)[2] for angles in state[rows, :2]])
+        assert np.median(np.degrees(np.arccos(np.clip((inwards * wanted).sum(1), -1, 1)))) < 3
+        np.testing.assert_allclose(-(touch.wrench[1:, :3] * inwards).sum(1), pressing[rows], atol=1e-3)
+        # how deep the plate is, is what the table has for that force (here as much as the load itself)
+        sunk = (touch.motion.pos[1:] * inwards).sum(1) - (inwards @ outer.T).min(1)
+        np.testing.assert_allclose(sunk, pressing[rows] / material.youngs_modulus, rtol=0.05, atol=1e-7)
 
 
 def test_a_plate_rolls_without_sliding():
