@@ -17,34 +17,36 @@ import numpy as np
 import trimesh
 
 from biotac_mj.data import Interaction, shard_path, write_shard
+from biotac_mj.data.clearance import Placed, first_touch, surface_samples
 from biotac_mj.data.generate import GenerateOptions, generate
-from biotac_mj.data.plan import plan_motions
+from biotac_mj.data.plan import Motion
 from biotac_mj.data.readings import read_motion
-from biotac_mj.data.simulate import simulate
+from biotac_mj.data.simulate import simulate, simulate_condensed
 from biotac_mj.data.splits import assign
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.rigid import rotation
 from biotac_mj.learning.examples import Examples, from_set
 from biotac_mj.learning.reader import Reader, fit_reader
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import SkinModel
 from biotac_mj.skin.settings import read_material
 
-OBJECTS = ("sphere_7mm", "cube_14mm", "cylinder_long_7mm", "table_edge")
-STEPS, RATE = 12, 20.0
-FILL = 5e-8  # [m3] more liquid than at rest
-BALL, APART = 2e-3, 8e-3  # [m] radius of two balls and how far apart their middles are
+OBJECTS = ("sphere_3-5mm", "sphere_7mm", "sphere_14mm", "cube_14mm")
+STEPS, RATE = 8, 20.0
+FILL = 2e-7  # [m3] more liquid than at rest
+BALL, APART = 3.5e-3, 9e-3  # [m] radius of two balls and how far apart their middles are, along the finger
 SHARES = (0.6, 0.2, 0.2)  # of the touches: train, size the intervals, unseen
 
 
-def ordinary(folder: pathlib.Path, count: int, **more: object) -> Examples:
+def ordinary(folder: pathlib.Path, count: int, tier: str, **more: object) -> Examples:
     """A generated set, made where it is not there; more: of GenerateOptions."""
-    settings = dict(labelled=0, steps=STEPS, rate=RATE, skin="coarse", objects=OBJECTS, batch=8) | more
-    generate(folder, GenerateOptions(count=count, **settings), progress=True)
+    settings = dict(labelled=0, steps=STEPS, rate=RATE, skin="coarse", objects=OBJECTS, batch=50) | more
+    generate(folder, GenerateOptions(count=count, tier=tier, **settings), workers=0)
     return from_set(folder)
 
 
-def two_contacts(folder: pathlib.Path, count: int) -> Examples:
-    """Touches of two balls at once, made where they are not there."""
+def two_contacts(folder: pathlib.Path, count: int, tier: str) -> Examples:
+    """Touches of two balls at once on the straight part of the pad, made where they are not there."""
     path = shard_path(folder, 0)
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,16 +55,28 @@ def two_contacts(folder: pathlib.Path, count: int) -> Examples:
             ball.apply_translation([side * APART, -BALL, 0])
         trimesh.util.concatenate(balls).export(folder / "two_balls.obj")
         name = f"mesh:{folder / 'two_balls.obj'}"
-        model = SkinModel(load_skin("coarse"), read_material("default"))
-        motions = plan_motions(model.geometry, name, [[7, k] for k in range(count)], STEPS)
+        model, rng = SkinModel(load_skin("coarse"), read_material("default")), np.random.default_rng(7)
+        angle, along = rng.uniform(-0.5, 0.5, count), rng.uniform(-9e-3, -4e-3, count)
+        mat = rotation(angle[:, None] * [1.0, 0, 0])
+        ahead = mat[:, :, 1]
+        begin = along[:, None] * [1.0, 0, 0] - 0.05 * ahead
+        points = surface_samples(model.geometry.vert, model.geometry.outer_face, "cpu")
+        met = first_touch(Placed(name, count), points, begin, mat, ahead)
+        depth = rng.uniform(0.6e-3, 1.6e-3, count)[:, None] * np.linspace(0, 1, STEPS) - 5e-6
+        travel = met[:, None] + depth
+        motions = [
+            Motion("press", {}, begin[k] + travel[k][:, None] * ahead[k], np.tile(mat[k], (STEPS, 1, 1)))
+            for k in range(count)
+        ]
         time = np.arange(STEPS) / RATE
-        fields, film, ones = simulate(model, name, motions, time=time), FilmConduction(model.geometry), []
+        walk = simulate if tier == "full" else simulate_condensed
+        fields, film, ones = walk(model, name, motions, time=time), FilmConduction(model.geometry), []
         for k, motion in enumerate(motions):
             vert = fields.vert_xpos(model.geometry.vert, k)
             read = read_motion(film, vert, time, fields.pressure[k], k)
             columns = {
                 "displacement": vert - model.geometry.vert,
-                "contact_force": fields.contact_force[k],
+                "contact_force": None if fields.contact_force is None else fields.contact_force[k],
                 "wrench": fields.wrench[k],
                 "counts": read.counts,
                 "converged": fields.converged[k],
@@ -73,9 +87,13 @@ def two_contacts(folder: pathlib.Path, count: int) -> Examples:
 
 
 def dead(data: Examples, reads: str, seed: int = 0) -> Examples:
-    """The same with one electrode of each touch, drawn, that stays at its rest or reads nothing."""
-    rng = np.random.default_rng(seed)
-    which = rng.integers(19, size=data.owner.max() + 1)[data.owner]
+    """The same with one electrode of each touch that stays at its rest (the one that answered most) or reads
+    nothing (any)."""
+    which = np.random.default_rng(seed).integers(19, size=data.owner.max() + 1)
+    if reads == "rest":
+        for k in np.unique(data.owner):
+            which[k] = np.abs(data.log_change[data.owner == k]).max(0).argmax()
+    which = which[data.owner]
     counts, rows = data.counts.copy(), np.arange(len(data.owner))
     counts[rows, which] = data.tare[rows, which] if reads == "rest" else 0
     return dataclasses.replace(data, counts=counts)
@@ -99,12 +117,14 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
     parser.add_argument("--count", type=int, default=160, help="ordinary touches; a quarter of others")
+    parser.add_argument("--few", type=int, default=48, help="touches of each other kind")
+    parser.add_argument("--tier", default="condensed", help="of the ordinary skin; full knows contact places")
     parser.add_argument("--seeds", type=int, default=10, help="divisions")
     given = parser.parse_args(argv)
-    data = ordinary(given.out / "ordinary", given.count)
-    few = max(8, given.count // 4)
-    filled = ordinary(given.out / "filled", few, seed=1, options={"skin": {"fill_volume": FILL}})
-    two = two_contacts(given.out / "two", few)
+    data = ordinary(given.out / "ordinary", given.count, given.tier)
+    fill = {"skin": {"fill_volume": FILL}}
+    filled = ordinary(given.out / f"filled{FILL:g}", given.few, given.tier, seed=1, options=fill)
+    two = two_contacts(given.out / "two", given.few, given.tier)
     covered, areas, errors = {}, {}, {}
     names = np.unique(data.owner)
     for seed in range(given.seeds):

@@ -203,6 +203,7 @@ def train_split(
         "settings": settings or {},
         "config": dataclasses.asdict(config),
         "set": str(path),
+        "sensor": arrays.sensor,
         "interactions": len(arrays.objects),
         "labelled": int(arrays.labelled.sum()),
         "test_interactions": len(np.unique(arrays.owner[rows].cpu())),
@@ -232,7 +233,7 @@ def train_split(
     if names:
         report["ensemble_of"] = best
     if seed == 0:
-        kept = {"split": split, "seed": seed, "set": "synthetic", "nvert": arrays.geometry.nvert}
+        kept = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
         if names:
             save_forward(
                 out / f"forward-{split}.safetensors",

@@ -42,7 +42,8 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
         raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
         raise ValueError(f"{folder} holds predictions on different sets: give every set its own folder")
-    result = {"schema": "biotac_mj.learning.evaluation/1", "data": "synthetic", "unit": "tared counts",
+    sensor = reports[0].get("sensor", "synthetic")
+    result = {"schema": "biotac_mj.learning.evaluation/1", "data": sensor, "unit": "tared counts",
               "folder": str(folder), "paper": PAPER, "splits": {},
               **{k: reports[0][k] for k in ("set", "interactions", "labelled")}}  # fmt: skip
     drawn = {}
@@ -120,7 +121,7 @@ def table(result: dict) -> str:
         where = kind if kind == split else f"{kind}: {split}"
         seeds = " ".join(map(str, found["seeds"]))
         lines.append(
-            f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; "
+            f"unseen {where}, {result['data']} sensor: {found['interactions']} interactions, seeds {seeds}; "
             "RMS per interaction, counts"
         )
         lines.append(
@@ -287,7 +288,7 @@ def _figures(result, drawn, out):
         axis.invert_yaxis()
         axis.set_xlabel("RMS error per interaction [counts]")
         axis.set_title(
-            f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor"
+            f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, {result['data']} sensor"
         )
         axis.legend(fontsize=7, loc="upper right")
         for k, name in enumerate(names):
@@ -328,7 +329,7 @@ def _traces(result, drawn, splits, path):
         mine = data["owner"] == one
         strong = np.argsort(np.abs(data["truth"][mine]).max(0))[::-1][:2]
         for axis, e in zip(row, strong):
-            axis.plot(data["time"][mine], data["truth"][mine][:, e], "k.-", label="synthetic sensor")
+            axis.plot(data["time"][mine], data["truth"][mine][:, e], "k.-", label=f"{result['data']} sensor")
             for name in shown:
                 axis.plot(data["time"][mine], data[f"predicted_{name}"][mine][:, e], lw=1.2, label=name)
             axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)
