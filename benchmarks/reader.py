@@ -57,10 +57,17 @@ def two_contacts(folder: pathlib.Path, count: int, tier: str) -> Examples:
         name = f"mesh:{folder / 'two_balls.obj'}"
         model, rng = SkinModel(load_skin("coarse"), read_material("default")), np.random.default_rng(7)
         angle, along = rng.uniform(-0.5, 0.5, count), rng.uniform(-9e-3, -4e-3, count)
+        points = surface_samples(model.geometry.vert, model.geometry.outer_face, "cpu")
         mat = rotation(angle[:, None] * [1.0, 0, 0])
+        begin = along[:, None] * [1.0, 0, 0] - 0.05 * mat[:, :, 1]
+        one, side = Placed(f"geom:sphere:{BALL}", count), [APART / 2, 0, 0]
+        later, sooner = (
+            first_touch(one, points, begin + s, mat, mat[:, :, 1]) for s in (side, np.negative(side))
+        )
+        # turned so that both balls meet the skin at once
+        mat = mat @ rotation(np.arctan((later - sooner) / APART)[:, None] * [0, 0, 1.0])
         ahead = mat[:, :, 1]
         begin = along[:, None] * [1.0, 0, 0] - 0.05 * ahead
-        points = surface_samples(model.geometry.vert, model.geometry.outer_face, "cpu")
         met = first_touch(Placed(name, count), points, begin, mat, ahead)
         depth = rng.uniform(0.6e-3, 1.6e-3, count)[:, None] * np.linspace(0, 1, STEPS) - 5e-6
         travel = met[:, None] + depth
@@ -116,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
     parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
-    parser.add_argument("--count", type=int, default=160, help="ordinary touches; a quarter of others")
+    parser.add_argument("--count", type=int, default=600, help="ordinary touches")
     parser.add_argument("--few", type=int, default=48, help="touches of each other kind")
     parser.add_argument("--tier", default="condensed", help="of the ordinary skin; full knows contact places")
     parser.add_argument("--seeds", type=int, default=10, help="divisions")
