@@ -140,7 +140,9 @@ class _Export:
         own = 1 / (step.mean() if even else np.median(step)) if len(step) else wanted
         near = 1e-2 if self.recorded else 1e-3  # a real clock is hardly ever right
         own = int(round(own)) if abs(own - round(own)) < near * own else float(own)
-        return (own, even) if wanted is None else (wanted, even and wanted == own)
+        if wanted is None:
+            return own, even
+        return int(wanted) if wanted == int(wanted) else wanted, even and wanted == own
 
     def write(self, progress):
         pa, rows, episodes, moments = _pyarrow(), [], [], []
