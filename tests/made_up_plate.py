@@ -10,8 +10,8 @@ MIRROR = [10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18]  # E
 
 
 def made_up_states():
-    """PlateStates and log_z of a made-up sensor whose electrodes answer smoothly to where the plate faces, how
-    it is dragged and how hard it presses, in mirror symmetry."""
+    """PlateStates and log_z of a made-up sensor whose electrodes answer smoothly to where the plate faces,
+    how it is dragged and how hard it presses, in mirror symmetry."""
     grid = PlateGrid(
         pitch=tuple(np.linspace(-0.1, 0.6, 6)),
         roll=tuple(np.linspace(0, 0.8, 4)),
