@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from .files import check_output, check_output_file
 
-__all__ = ["SEED", "Parser", "device", "output_file", "output_folder", "real", "whole"]
+__all__ = ["SEED", "Parser", "check_device", "device", "output_file", "output_folder", "real", "whole"]
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,6 +51,16 @@ def device(text: str) -> str:
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?(,cuda:\d{1,3})*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no device: give cpu, or cuda:0")
     return text
+
+
+def check_device(names: str) -> None:
+    """Refuses devices that are not here (ValueError); names: of Warp, several with commas."""
+    import warp
+
+    there = [one.alias for one in warp.get_devices()]
+    for name in names.split(","):
+        if name not in (*there, *("cuda" for one in there if one != "cpu")):
+            raise ValueError(f"--device {name} is not here: choose one of {', '.join(there)}")
 
 
 def output_folder(*names: str) -> Callable[[str], str]:

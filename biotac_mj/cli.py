@@ -7,7 +7,7 @@ import os
 import sys
 import traceback
 
-from .arguments import SEED, Parser, device, output_file, output_folder, real, whole
+from .arguments import SEED, Parser, check_device, device, output_file, output_folder, real, whole
 from .files import check_output_file
 
 __all__ = ["main", "parser"]
@@ -61,6 +61,7 @@ def parser() -> argparse.ArgumentParser:
     _add_generate(verbs)
     _add_data(verbs)
     _add_recordings(verbs)
+    _add_resimulation(verbs)
     _add_learning(verbs)
     return top
 
@@ -263,7 +264,7 @@ def _press(args):
 
         settings = amend_settings(settings, PressOptions, args.effects)
     options = PressOptions(**settings)
-    _check_device(args)
+    check_device(args.device)
     record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
@@ -313,7 +314,7 @@ def _add_view(verbs):
 def _view(args):
     from .view import view
 
-    _check_device(args)
+    check_device(args.device)
     view(
         skin=args.skin,
         tier=args.tier,
@@ -466,7 +467,7 @@ def _add_calibrate(verbs):
 def _calibrate(args):
     from .calibration import verbs
 
-    _check_device(args)
+    check_device(args.device)
     verbs.calibrate_verb(args)
 
 
@@ -532,7 +533,7 @@ def _add_compare(verbs):
 def _compare(args):
     from .calibration import verbs
 
-    _check_device(args)
+    check_device(args.device)
     verbs.compare_verb(args)
 
 
@@ -619,7 +620,7 @@ def _add_generate(verbs):
 def _generate(args):
     from .data import verbs
 
-    _check_device(args)
+    check_device(args.device)
     verbs.generate_verb(args)
 
 
@@ -695,7 +696,7 @@ def _diagnose(args):
     from .discrepancy import verbs
 
     if args.tier == "full":
-        _check_device(args)
+        check_device(args.device)
     verbs.diagnose_verb(args)
 
 
@@ -731,6 +732,12 @@ def _add_data(verbs):
         action="store_true",
         help="measured counts, of interactions that have them, not simulated ones",
     )
+    verb.add_argument(
+        "--rate",
+        type=real(0.1, 1e4),
+        metavar="HZ",
+        help="of frames, which hold the nearest rows (default: the set's)",
+    )
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -739,6 +746,12 @@ def _add_recordings(verbs):
     from .recordings.verbs import add_verbs
 
     add_verbs(verbs, _verb)
+
+
+def _add_resimulation(verbs):
+    from .resimulation.verbs import add_verb
+
+    add_verb(verbs, _verb)
 
 
 def _import_data(args):
@@ -751,16 +764,6 @@ def _export_data(args):
     from .data import verbs
 
     verbs.export_verb(args)
-
-
-def _check_device(args):
-    """Refuses devices that are not here."""
-    import warp
-
-    there = [one.alias for one in warp.get_devices()]
-    for name in args.device.split(","):
-        if name not in (*there, *("cuda" for one in there if one != "cpu")):
-            raise ValueError(f"--device {name} is not here: choose one of {', '.join(there)}")
 
 
 # what is said of errors of the system beside their own text

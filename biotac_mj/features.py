@@ -229,8 +229,17 @@ _READINGS = (
      "attach, condensed (those of the rubber and the contact's law: full), batch, tasks; press and generate: "
      "`--effects`. Effects of the set-up are left out by name"),
     ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
-    ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate and its LeRobot export; "
-     "`readings.csv` of a press has the latest, of the synthetic measured sensor too"),
+    ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
+     "and the LeRobot export of all three; `readings.csv` of a press has the latest, of the synthetic "
+     "measured sensor too"),
+    ("electrodes from a network", '`signal=` "learned", or a file that `biotac evaluate --save` wrote',
+     "attach, condensed, batch (`readings={\"signal\": ...}`), tasks (`SensorBioTac`); press, generate and "
+     "diagnose: by physics alone"),
+    ("the skin under a recording", "`biotac resimulate`: recorded poses, or a plate's fitted ones",
+     "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
+     "vibration"),
+    ("what electrodes tell (force, place, novelty)", "`biotac evaluate --save`, `biotac predict`",
+     "recordings and data sets"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
     ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
     ("status (tier, steps lost, rounds, share of the way, push withheld)", "yes",

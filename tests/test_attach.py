@@ -264,7 +264,7 @@ def test_packages_that_are_missing_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "biotac_mj.learning.serve", raising=False)
     with pytest.raises(ModuleNotFoundError, match=r"needs torch: pip install 'biotac-mj\[learning\]'"):
-        springs(spec_of(), **FEM | {"readings": "latent_projection"})
+        springs(spec_of(), **FEM | {"readings": "learned"})
 
 
 def test_a_prefix_serves_one_biotac():

@@ -641,6 +641,20 @@ def trained_models():
     yield Row("evaluate trained --force force.txt", "--force goes with --electrodes")
     yield Row("evaluate --electrodes electrodes.txt --ship out", "--ship copies")
     yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
+    yield Row("evaluate electrodes.txt --save out.pt", "--save FILE.safetensors goes with")
+    yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
+    yield Row("predict inverse.safetensors electrodes.txt", "holds no model that reads electrodes")
+    yield Row("predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
+    yield Row("predict forward.safetensors electrodes.txt", "has no intervals: write it with")
+    for words, said in (
+        ("--object spoon", "unknown object 'spoon'"),
+        ("--object sphere_7mm", "has no pose of the object"),
+        ("--object sphere_7mm --object-pose 1 2", "is no pose"),
+        ("--poses fitted", "a match needs the force"),
+        ("--poses fitted --object ring_7mm", "fitted poses are a plate's"),
+        ("", "give --object, one of"),
+    ):
+        yield Row(f"resimulate electrodes.txt --quiet --skin coarse --out out {words}", said)
     yield Row("train shard.h5 --quiet --out trained", "is of other settings (set, config, models")
 
 
@@ -689,6 +703,9 @@ NUMBERS = {
     "train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a limit:0,-1 device:gpu",
     "evaluate trained": "fraction:nan,a seed:-1",
     "contact-patch electrodes.txt": "tare:a,1.5 row:a",
+    "resimulate electrodes.txt": "at-most:0,nan,a block:0,-1 batch:0 workers:-1 seed:-1 device:gpu,cuda:0 "
+    "mount:a,nan",
+    "predict forward.safetensors electrodes.txt": "tare:0,a,1.5 rate:0,nan",
 }
 
 
@@ -698,7 +715,7 @@ def numbers():
             name, _, values = argument.partition(":")
             for value in values.split(","):
                 said = value if name == "indenter" else name
-                out = " --out out" if verb.startswith("import-data") else ""
+                out = " --out out" if verb.startswith(("import-data", "resimulate")) else ""
                 yield Row(f"{verb} --{name}={value}{out}", said)
     for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
@@ -733,10 +750,16 @@ OUT = {
     "import-data electrodes.txt": ("--out", None),
     "export-data shard.h5": ("--out", None),
     "train shard.h5": ("--out", None),
+    "resimulate electrodes.txt": ("--out", "resimulate.json"),
     "contact-patch electrodes.txt": ("--out", "contact.png"),
     "evaluate trained --ship": ("", None),
 }
-OUT_FILES = {"evaluate trained": "--json", "view": "--render"}
+OUT_FILES = {
+    "evaluate trained": "--json",
+    "evaluate electrodes.txt": "--save",
+    "view": "--render",
+    "predict forward.safetensors electrodes.txt": "--out",
+}
 
 
 def outputs():

@@ -5,12 +5,22 @@ import json
 
 import numpy as np
 import pytest
+from recorded import synthetic
 
 from biotac_mj import cli
 from biotac_mj.data import Interaction, TactileSet, shard_path, write_shard
 from biotac_mj.data.lerobot import export_lerobot
+from biotac_mj.recordings import write
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow: pip install 'biotac-mj[lerobot]'")
+
+
+ORDER = [0, 2, 3, 1, 4]  # train, validation, test
+
+
+def ordered(data):
+    """Rows of the set in the order of the export."""
+    return np.concatenate([np.arange(data.start[k], data.stop[k]) for k in ORDER])
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +45,8 @@ def folder(tmp_path_factory):
                 **label,
             )
             what, kind = ["ring_7mm", "sphere_7mm"][k % 2], ["press", "tap"][k // 3]
-            ones.append(Interaction(f"{k:03d}", what, kind, "train", k, {}, 0.05 * np.arange(n), **columns))
+            split = ["train", "test", "train", "validation", "test"][k]
+            ones.append(Interaction(f"{k:03d}", what, kind, split, k, {}, 0.05 * np.arange(n), **columns))
         write_shard(shard_path(out, shard), ones)
     return out
 
@@ -62,7 +73,9 @@ def test_the_documented_files_are_there(exported):
     assert info["codebase_version"] == "v3.0" and info["fps"] == 20 and info["chunks_size"] == 1000
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 40, 4)
     assert info["data_path"].format(chunk_index=0, file_index=0) == files[0] and info["splits"] == {
-        "train": "0:5"
+        "train": "0:2",
+        "validation": "2:3",
+        "test": "3:5",
     }
     assert info["features"]["observation.tactile.electrodes"]["names"] == [f"e{i}" for i in range(1, 20)]
     for name in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
@@ -83,13 +96,15 @@ def test_frames_are_the_steps(exported, folder):
         )
     rows = table.to_pydict()
     with TactileSet(folder) as data:
-        np.testing.assert_array_equal(rows["observation.tactile.electrodes"], data["counts"][:][:, :19])
-        np.testing.assert_array_equal(rows["observation.tactile.tac"], data["counts"][:][:, 22])
-        pose = np.hstack([data["indenter_pos"][:], data["indenter_quat"][:]]).astype(np.float32)
+        order = ordered(data)
+        np.testing.assert_array_equal(rows["observation.tactile.electrodes"], data["counts"][order][:, :19])
+        np.testing.assert_array_equal(rows["observation.tactile.tac"], data["counts"][order][:, 22])
+        pose = np.hstack([data["indenter_pos"][order], data["indenter_quat"][order]]).astype(np.float32)
         np.testing.assert_array_equal(rows["observation.state"], pose)
-        np.testing.assert_array_equal(rows["episode_index"], data.owner())
-        np.testing.assert_allclose(rows["timestamp"], data["time"][:], atol=1e-6)
-        last = data.stop - 1
+        length = (data.stop - data.start)[ORDER]
+        np.testing.assert_array_equal(rows["episode_index"], np.repeat(np.arange(5), length))
+        np.testing.assert_allclose(rows["timestamp"], data["time"][order], atol=1e-6)
+        last = np.cumsum(length) - 1
         following = np.arange(data.nstep) + 1
         following[last] = last
         np.testing.assert_array_equal(rows["action"], pose[following])
@@ -103,9 +118,12 @@ def test_episodes_and_tasks_point_where_they_should(exported, folder):
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
     frames = parquet.read_table(exported / "data/chunk-000/file-000.parquet").to_pydict()
     with TactileSet(folder) as data:
-        for k, row in enumerate(episodes):
-            assert (row["episode_index"], row["length"]) == (k, data.stop[k] - data.start[k])
-            assert (row["dataset_from_index"], row["dataset_to_index"]) == (data.start[k], data.stop[k])
+        begun = 0
+        for number, (k, row) in enumerate(zip(ORDER, episodes, strict=True)):
+            length, begin = data.stop[k] - data.start[k], begun
+            begun += length
+            assert (row["episode_index"], row["length"]) == (number, length)
+            assert (row["dataset_from_index"], row["dataset_to_index"]) == (begin, begun)
             assert (row["data/chunk_index"], row["data/file_index"], row["meta/episodes/file_index"]) == (
                 0,
                 0,
@@ -114,7 +132,7 @@ def test_episodes_and_tasks_point_where_they_should(exported, folder):
             assert (
                 row["tasks"]
                 == [f"{data.kind[k]} with {data.object[k]}"]
-                == [names[frames["task_index"][data.start[k]]]]
+                == [names[frames["task_index"][begin]]]
             )
             force = data["wrench"][data.start[k] : data.stop[k]]
             np.testing.assert_allclose(row["stats/observation.force/max"], force.max(0), rtol=1e-6)
@@ -157,10 +175,28 @@ def test_a_recording_is_exported_with_what_it_has(tmp_path):
     np.testing.assert_allclose(table["observation.force"].to_pylist(), force, rtol=1e-5)
     np.testing.assert_array_equal(table["observation.tactile.pdc"].to_pylist(), counts[:, 0])
     info = json.loads((tmp_path / "o/meta/info.json").read_text())
+    assert info["fps"] == 100
     features = {name for name in info["features"] if name.startswith(("observation", "action"))}
     assert features == {"observation.force", "observation.tactile.electrodes", "observation.tactile.pdc"}
-    assert info["fps"] == pytest.approx(100, rel=0.01) and set(info["features"]) == set(table.column_names)
+    assert set(info["features"]) == set(table.column_names)
     assert json.loads((tmp_path / "o/source.json").read_text())["synthetic"] is False
+
+
+def test_all_of_pac_and_dropped_rows_of_a_recording(tmp_path):
+    """A synthetic log at 100 Hz that lacks rows: frames hold the nearest; PAC keeps its 22 samples."""
+    one = synthetic(n=60)
+    write(tmp_path / "log.h5", [one.rows(np.r_[0:20, 24:60])])
+    assert cli.main(["import-data", str(tmp_path / "log.h5"), "--out", str(tmp_path / "set")]) == 0
+    for out, words, n, hold in (("o", [], 60, 1), ("half", ["--rate", "50"], 30, 2)):
+        words = ["export-data", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / out), *words]
+        assert cli.main(words) == 0
+        table = parquet.read_table(tmp_path / out / "data/chunk-000/file-000.parquet").to_pydict()
+        wanted = np.arange(0, 60, hold)
+        wanted = np.where((wanted > 19) & (wanted < 24), np.where(wanted < 22, 19, 24), wanted)
+        assert len(table["timestamp"]) == n
+        np.testing.assert_array_equal(table["observation.tactile.pac"], one.pac[wanted])
+        np.testing.assert_array_equal(table["observation.tactile.electrodes"], one.electrodes[wanted])
+        assert json.loads((tmp_path / out / "meta/info.json").read_text())["fps"] == 100 // hold
 
 
 def test_what_cannot_be_exported_is_named(tmp_path):

@@ -15,6 +15,7 @@ pytest.importorskip("safetensors")
 from learning_set import dent, log_change, make_set  # noqa: E402
 
 import biotac_mj  # noqa: E402
+from biotac_mj import cli  # noqa: E402
 from biotac_mj.data import TactileSet  # noqa: E402
 from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.arrays import load_arrays  # noqa: E402
@@ -187,7 +188,7 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         <geom name="ball" type="sphere" size="0.0035"/></body>
         </worldbody></mujoco>"""
     )
-    sensor = biotac_mj.SensorBioTac(signal="latent_projection", weights=str(weights), noise=False)
+    sensor = biotac_mj.SensorBioTac(signal="learned", weights=str(weights), noise=False)
     handle = biotac_mj.attach(
         spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings()
     )
@@ -215,6 +216,16 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         biotac_mj.SensorBioTac(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
         biotac_mj.SensorBioTac(weights="a")
+    with pytest.warns(FutureWarning, match="is called 'learned'"):
+        assert biotac_mj.SensorBioTac(signal="latent_projection").signal == "learned"
+
+
+def test_attach_takes_the_file_of_a_model(weights):
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", signal=str(weights))
+    assert handle.config.readings == "learned" and handle.config.options["readings"]["weights"] == str(
+        weights
+    )
 
 
 def test_a_window_remembers_in_the_state_and_settles(tmp_path):
@@ -375,3 +386,21 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
     z = film.impedance.numpy()
     np.testing.assert_allclose(got[1], 4095 / (z[1] / 1e4 + 1), atol=1)
     assert np.abs(got[1] - REST_COUNTS["1"]).max() > 20
+
+
+def test_a_forward_model_is_kept_with_intervals(trained, folder, tmp_path, capsys):
+    model, out = str(tmp_path / "m.safetensors"), tmp_path / "p.h5"
+    assert cli.main(["evaluate", str(trained), "--save", model]) == 0
+    assert cli.main(["predict", model, str(folder), "--out", str(out)]) == 0
+    assert "interval" in capsys.readouterr().out
+    arrays = load_arrays(folder)
+    rows = (torch.isfinite(arrays.counts).all(1) & (arrays.time > 0)).numpy()
+    with h5py.File(out) as file:
+        error = np.abs(file["electrodes"][:][rows] - arrays.counts.numpy()[rows])
+        assert np.median(error) < 4 and 0.8 < (error <= file["electrodes_half"][:][rows]).mean() <= 1
+        assert set(file["interaction"]) == set(range(80))
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
+    assert biotac_mj.attach(spec, site="tip", skin="coarse", signal=model).config.readings == "learned"
+    capsys.readouterr()
+    assert cli.main(["evaluate", str(folder), "--save", str(tmp_path / "r.safetensors")]) == 0
+    assert "place" in capsys.readouterr().out

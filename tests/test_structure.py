@@ -33,6 +33,7 @@ LAYERS = {
     "learning": "arguments recordings data sensor effects geometry fields files reading",
     "discrepancy": "effects recordings data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
+    "resimulation": "arguments matching data recordings skin sensor geometry files",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

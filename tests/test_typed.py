@@ -23,6 +23,7 @@ TYPED = (
     "discrepancy",
     "skin",
     "matching",
+    "resimulation",
 )
 
 

@@ -15,7 +15,7 @@ from ..coupling.config import Config
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.readings import film_of
-from ..coupling.sensor_biotac import SIGNALS
+from ..coupling.sensor_biotac import read_signal
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
@@ -457,9 +457,7 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
             check_geoms(what, one, read)
             find_geoms(ModelView(mjm._address), one or ())
     rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms)
-    signal, weights = settings.pop("signal", "physics"), settings.pop("weights", None)
-    if signal not in SIGNALS:
-        raise ValueError(f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}")
+    signal, weights = read_signal(settings.pop("signal", "physics"), settings.pop("weights", None))
     if signal != "physics":
         if "film" in config.options:
             raise ValueError("a network stands in the film's place: leave options['film'] out")

@@ -19,6 +19,7 @@ from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
+from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
 
 if typing.TYPE_CHECKING:
@@ -134,6 +135,7 @@ def attach(
     stepper: str = "fem",
     tier: str = "full",
     readings: str = "biotac",
+    signal: str | None = None,
     options: dict | None = None,
     slots: int | None = None,
     on_error: str = "warn",
@@ -156,6 +158,8 @@ def attach(
         elements' centroids; "film": residual_film, electrode_radius [m], excitation, see
         `sensor.film.read_film`; "readings": of the sensor (noise, sensor, randomise, film_every_step,
         temperature, cold; weights).
+      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
+        `SensorBioTac`. Short for readings and options["readings"]["weights"].
       sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by seed
         and prefix), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for
         options["readings"].
@@ -191,6 +195,10 @@ def attach(
 
     material, options = plain(material), plain({} if options is None else options, geometry)
     own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
+    if signal is not None or readings == "latent_projection":
+        name, weights = read_signal(signal or readings)
+        readings = "biotac" if name == "physics" else name
+        own |= {} if weights is None else {"weights": weights}
     if own and isinstance(options.get("readings", {}), dict):
         options = {**options, "readings": {**options.get("readings", {}), **own}}
     if stepper == "fem":

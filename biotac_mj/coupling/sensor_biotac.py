@@ -2,24 +2,56 @@
 batches alike."""
 
 import dataclasses
+import warnings
 
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = ["SIGNALS", "SensorBioTac"]
+__all__ = ["SIGNALS", "SensorBioTac", "read_signal"]
 
-SIGNALS = ("physics", "latent_projection")
+SIGNALS = ("physics", "learned")
+_WEIGHTS = ".safetensors"
+
+
+def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | None]:
+    """One of SIGNALS and the file of its weights, None for the package's.
+
+    Args:
+      signal: one of SIGNALS, or the file itself, which ends in .safetensors. weights: of "learned".
+
+    Raises:
+      ValueError: unknown signal, weights for the physics, or two files.
+    """
+    if str(signal).endswith(_WEIGHTS):
+        if weights is not None:
+            raise ValueError(f"signal {signal!r} and weights {weights!r} are two models: give one")
+        return "learned", str(signal)
+    if signal == "latent_projection":
+        warnings.warn(
+            "signal 'latent_projection' is called 'learned': the model that is shipped is none",
+            FutureWarning,
+            stacklevel=3,
+        )
+        signal = "learned"
+    if signal not in SIGNALS:
+        raise ValueError(
+            f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+        )
+    if signal == "physics" and weights is not None:
+        raise ValueError(f"weights {weights!r} are given but the signal is 'physics': take signal='learned'")
+    return signal, None if weights is None else str(weights)
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorBioTac:
     """Settings of the readings.
 
-        handle = biotac_mj.attach(spec, site="tip", **SensorBioTac(signal="latent_projection").settings())
+        handle = biotac_mj.attach(spec, site="tip", **SensorBioTac(signal="learned").settings())
 
     Attributes:
-      signal: "physics": conduction in the liquid film; "latent_projection": the learned model that did best
-        on unseen objects, trained on synthetic data (docs/learning.md).
+      signal: "physics": conduction in the liquid film; "learned": a network on film and strain over each
+        electrode, the one that did best on unseen objects, trained on synthetic data (docs/learning.md); or
+        its file, *.safetensors.
       sensor: which one it is, see `sensor.presets.read_sensor`. randomise: see `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
@@ -36,13 +68,9 @@ class SensorBioTac:
     randomise: list | dict = ()
 
     def __post_init__(self):
-        if self.signal not in SIGNALS:
-            raise ValueError(f"unknown signal {self.signal!r}: choose one of {', '.join(SIGNALS)}")
-        if self.signal == "physics" and self.weights is not None:
-            raise ValueError(
-                f"weights {self.weights!r} are given but the signal is 'physics': "
-                "take signal='latent_projection'"
-            )
+        signal, weights = read_signal(self.signal, self.weights)
+        object.__setattr__(self, "signal", signal)
+        object.__setattr__(self, "weights", weights)
 
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""

@@ -166,7 +166,8 @@ _steppers = {"fem": "biotac_mj.coupling.fem:FemStepper"}
 _tiers = {"condensed": "biotac_mj.coupling.condensed:CondensedStepper"}  # instead of "fem"
 _readings = {
     "biotac": "biotac_mj.coupling.readings:SensorReadings",
-    "latent_projection": "biotac_mj.learning.serve:LearnedReadings",
+    "learned": "biotac_mj.learning.serve:LearnedReadings",
+    "latent_projection": "biotac_mj.learning.serve:LearnedReadings",  # its old name, in models saved with it
     "none": _NoReadings,
 }
 

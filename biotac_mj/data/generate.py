@@ -23,7 +23,7 @@ from .plan import KINDS
 from .store import TactileSet, shard_path
 from .vary import check_vary
 
-__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate"]
+__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate", "made_already"]
 
 # folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
 RECORDINGS = "recordings"
@@ -243,7 +243,7 @@ def generate(
         "device": options.device.split(":")[0]
     }
     settings = json.loads(json.dumps(settings))
-    todo = [batch for batch in batches(options) if not _is_there(out / batch.path, settings)]
+    todo = [batch for batch in batches(options) if not made_already(out / batch.path, settings)]
     begin = time.perf_counter()
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
@@ -269,8 +269,8 @@ def generate(
     return report
 
 
-def _is_there(path, settings):
-    """Whether a shard is there; ValueError where it belongs to another run."""
+def made_already(path: pathlib.Path, settings: dict) -> bool:
+    """Whether a shard is there; ValueError where it was made with other settings."""
     if not path.is_file():
         return False
     with TactileSet(path) as data:
@@ -278,7 +278,7 @@ def _is_there(path, settings):
     different = [f"{k} {found.get(k)!r} there, {v!r} now" for k, v in settings.items() if found.get(k) != v]
     if different:
         raise ValueError(
-            f"{path} was generated with other options ({'; '.join(different)}): "
+            f"{path} was made with other options ({'; '.join(different)}): "
             "use another --out, or delete that set"
         )
     return True

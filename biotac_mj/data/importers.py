@@ -1,6 +1,7 @@
 """Recordings of real sensors in the native store: interactions of kind "recorded", no simulation."""
 
 import pathlib
+import typing
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,17 +12,54 @@ from .schema import Interaction
 from .splits import assign
 from .store import shard_path, write_shard
 
-__all__ = ["import_recordings", "interactions"]
+__all__ = ["Measured", "import_recordings", "interactions", "measured"]
 
 _GAP = 0.5  # [s] without a sample ends an interaction
+
+
+class Measured(typing.NamedTuple):
+    """Rows of a recording as a set's columns.
+
+    Attributes:
+      counts: (n, 23), NaN where a channel was not recorded. pac: (n, 22), None without raw counts of it.
+      wrench: (n, 6) in the recording's frame, None without forces. notes: what had to be assumed.
+    """
+
+    counts: np.ndarray
+    pac: np.ndarray | None
+    wrench: np.ndarray | None
+    notes: list[str]
+
+
+def measured(recording: Recording) -> Measured:
+    """What a recording measured.
+
+    Raises:
+      ValueError: no raw counts can be made of its electrodes.
+    """
+    electrodes, notes = recording.counts()
+    n = len(recording)
+    counts = np.full((n, len(CHANNELS)), np.nan, np.float32)
+    counts[:, :NELECTRODE] = electrodes
+    pac = None
+    for channel in CHANNELS[NELECTRODE:]:
+        value = getattr(recording, channel)
+        if value is not None and recording.unit(channel) == "counts":
+            counts[:, CHANNELS.index(channel)] = value[:, -1] if channel == "pac" else value
+            pac = value.astype(np.float32) if channel == "pac" else pac
+    wrench = None
+    if recording.force is not None or recording.torque is not None:
+        wrench = np.full((n, 6), np.nan, np.float32)
+        for columns, value in ((slice(0, 3), recording.force), (slice(3, 6), recording.torque)):
+            wrench[:, columns] = np.nan if value is None else value
+    return Measured(counts, pac, wrench, notes)
 
 
 def interactions(recording: Recording, block: float | None = None) -> list[Interaction]:
     """A recording cut where its clock has a gap of more than 0.5 s.
 
-    Electrodes become `measured_counts`, forces `measured_wrench`; the object's pose, or where it touches,
-    becomes
-    `indenter_pos`, in the recording's frame.
+    Electrodes become `measured_counts`, PAC `measured_pac` as well, forces `measured_wrench`; the object's
+    pose, or where it touches, becomes `indenter_pos`, in the recording's frame.
 
     Args:
       block: cuts into this length [s], too. Neighbouring blocks share their drift: they are alike.
@@ -29,19 +67,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
     Raises:
       ValueError: no raw counts can be made of its electrodes.
     """
-    electrodes, assumed = recording.counts()
-    n = len(recording)
-    counts = np.full((n, len(CHANNELS)), np.nan, np.float32)
-    counts[:, :NELECTRODE] = electrodes
-    for channel in CHANNELS[NELECTRODE:]:
-        value = getattr(recording, channel)
-        if value is not None and recording.unit(channel) == "counts":
-            counts[:, CHANNELS.index(channel)] = value[:, -1] if channel == "pac" else value
-    wrench = None
-    if recording.force is not None or recording.torque is not None:
-        wrench = np.full((n, 6), np.nan, np.float32)
-        for columns, value in ((slice(0, 3), recording.force), (slice(3, 6), recording.torque)):
-            wrench[:, columns] = np.nan if value is None else value
+    n, found = len(recording), measured(recording)
     place = recording.contact_pos if recording.object_pos is None else recording.object_pos
     cut = set(np.flatnonzero(np.diff(recording.time) > _GAP) + 1)
     if block is not None:
@@ -59,12 +85,13 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
                 "recorded",
                 "train",
                 0,
-                {**said, "rows": [a, b], "notes": [*recording.notes, *assumed]},
+                {**said, "rows": [a, b], "notes": [*recording.notes, *found.notes]},
                 recording.time[rows],
                 indenter_pos=_whole(place, rows),
                 indenter_quat=_whole(recording.object_quat, rows),
-                measured_counts=counts[rows],
-                measured_wrench=None if wrench is None else wrench[rows],
+                measured_counts=found.counts[rows],
+                measured_pac=None if found.pac is None else found.pac[rows],
+                measured_wrench=None if found.wrench is None else found.wrench[rows],
             )
         )
     return out
@@ -105,7 +132,7 @@ def import_recordings(
         for one in group:
             one.split = str(next(part))
         # a column is in all interactions of a shard or in none
-        for name in ("indenter_pos", "indenter_quat", "measured_wrench"):
+        for name in ("indenter_pos", "indenter_quat", "measured_pac", "measured_wrench"):
             if any(getattr(one, name) is None for one in group):
                 for one in group:
                     setattr(one, name, None)

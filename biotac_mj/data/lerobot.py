@@ -12,6 +12,7 @@ import tqdm
 
 from ..files import replacing
 from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE, NPAC
+from .schema import SPLITS
 
 __all__ = ["VERSION", "export_lerobot"]
 
@@ -20,12 +21,17 @@ _FILE_MB = 100  # of one data file, lerobot's default
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 PAC = tuple(f"pac{i + 1}" for i in range(NPAC))
+_REAL = ("recorded", "resimulated")  # kinds whose measured counts a real sensor gave
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATS = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 
 
 def export_lerobot(
-    data: pathlib.Path | str, out: pathlib.Path | str, counts: str = "counts", progress: bool = True
+    data: pathlib.Path | str,
+    out: pathlib.Path | str,
+    counts: str = "counts",
+    progress: bool = True,
+    rate: float | None = None,
 ) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
@@ -41,6 +47,10 @@ def export_lerobot(
       data: TactileSet with poses.
       counts: "counts" for simulated readings of all interactions, "measured_counts" for those that have
         measured ones.
+      rate: [Hz] of the frames; each holds the nearest row, none is made up. None: the set's own, where its
+        clock is even, or that of a recording from which rows are missing.
+
+    Episodes are in the order train, validation, test, and meta/info.json has the set's splits.
 
     Raises:
       ValueError: no poses or counts in the set, nothing to export, time steps that are not even, or a folder
@@ -57,14 +67,15 @@ def export_lerobot(
         )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
-    recorded = bool((data.kind == "recorded").all())
+    recorded = counts == "measured_counts" and bool(np.isin(data.kind, _REAL).all())
     for name in (counts,) if recorded else (counts, "indenter_pos", "indenter_quat", "wrench"):
         data[name]  # says what is missing
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
     if not len(chosen):
         raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
+    chosen = np.concatenate([chosen[data.split[chosen] == name] for name in SPLITS])
     with replacing(out, folder=True) as building:
-        _Export(data, building, counts, chosen, recorded).write(progress)
+        _Export(data, building, counts, chosen, recorded, rate).write(progress)
     return out
 
 
@@ -78,11 +89,13 @@ def _pyarrow():
 
 
 class _Export:
-    def __init__(self, data, folder, counts, chosen, recorded):
+    def __init__(self, data, folder, counts, chosen, recorded, rate):
         self.data, self.folder, self.counts, self.chosen = data, folder, counts, chosen
         self.recorded = recorded
-        self.fps = self._rate()
-        self.pac = counts == "counts" and "pac" in data.columns
+        self.fps, self.even = self._rate(rate)
+        self.pac = {"counts": "pac", "measured_counts": "measured_pac"}[counts]
+        whole = self.pac in data.columns and np.isfinite(data[self.pac][self.data.steps(chosen)]).all()
+        self.pac = self.pac if whole else None
         self.features = {
             "observation.state": _feature(_POSE),
             "observation.force": _feature(self._axes()),
@@ -112,18 +125,24 @@ class _Export:
             return _WRENCH
         return _WRENCH if np.isfinite(self.data["measured_wrench"][:][:, 3:]).any() else _WRENCH[:3]
 
-    def _rate(self):
+    def _rate(self, wanted):
+        """Frames per second, and whether rows are frames as they are."""
         steps = [np.diff(self.data["time"][self.data.start[i] : self.data.stop[i]]) for i in self.chosen[:50]]
         step = np.concatenate(steps)
         # a real clock shakes; half a step off, a row was dropped
         shaken = 0.5 * np.median(step) if self.recorded and len(step) else 1e-4
-        if not len(step) or np.ptp(step) > shaken:
+        even = len(step) > 0 and np.ptp(step) <= shaken
+        if not even and wanted is None and not (self.recorded and len(step)):
             raise ValueError(
                 "the time steps of the set are not even: LeRobot's layout has one frame rate; "
-                "resample the recordings first"
+                "give it with --rate, frames hold the nearest rows"
             )
-        rate = 1 / step.mean()
-        return int(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)
+        own = 1 / (step.mean() if even else np.median(step)) if len(step) else wanted
+        near = 1e-2 if self.recorded else 1e-3  # a real clock is hardly ever right
+        own = int(round(own)) if abs(own - round(own)) < near * own else float(own)
+        if wanted is None:
+            return own, even
+        return int(wanted) if wanted == int(wanted) else wanted, even and wanted == own
 
     def write(self, progress):
         pa, rows, episodes, moments = _pyarrow(), [], [], []
@@ -153,14 +172,14 @@ class _Export:
             "interaction": self.data.id[self.chosen].tolist(),
             "counts": self.counts,
         }
-        synthetic = bool((self.data.kind[self.chosen] != "recorded").any())
+        synthetic = not self.recorded
         self._json("source.json", source | {"synthetic": synthetic, "versions": self.data.versions})
 
     def _episode(self, number, i, first):
         """Columns of one episode: name -> (n, k) or (n,)."""
         data = self.data
-        rows = slice(data.start[i], data.stop[i])
-        n = int(data.stop[i] - data.start[i])
+        rows = self._rows(i)
+        n = len(rows)
         parts = [self._column(f"indenter_{name}", rows, k) for name, k in (("pos", 3), ("quat", 4))]
         pose = np.concatenate(parts, axis=1)
         pose = pose.astype(np.float32)
@@ -174,7 +193,7 @@ class _Export:
                 f"observation.tactile.{name}": counts[:, NELECTRODE + k]
                 for k, name in enumerate(CHANNELS[NELECTRODE:])
             },
-            **({"observation.tactile.pac": data["pac"][rows].astype(np.float32)} if self.pac else {}),
+            **({"observation.tactile.pac": data[self.pac][rows].astype(np.float32)} if self.pac else {}),
             "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
             "timestamp": (np.arange(n) / self.fps).astype(np.float32),
             "frame_index": np.arange(n),
@@ -184,11 +203,21 @@ class _Export:
         }
         return {name: out[name] for name in self.all_features}
 
+    def _rows(self, i):
+        """(n,) rows of the set that the frames of interaction i are."""
+        rows = np.arange(self.data.start[i], self.data.stop[i])
+        if self.even:
+            return rows
+        time = self.data["time"][rows] - self.data["time"][rows[:1]]
+        due = np.arange(int(np.floor(time[-1] * self.fps + 1e-6)) + 1) / self.fps
+        after = np.clip(np.searchsorted(time, due), 1, max(len(time) - 1, 1))
+        return rows[np.where(due - time[after - 1] <= time[after % len(time)] - due, after - 1, after)]
+
     def _column(self, name, rows, width):
         """(n, width) of a column; NaN where the set has none."""
         if name in self.data.columns:
             return self.data[name][rows]
-        return np.full((rows.stop - rows.start, width), np.nan)
+        return np.full((len(rows), width), np.nan)
 
     def _row(self, number, n, first, file_index, statistics):
         row = {
@@ -256,11 +285,21 @@ class _Export:
             "data_files_size_in_mb": _FILE_MB,
             "video_files_size_in_mb": 200,
             "fps": self.fps,
-            "splits": {"train": f"0:{episodes}"},
+            "splits": self._splits(),
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": None,
             "features": self.all_features,
         }
+
+    def _splits(self):
+        """Ranges of episodes, as they were chosen: one split after the other."""
+        split, out, begin = self.data.split[self.chosen], {}, 0
+        for name in SPLITS:
+            count = int((split == name).sum())
+            if count:
+                out[name] = f"{begin}:{begin + count}"
+            begin += count
+        return out
 
     def _parquet(self, name, table):
         import pyarrow.parquet as parquet

@@ -11,7 +11,7 @@ from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
 __all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
 
 SCHEMA = "biotac_mj.data/1"
-KINDS = ("press", "slide", "twist", "tap", "recorded")
+KINDS = ("press", "slide", "twist", "tap", "recorded", "resimulated")
 SPLITS = ("train", "validation", "test")
 DISPLACEMENT_SCALE = (
     2.5e-7  # [m] of one unit of the stored integers: rounding of at most 0.125 um, reach of 8.19 mm
@@ -32,6 +32,7 @@ COLUMNS = {
     "indenter_quat": ((4,), "f8", "w x y z"),
     "converged": ((), "u1", "0 or 1"),
     "measured_counts": ((len(CHANNELS),), "f4", "count"),
+    "measured_pac": ((NPAC,), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
 
@@ -59,6 +60,8 @@ class Interaction:
       converged: (n,) whether the skin's step converged.
       measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it
         has no such channel.
+      measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN where there
+        is none.
       measured_wrench: (n, 6) measured with it; NaN where it was not.
     """
 
@@ -80,6 +83,7 @@ class Interaction:
     indenter_quat: np.ndarray | None = None
     converged: np.ndarray | None = None
     measured_counts: np.ndarray | None = None
+    measured_pac: np.ndarray | None = None
     measured_wrench: np.ndarray | None = None
 
     @property

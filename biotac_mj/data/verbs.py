@@ -86,7 +86,9 @@ def export_verb(args: argparse.Namespace) -> None:
     with TactileSet(args.set) as data:
         try:
             measured = args.measured or (data.kind == "recorded").all()
-            out = export_lerobot(data, args.out, "measured_counts" if measured else "counts", not args.quiet)
+            out = export_lerobot(
+                data, args.out, "measured_counts" if measured else "counts", not args.quiet, args.rate
+            )
         except ImportError as error:
             raise ValueError(str(error)) from error
     print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")

@@ -24,7 +24,8 @@ class Arrays:
         interaction's first row.
       simulated: (n, 19) counts of the simulation's own film, without noise where the set has its impedances.
       force: (n, nouter) float16 norm of the contact force on the nodes `outer` [N].
-      geometry: SkinGeometry. path: of the set.
+      geometry: SkinGeometry. path: of the set. sensor: "real" where resimulated recordings have the measured
+        counts, else "synthetic".
     """
 
     field: torch.Tensor
@@ -40,6 +41,7 @@ class Arrays:
     outer: np.ndarray
     geometry: object
     path: str = ""
+    sensor: str = "synthetic"
 
     @property
     def device(self) -> torch.device:
@@ -150,4 +152,5 @@ def load_arrays(
             outer=np.unique(data.geometry.outer_face),
             geometry=data.geometry,
             path=str(path),
+            sensor="real" if (data.kind[:stop][labelled] == "resimulated").all() else "synthetic",
         )

@@ -24,7 +24,7 @@ from .local import Features, train_head
 from .paper import train_latent_projection, train_pointnet
 from .weights import save_forward, save_inverse
 
-__all__ = ["FORWARD", "train_all", "train_split"]
+__all__ = ["FORWARD", "division_of", "train_all", "train_split"]
 
 # name -> arguments of `local.train_head`; from simple to full, each line adds one thing
 FORWARD = {
@@ -81,7 +81,7 @@ def train_all(
     begun = time.time()
     arrays = load_arrays(path, device, limit)
     for split in splits:
-        _division(path, split, 0, len(arrays.objects))  # refuses what cannot be divided
+        division_of(path, split, 0, len(arrays.objects))  # refuses what cannot be divided
     features = Features(arrays, config)
     print(
         f"{len(arrays.objects)} interactions, "
@@ -133,7 +133,7 @@ def train_split(
 ) -> None:
     """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
     and last SPLIT-SEED.json, which keeps the settings of the whole training."""
-    division = _division(path, split, seed, len(arrays.objects))
+    division = division_of(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
     fit = arrays.rows(train, labelled=True)
@@ -203,6 +203,7 @@ def train_split(
         "settings": settings or {},
         "config": dataclasses.asdict(config),
         "set": str(path),
+        "sensor": arrays.sensor,
         "interactions": len(arrays.objects),
         "labelled": int(arrays.labelled.sum()),
         "test_interactions": len(np.unique(arrays.owner[rows].cpu())),
@@ -232,7 +233,7 @@ def train_split(
     if names:
         report["ensemble_of"] = best
     if seed == 0:
-        kept = {"split": split, "seed": seed, "set": "synthetic", "nvert": arrays.geometry.nvert}
+        kept = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
         if names:
             save_forward(
                 out / f"forward-{split}.safetensors",
@@ -252,7 +253,8 @@ def train_split(
     _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
 
 
-def _division(path, split, seed, count):
+def division_of(path: pathlib.Path | str, split: str, seed: int, count: int) -> Split:
+    """How a set was divided in a training: see `train_all`; count: interactions that were read."""
     with TactileSet(path) as data:
         whole = (
             split_by_interaction(data, seed)

@@ -5,7 +5,8 @@ ln Z of the 19 electrodes, causal averages of it and products of its first princ
 regressions. The sensor's warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t /
 tau): with its own weight for each force component, or as one gain shared by all electrodes and removed from
 ln Z. Which of these, and how strong the ridge, is chosen for every component by walk- forward trials inside
-the training part. A small network then learns what the ridge leaves, where it helps in those trials."""
+the training part. Beside them stand regressions without the mean over the electrodes, which warm-up moves,
+and on random waves. A small network then learns what the ridge leaves, where it helps in those trials."""
 
 import dataclasses
 import itertools
@@ -15,13 +16,15 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ..sensor.channels import counts_from_log_impedance, log_impedance
+from .terms import Terms
 
-__all__ = ["ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
+__all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
 
 _WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
 _PRODUCTS = (0, 3, 5)  # principal components whose products are features
 _RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
 _WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
+_WAVES = ((0.5, 1.0, 2.0), (1e-3, 1e-2, 1e-1))  # lengths and ridges of `Terms` with waves
 
 
 def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
@@ -74,6 +77,8 @@ class _Candidate:
     products: int
     strength: float
     raw: bool = False
+    common: bool = False
+    waves: float = 0.0
 
     def text(self):
         words = ["counts" if self.raw else "ln Z"]
@@ -81,6 +86,10 @@ class _Candidate:
             words.append(f"averages over {', '.join(map(str, self.window))} rows")
         if self.products:
             words.append(f"products of {self.products} components")
+        if self.waves:
+            words.append(f"waves of length {self.waves:g}")
+        if self.common:
+            words.append("common mode out")
         if self.warm_up:
             words.append(f"{'shared gain' if self.shared else 'warm-up'} tau {self.warm_up:g} n")
         return f"{' + '.join(words)}; ridge {self.strength:g}"
@@ -93,13 +102,25 @@ def _candidates():
                 yield _Candidate(window, warm_up, shared, products, strength)
     for window, warm_up, strength in itertools.product(_WINDOWS, _WARM_UP, _RIDGE):
         yield _Candidate(window, warm_up, False, 0, strength, raw=True)
+    for window, products, strength in itertools.product(_WINDOWS, _PRODUCTS, _RIDGE):
+        yield _Candidate(window, None, False, products, strength, common=True)
+    for common, waves, strength in itertools.product((False, True), *_WAVES):
+        yield _Candidate((), None, False, 0, strength, common=common, waves=waves)
+
+
+# groups of candidates that differ in their ridge alone: what `progress` of `fit_force` is called for
+TRIALS = len({dataclasses.replace(c, strength=0.0) for c in _candidates()})
+
+
+def _kind(c):
+    return c.products, c.raw, bool(c.warm_up), c.common, bool(c.waves)
 
 
 def _kinds(candidates):
     kinds = {}
     for c in candidates:
-        kinds.setdefault((c.products, c.raw, bool(c.warm_up)), []).append(c)
-    return list(kinds.values())
+        kinds.setdefault(_kind(c), []).append(c)
+    return kinds
 
 
 def _features(log_z, force, part, candidate):
@@ -114,15 +135,8 @@ def _features(log_z, force, part, candidate):
             log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
     if candidate.raw:
         log_z = counts_from_log_impedance(log_z) / 1000
-    columns = [log_z, *(causal_average(log_z, tau) for tau in candidate.window)]
-    if candidate.products:
-        centred = log_z - log_z[part].mean(0)
-        covariance = centred[part].T @ centred[part]
-        main = centred @ np.linalg.eigh(covariance)[1][:, ::-1][:, : candidate.products]
-        # products must not run away beyond what was seen
-        main = np.clip(main, main[part].min(0), main[part].max(0))
-        i, j = np.triu_indices(candidate.products)
-        columns.append(main[:, i] * main[:, j])
+    terms = Terms.fit(log_z[part], candidate.products, candidate.common, candidate.waves)(log_z)
+    columns = [terms, *(causal_average(terms[:, : log_z.shape[1]], tau) for tau in candidate.window)]
     if rise is not None and not candidate.shared:
         columns.append(rise[:, None])
     return np.hstack(columns)
@@ -132,7 +146,7 @@ class ForceModel:
     """Predicts force from the counts up to each row; made by `fit_force`.
 
     Attributes:
-      chosen: for x, y, z, descriptions of the candidates whose mean predicts.
+      chosen: for x, y, z, descriptions of the candidates whose weighted mean predicts.
       network: whether the network's correction was kept, for x, y, z.
       trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
     """
@@ -186,11 +200,8 @@ def fit_force(
                 error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
         if progress:
             progress()
-    # one of each degree of flexibility, with and without warm-up: their mean is steadier than any of them
-    # where something new comes
-    best = [
-        [min(kin, key=lambda c: np.mean(error[c], axis=0)[k]) for kin in _kinds(candidates)] for k in range(3)
-    ]
+    error = {c: np.mean(e, axis=0) for c, e in error.items()}
+    best = [_best(candidates, {c: e[k] for c, e in error.items()}) for k in range(3)]
     prediction = _mean_of(best, log_z, force, slice(0, ntrain))
     base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]
     plain = np.array(
@@ -212,15 +223,29 @@ def fit_force(
     return ForceModel(prediction, [[c.text() for c in cs] for cs in best], kept, trials, gain)
 
 
+def _best(candidates, error):
+    """{candidate: weight} for one component of the force.
+
+    One of each degree of flexibility: their mean is steadier than any of them where something new comes. Each
+    counts as the inverse of its mean square in the trials; warm-up takes part where it helped there."""
+    winners = {kind: min(kin, key=error.get) for kind, kin in _kinds(candidates).items()}
+    cold = {kind: error[c] for kind, c in winners.items() if not c.warm_up}
+    kept = [
+        c
+        for kind, c in winners.items()
+        if not c.warm_up or error[c] < cold[_kind(dataclasses.replace(c, warm_up=None))]
+    ]
+    weight = np.array([error[c] ** -2 for c in kept])
+    return dict(zip(kept, weight / weight.sum()))
+
+
 def _mean_of(best, log_z, force, part):
-    """(n, 3): mean of each component's chosen candidates, fitted on the rows of `part`."""
+    """(n, 3): weighted mean of each component's chosen candidates, fitted on the rows of `part`."""
     out = np.zeros((len(log_z), 3))
-    for c in {c for cs in best for c in cs}:
+    for c in dict.fromkeys(c for chosen in best for c in chosen):  # in an order that does not change
         x = _features(log_z, force, part, c)
         w, b = ridge(x[part], force[part], c.strength)
-        value = x @ w + b
-        for k in range(3):
-            out[:, k] += best[k].count(c) / len(best[k]) * value[:, k]
+        out += (x @ w + b) * [chosen.get(c, 0.0) for chosen in best]
     return out
 
 

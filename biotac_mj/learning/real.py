@@ -10,7 +10,7 @@ import numpy as np
 from ..files import replacing
 from ..recordings.recording import Recording
 from ..sensor.channels import FULL_SCALE
-from .force import fit_force, ridge
+from .force import TRIALS, fit_force, ridge
 
 __all__ = ["evaluate_recording"]
 
@@ -58,7 +58,7 @@ def evaluate_recording(
         if share > 0.001
     ]
     with tqdm(
-        total=(3 if network else 1) + (78 if recording.force is not None else 0),
+        total=(3 if network else 1) + (TRIALS if recording.force is not None else 0),
         disable=not progress,
         desc="evaluate",
         leave=False,

@@ -12,7 +12,7 @@ from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import NELECTRODE, electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 
-__all__ = ["PAPER", "evaluate_models", "table"]
+__all__ = ["PAPER", "evaluate_models", "predictions_of", "report_of", "table"]
 
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
 PAPER = {
@@ -37,12 +37,13 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
       ValueError: seeds that were trained on different sets.
     """
     folder = pathlib.Path(folder)
-    reports = [_report(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
+    reports = [report_of(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
     if not reports:
         raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
         raise ValueError(f"{folder} holds predictions on different sets: give every set its own folder")
-    result = {"schema": "biotac_mj.learning.evaluation/1", "data": "synthetic", "unit": "tared counts",
+    sensor = reports[0].get("sensor", "synthetic")
+    result = {"schema": "biotac_mj.learning.evaluation/1", "data": sensor, "unit": "tared counts",
               "folder": str(folder), "paper": PAPER, "splits": {},
               **{k: reports[0][k] for k in ("set", "interactions", "labelled")}}  # fmt: skip
     drawn = {}
@@ -88,7 +89,7 @@ _PREDICTIONS = {
 }
 
 
-def _report(path):
+def report_of(path: pathlib.Path) -> dict:
     """What `biotac train` says of one split and seed."""
     report = check_entries(str(path), read_json(path, "result of `biotac train`", _AGAIN), _REPORT)
     for code, found in report["mesh"].items():
@@ -101,7 +102,7 @@ def _report(path):
     return report
 
 
-def _predictions(path):
+def predictions_of(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Its predictions, each (n, 19)."""
     what = "file of predictions"
     found = read_npz(path, what, _AGAIN)
@@ -120,7 +121,7 @@ def table(result: dict) -> str:
         where = kind if kind == split else f"{kind}: {split}"
         seeds = " ".join(map(str, found["seeds"]))
         lines.append(
-            f"unseen {where}, synthetic sensor: {found['interactions']} interactions, seeds {seeds}; "
+            f"unseen {where}, {result['data']} sensor: {found['interactions']} interactions, seeds {seeds}; "
             "RMS per interaction, counts"
         )
         lines.append(
@@ -179,7 +180,7 @@ def _split(folder, split, reports):
     errors, pooled, seconds = {}, {}, {}
     coverage, intervals, noise, example = {}, {}, [], None
     for report in reports:
-        data = _predictions(folder / f"{split}-{report['seed']}.npz")
+        data = predictions_of(folder / f"{split}-{report['seed']}.npz")
         test = data["test"].astype(bool)
         truth, owner = data["truth"][test].astype(float), data["owner"][test]
         raw = truth + data["tare"][test]
@@ -287,7 +288,7 @@ def _figures(result, drawn, out):
         axis.invert_yaxis()
         axis.set_xlabel("RMS error per interaction [counts]")
         axis.set_title(
-            f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, synthetic sensor"
+            f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, {result['data']} sensor"
         )
         axis.legend(fontsize=7, loc="upper right")
         for k, name in enumerate(names):
@@ -328,7 +329,7 @@ def _traces(result, drawn, splits, path):
         mine = data["owner"] == one
         strong = np.argsort(np.abs(data["truth"][mine]).max(0))[::-1][:2]
         for axis, e in zip(row, strong):
-            axis.plot(data["time"][mine], data["truth"][mine][:, e], "k.-", label="synthetic sensor")
+            axis.plot(data["time"][mine], data["truth"][mine][:, e], "k.-", label=f"{result['data']} sensor")
             for name in shown:
                 axis.plot(data["time"][mine], data[f"predicted_{name}"][mine][:, e], lw=1.2, label=name)
             axis.set_title(f"{split}: E{e + 1}, {data['object'][mine][0].decode()}", fontsize=9)

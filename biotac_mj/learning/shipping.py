@@ -28,6 +28,8 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
       FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: more than 16 MB.
     """
     folder, target = pathlib.Path(folder), pathlib.Path(target)
+    if result.get("data", "synthetic") != "synthetic":
+        raise ValueError("--ship is for models of synthetic data, as its cards say: keep this with --save")
     sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
     for path in sources.values():
         if not path.is_file():

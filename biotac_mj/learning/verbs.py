@@ -1,22 +1,25 @@
-"""The verbs `biotac train`, `biotac evaluate` and `biotac contact-patch`: their arguments here, their work
+"""The verbs `biotac train`, `evaluate`, `predict` and `contact-patch`: their arguments here, their work
 beside it."""
 
 import argparse
 import os
+import pathlib
 from collections.abc import Callable
 
 from ..arguments import SEED, device, output_file, output_folder, real, whole
 from ..fields import refuse_unknown
 from ..files import check_output_file
 from ..reading import read_json
+from ..recordings.verbs import add_load_arguments
 
 __all__ = ["add_verbs"]
 
 
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds the three to argparse's subparsers; verb(verbs, name, run, text) makes one."""
+    """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""
     _add_train(verbs, verb)
     _add_evaluate(verbs, verb)
+    _add_predict(verbs, verb)
     _add_contact_patch(verbs, verb)
 
 
@@ -107,7 +110,10 @@ def _add_evaluate(verbs, verb):
         "or electrode code and force regression on a recording of a real sensor.",
     )
     v.add_argument(
-        "folder", nargs="?", metavar="DIR", help="what `biotac train` wrote; or a recording, as --electrodes"
+        "folder",
+        nargs="?",
+        metavar="DIR",
+        help="what `biotac train` wrote; or a recording, as --electrodes; or, with --save, a data set",
     )
     v.add_argument(
         "--electrodes",
@@ -132,6 +138,13 @@ def _add_evaluate(verbs, verb):
         help="copy the trained weights there, each with a card",
     )
     v.add_argument(
+        "--save",
+        type=output_file(),
+        metavar="FILE.safetensors",
+        help="keep a model for `biotac predict`: of a recording or a set one that reads electrodes, of what "
+        "`biotac train` wrote one that predicts them, for attach(signal=FILE)",
+    )
+    v.add_argument(
         "--fraction", type=real(), default=0.7, help="of the recording's rows, in time, that train"
     )
     v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
@@ -154,6 +167,10 @@ def _evaluate(args):
             raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
+    if args.save and (args.new_sensor or not args.save.endswith(".safetensors")):
+        raise ValueError("--save FILE.safetensors goes with a recording, a set or a folder of `biotac train`")
+    if args.folder and args.save and any(pathlib.Path(args.folder).glob("shard-*.h5")):
+        return _evaluate_set(args)
     if args.ship and not args.folder:
         raise ValueError("--ship copies what `biotac train` wrote: give its DIR, or leave it out")
     if args.json is None and not args.folder:
@@ -190,6 +207,74 @@ def _evaluate_models(args):
         from .shipping import ship
 
         print("written: " + ", ".join(map(str, ship(args.folder, result, args.ship))))
+
+    if args.save:
+        from .predict import save_forward_model
+
+        save_forward_model(args.folder, args.save)
+        print(f"written: {args.save}")
+
+
+def _evaluate_set(args):
+    from .examples import from_set
+    from .reader import judge
+
+    _save_reader(args, *judge(from_set(args.folder), args.seed))
+
+
+def _save_reader(args, reader, scores):
+    reader.save(args.save)
+    print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} kept aside")
+    for name, row in scores["targets"].items():
+        covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
+        error = "" if row["rmse"] is None else f"RMSE {row['rmse']:.4g} {row['unit']}, "
+        print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
+    print(f"written: {args.save}; use it with `biotac predict {args.save} RECORDING`")
+
+
+def _add_predict(verbs, verb):
+    v = verb(
+        verbs,
+        "predict",
+        _predict,
+        "Force, contact place and electrodes of a recording by a kept model, with intervals and novelty.",
+    )
+    v.add_argument("model", metavar="MODEL", help="what `biotac evaluate --save` wrote")
+    v.add_argument(
+        "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
+    )
+    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_load_arguments(v)
+    v.add_argument(
+        "--tare",
+        type=whole(1, 10_000_000),
+        metavar="ROWS",
+        help="first rows, whose mean is the sensor at rest, for a model that reads changes",
+    )
+    v.add_argument(
+        "--out", type=output_file(), default="out/predict.csv", metavar="FILE", help="table .csv, or .h5"
+    )
+
+
+def _predict(args):
+    import numpy as np
+
+    from .predict import SUFFIXES, predict, write_prediction
+
+    if not args.out.endswith(SUFFIXES):
+        raise ValueError(f"--out {args.out} ends in none of {', '.join(SUFFIXES)}: give such a name")
+    load = dict(rate=args.rate, scale=args.scale, object_name=args.object)
+    where, found, meta = predict(args.model, args.source, args.sensor, args.tare, **load)
+    write_prediction(args.out, where, found, meta)
+    strange = found.novelty
+    print(
+        f"{len(strange)} rows: {', '.join(found.value)}, intervals of {100 * meta['level']:.0f} %; novelty "
+        f"{np.median(strange):.2f} in the median, {100 * (strange > 1).mean():.0f} % of rows above 1 "
+        "(usual: 5)"
+    )
+    if np.median(strange) > 1:
+        print("  note: most rows are unlike those that the model was trained on: do not trust it here")
+    print(f"written: {args.out}")
 
 
 def _add_contact_patch(verbs, verb):
@@ -265,3 +350,8 @@ def _evaluate_recording(args):
     for note in [*notes, *result["notes"]]:
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")
+    if args.save:
+        from .examples import from_recording
+        from .reader import judge_in_time
+
+        _save_reader(args, *judge_in_time(from_recording(recording), args.fraction, args.seed))

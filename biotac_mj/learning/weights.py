@@ -22,10 +22,13 @@ if typing.TYPE_CHECKING:
     from .predictor import ForwardModel
 
 __all__ = [
+    "FORMAT",
+    "amend",
     "describe",
     "load_forward",
     "load_inverse",
     "mesh_key",
+    "read_tensors",
     "save_forward",
     "save_inverse",
     "shipped",
@@ -33,7 +36,7 @@ __all__ = [
 ]
 
 _DAMAGED = "it is damaged: train again, or copy it again"
-_FORMAT = "biotac_mj.learning.weights/1"
+FORMAT = "biotac_mj.learning.weights/1"
 # what a file says of itself
 _SAID = {"mesh": str, "skin": str, "channels": list, "nvert": int}
 _SAID_OF = {
@@ -108,7 +111,7 @@ def _save(path, tensors, geometry, meta):
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
     tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()}
     meta = meta | {
-        "format": _FORMAT,
+        "format": FORMAT,
         "mesh": mesh_key(geometry),
         "skin": geometry.name,
         "channels": list(ELECTRODES),
@@ -119,11 +122,15 @@ def _save(path, tensors, geometry, meta):
 
 def describe(path: pathlib.Path | str) -> dict:
     """What a file of weights says about itself: direction, skin, nvert, channels, kind ..."""
-    return _read(path, ())[0]
+    return read_tensors(path, ())[0]
 
 
-def _read(path, names=None):
-    """Description and tensors (all, or of these names) of a file."""
+def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -> tuple[dict, dict]:
+    """Description and tensors (all, or of these names) of a file.
+
+    Raises:
+      FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite.
+    """
     from safetensors import safe_open
 
     remedy = (
@@ -141,15 +148,15 @@ def _read(path, names=None):
 
 
 def _load(path, geometry, direction):
-    meta, tensors = _read(path)
+    meta, tensors = read_tensors(path)
     _refuse_other(meta, path, geometry, direction)
     return meta, tensors
 
 
 def _refuse_other(meta, path, geometry, direction):
-    if not isinstance(meta, dict) or meta.get("format") != _FORMAT or meta.get("direction") != direction:
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT or meta.get("direction") != direction:
         raise ValueError(
-            f"{path} holds no {direction} model of {_FORMAT}: "
+            f"{path} holds no {direction} model of {FORMAT}: "
             f"it says {meta.get('format')}, {meta.get('direction')}"
         )
     check_entries(f"the description of {path}", meta, _SAID | _SAID_OF[direction])
@@ -163,6 +170,16 @@ def _refuse_other(meta, path, geometry, direction):
             f"{geometry.name!r} with "
             f"{geometry.nvert}: take that skin, or train on this one"
         )
+
+
+def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) -> None:
+    """Copies a file of weights and says more of it; more: JSON's types."""
+    from safetensors.torch import load, save
+
+    meta = describe(source) | more
+    with replacing(target) as temporary:
+        tensors = load(pathlib.Path(source).read_bytes())
+        temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
 
 def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel":

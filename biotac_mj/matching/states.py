@@ -72,6 +72,7 @@ class PlateStates:
         tip), across (to +z), towards the core [m^2].
       pressure: (..., nload) of the liquid over Young's modulus.
       reached: (npitch, nroll, nway) largest load of a way [m^2]; states beyond are its last.
+      depth: (..., nload) travel of the plate towards the core from first touch [m].
     """
 
     grid: PlateGrid
@@ -81,6 +82,7 @@ class PlateStates:
     force: np.ndarray
     pressure: np.ndarray
     reached: np.ndarray
+    depth: np.ndarray
 
 
 def frame(pitch: float, roll: float) -> np.ndarray:
@@ -121,7 +123,7 @@ def plate_states(
             return _press(model, node, axes, ways[:, 1:], np.array(grid.load))
 
         inputs = [geometry.vert, geometry.elem, geometry.fixed, material, options, pitch, ways, grid.load]
-        parts.append(kept("plate", inputs, make))
+        parts.append(kept("plate-states", inputs, make))
     shape = len(grid.pitch), len(grid.roll), len(grid.ways)
     stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
     return PlateStates(
@@ -131,7 +133,7 @@ def plate_states(
 
 def _press(model, node, axes, ways, load):
     """States along ways (nway, 2) of plates that face along axes (nway, 3, 3), a world for each: xpos (nway,
-    nload, n, 3), force, pressure, reached."""
+    nload, n, 3), force, pressure, depth, reached."""
     nway, E = len(ways), model.material.youngs_modulus
     data = SkinData(model, nway)
     geoms = GeomSet(["plane"], [(0, 0, 0)], nworld=nway)
@@ -142,7 +144,7 @@ def _press(model, node, axes, ways, load):
     push = ways[:, :1] * along + ways[:, 1:] * across + inwards
     mat = np.stack([along, np.cross(inwards, along), inwards], 2)[:, None]
     rest = model.rest.vert[node]
-    track = [[(0.0, rest, np.zeros(3), 0.0)] for _ in range(nway)]
+    track = [[(0.0, rest, np.zeros(3), 0.0, 0.0)] for _ in range(nway)]
     going, lost, depth = np.ones(nway, bool), np.zeros(nway, int), np.zeros(nway)
     while going.any():
         depth[going] += _STRIDE
@@ -154,15 +156,16 @@ def _press(model, node, axes, ways, load):
         for w in np.flatnonzero(going & good):
             force = -axes[w] @ wrench[w] / E
             if force[2] > track[w][-1][0]:
-                track[w].append((force[2], x[w], force, pressure[w] / E))
+                track[w].append((force[2], x[w], force, pressure[w] / E, depth[w]))
         top = np.array([t[-1][0] for t in track])
         going &= (top < load[-1]) & (depth < _DEEPEST) & (lost < _LOST)
-    out = {"xpos": [], "force": [], "pressure": [], "reached": top}
+    columns = ("xpos", "force", "pressure", "depth")
+    out = {"reached": top} | {name: [] for name in columns}
     for t in track:
         at = np.array([row[0] for row in t])
         k = np.clip(np.searchsorted(at, load), 1, len(at) - 1)
         f = np.clip((load - at[k - 1]) / (at[k] - at[k - 1]), 0, 1)
-        for name, column in (("xpos", 1), ("force", 2), ("pressure", 3)):
+        for column, name in enumerate(columns, 1):
             value = np.array([row[column] for row in t])
             share = f.reshape(-1, *[1] * (value.ndim - 1))
             out[name].append((1 - share) * value[k - 1] + share * value[k])

@@ -48,8 +48,10 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
 
 
-def add_load_arguments(verb: argparse.ArgumentParser) -> None:
-    """What a file does not say itself."""
+def add_load_arguments(
+    verb: argparse.ArgumentParser, touched: str = "what touched (default: what the files say)"
+) -> None:
+    """What a file does not say itself; touched: help of --object."""
     verb.add_argument(
         "--rate", type=real(0.5, 1e4), metavar="HZ", help="of rows without times (default: guessed)"
     )
@@ -58,7 +60,7 @@ def add_load_arguments(verb: argparse.ArgumentParser) -> None:
         type=real(1e-9, 1e9),
         help="counts for one unit of the channels: 4095 where they are normalised",
     )
-    verb.add_argument("--object", metavar="NAME", help="what touched (default: what the files say)")
+    verb.add_argument("--object", metavar="NAME", help=touched)
 
 
 def load_given(args: argparse.Namespace) -> list:

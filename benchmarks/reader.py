@@ -1,0 +1,170 @@
+"""Intervals and novelty of a model that reads electrodes, on synthetic sets that are made here.
+
+python benchmarks/reader.py --out DIR --json OUT
+
+An ordinary set is divided by whole touches, several times; the model is fitted, its intervals are sized on
+touches kept aside, and unseen touches say how many rows they cover. What training did not have is told from
+those unseen touches by the median novelty of a touch: a skin with more liquid, two balls at once, an
+electrode that stays at rest or reads nothing. Everything is simulated."""
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import sys
+
+import numpy as np
+import trimesh
+
+from biotac_mj.data import Interaction, shard_path, write_shard
+from biotac_mj.data.clearance import Placed, first_touch, surface_samples
+from biotac_mj.data.generate import GenerateOptions, generate
+from biotac_mj.data.plan import Motion
+from biotac_mj.data.readings import read_motion
+from biotac_mj.data.simulate import simulate, simulate_condensed
+from biotac_mj.data.splits import assign
+from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.rigid import rotation
+from biotac_mj.learning.examples import Examples, from_set
+from biotac_mj.learning.reader import Reader, fit_reader
+from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.skin import SkinModel
+from biotac_mj.skin.settings import read_material
+
+OBJECTS = ("sphere_3-5mm", "sphere_7mm", "sphere_14mm", "cube_14mm")
+STEPS, RATE = 8, 20.0
+FILL = 2e-7  # [m3] more liquid than at rest
+BALL, APART = 3.5e-3, 9e-3  # [m] radius of two balls and how far apart their middles are, along the finger
+SHARES = (0.6, 0.2, 0.2)  # of the touches: train, size the intervals, unseen
+
+
+def ordinary(folder: pathlib.Path, count: int, tier: str, **more: object) -> Examples:
+    """A generated set, made where it is not there; more: of GenerateOptions."""
+    settings = dict(labelled=0, steps=STEPS, rate=RATE, skin="coarse", objects=OBJECTS, batch=50) | more
+    generate(folder, GenerateOptions(count=count, tier=tier, **settings), workers=0)
+    return from_set(folder)
+
+
+def two_contacts(folder: pathlib.Path, count: int, tier: str) -> Examples:
+    """Touches of two balls at once on the straight part of the pad, made where they are not there."""
+    path = shard_path(folder, 0)
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        balls = [trimesh.creation.icosphere(subdivisions=3, radius=BALL) for _ in range(2)]
+        for ball, side in zip(balls, (-0.5, 0.5)):
+            ball.apply_translation([side * APART, -BALL, 0])
+        trimesh.util.concatenate(balls).export(folder / "two_balls.obj")
+        name = f"mesh:{folder / 'two_balls.obj'}"
+        model, rng = SkinModel(load_skin("coarse"), read_material("default")), np.random.default_rng(7)
+        angle, along = rng.uniform(-0.5, 0.5, count), rng.uniform(-9e-3, -4e-3, count)
+        points = surface_samples(model.geometry.vert, model.geometry.outer_face, "cpu")
+        mat = rotation(angle[:, None] * [1.0, 0, 0])
+        begin = along[:, None] * [1.0, 0, 0] - 0.05 * mat[:, :, 1]
+        one, side = Placed(f"geom:sphere:{BALL}", count), [APART / 2, 0, 0]
+        later, sooner = (
+            first_touch(one, points, begin + s, mat, mat[:, :, 1]) for s in (side, np.negative(side))
+        )
+        # turned so that both balls meet the skin at once
+        mat = mat @ rotation(np.arctan((later - sooner) / APART)[:, None] * [0, 0, 1.0])
+        ahead = mat[:, :, 1]
+        begin = along[:, None] * [1.0, 0, 0] - 0.05 * ahead
+        met = first_touch(Placed(name, count), points, begin, mat, ahead)
+        depth = rng.uniform(0.6e-3, 1.6e-3, count)[:, None] * np.linspace(0, 1, STEPS) - 5e-6
+        travel = met[:, None] + depth
+        motions = [
+            Motion("press", {}, begin[k] + travel[k][:, None] * ahead[k], np.tile(mat[k], (STEPS, 1, 1)))
+            for k in range(count)
+        ]
+        time = np.arange(STEPS) / RATE
+        walk = simulate if tier == "full" else simulate_condensed
+        fields, film, ones = walk(model, name, motions, time=time), FilmConduction(model.geometry), []
+        for k, motion in enumerate(motions):
+            vert = fields.vert_xpos(model.geometry.vert, k)
+            read = read_motion(film, vert, time, fields.pressure[k], k)
+            columns = {
+                "displacement": vert - model.geometry.vert,
+                "contact_force": None if fields.contact_force is None else fields.contact_force[k],
+                "wrench": fields.wrench[k],
+                "counts": read.counts,
+                "converged": fields.converged[k],
+            }
+            ones.append(Interaction(f"two-{k}", "two_balls", motion.kind, "test", k, {}, time, **columns))
+        write_shard(path, ones, model.geometry)
+    return from_set(folder)
+
+
+def dead(data: Examples, reads: str, seed: int = 0) -> Examples:
+    """The same with one electrode of each touch that stays at its rest (the one that answered most) or reads
+    nothing (any)."""
+    which = np.random.default_rng(seed).integers(19, size=data.owner.max() + 1)
+    if reads == "rest":
+        for k in np.unique(data.owner):
+            which[k] = np.abs(data.log_change[data.owner == k]).max(0).argmax()
+    which = which[data.owner]
+    counts, rows = data.counts.copy(), np.arange(len(data.owner))
+    counts[rows, which] = data.tare[rows, which] if reads == "rest" else 0
+    return dataclasses.replace(data, counts=counts)
+
+
+def strangeness(reader: Reader, data: Examples, touches: np.ndarray | None = None) -> np.ndarray:
+    """Median novelty of each touch (k,)."""
+    novelty = reader.predict(data.counts, data.tare).novelty
+    every = np.unique(data.owner) if touches is None else touches
+    return np.array([np.median(novelty[data.owner == k]) for k in every])
+
+
+def area(usual: np.ndarray, strange: np.ndarray) -> float:
+    """Share of pairs in which the strange one has the higher score."""
+    more = (strange[:, None] > usual).mean() + 0.5 * (strange[:, None] == usual).mean()
+    return float(more)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
+    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
+    parser.add_argument("--count", type=int, default=600, help="ordinary touches")
+    parser.add_argument("--few", type=int, default=48, help="touches of each other kind")
+    parser.add_argument("--tier", default="condensed", help="of the ordinary skin; full knows contact places")
+    parser.add_argument("--seeds", type=int, default=10, help="divisions")
+    given = parser.parse_args(argv)
+    data = ordinary(given.out / "ordinary", given.count, given.tier)
+    fill = {"skin": {"fill_volume": FILL}}
+    filled = ordinary(given.out / f"filled{FILL:g}", given.few, given.tier, seed=1, options=fill)
+    two = two_contacts(given.out / "two", given.few, given.tier)
+    covered, areas, errors = {}, {}, {}
+    names = np.unique(data.owner)
+    for seed in range(given.seeds):
+        part = assign(len(names), seed, SHARES)
+        train, kept, test = (names[part == k] for k in ("train", "validation", "test"))
+        reader = fit_reader(data, train, kept, seed=seed)
+        rows = np.isin(data.owner, test)
+        found = reader.predict(data.counts[rows], data.tare[rows])
+        truth = data.targets | {"electrodes": data.counts}
+        for name, value in found.value.items():
+            error = np.abs(value - truth[name][rows])
+            there = np.isfinite(error).all(1)
+            covered.setdefault(name, []).append(float((error <= found.half[name])[there].mean()))
+            errors.setdefault(name, []).append(float(np.sqrt((error[there] ** 2).mean())))
+        unseen = dataclasses.replace(data, **{k: getattr(data, k)[rows] for k in ("counts", "tare", "owner")})
+        usual = strangeness(reader, unseen)
+        cases = {"more liquid": filled, "two contacts": two}
+        cases |= {f"an electrode reads {what}": dead(unseen, what, seed) for what in ("rest", "nothing")}
+        for name, case in cases.items():
+            areas.setdefault(name, []).append(area(usual, strangeness(reader, case)))
+    out = {
+        "touches": len(names),
+        "divisions": given.seeds,
+        "covered_by_90": {k: [float(np.mean(v)), float(np.std(v))] for k, v in covered.items()},
+        "rmse": {k: float(np.mean(v)) for k, v in errors.items()},
+        "novelty_area": {k: [float(np.mean(v)), float(np.min(v))] for k, v in areas.items()},
+    }
+    given.json.write_text(json.dumps(out, indent=1))
+    print(json.dumps(out, indent=1))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"reader: {error}")

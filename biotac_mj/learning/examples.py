@@ -1,0 +1,104 @@
+"""Rows of electrodes with what is to be told from them, from a recording or from a data set."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from ..recordings import Recording
+from ..sensor.channels import NELECTRODE, log_impedance
+from .inverse import contact_centre
+
+__all__ = ["Examples", "from_recording", "from_set"]
+
+_BLOCKS = 40  # trajectories of a recording: its rows are alike in time
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Examples:
+    """n rows.
+
+    Attributes:
+      counts: (n, 19) raw; tare: (n, 19) at rest. owner: (n,) number of the trajectory.
+      targets: "force" (n, 3) [N], "place" (n, 3) [m], as far as they are known; NaN: not in this row.
+      tared: whether the tare is measured; else ln Z is taken as it is. synthetic: no real sensor.
+    """
+
+    counts: np.ndarray
+    tare: np.ndarray
+    owner: np.ndarray
+    targets: dict[str, np.ndarray]
+    tared: bool
+    source: str
+    synthetic: bool
+
+    @property
+    def log_change(self) -> np.ndarray:
+        """(n, 19) d ln Z against the tare, or ln Z itself."""
+        return log_impedance(self.counts) - (log_impedance(self.tare) if self.tared else 0.0)
+
+
+def from_recording(recording: Recording) -> Examples:
+    """A recording as 40 pieces in order of time: force, and the place of the contact, where it has them.
+
+    Raises:
+      ValueError: no raw counts, or neither force nor contact place.
+    """
+    counts, _ = recording.counts()
+    found = {"force": recording.force, "place": recording.contact_pos}
+    targets = {name: value for name, value in found.items() if value is not None}
+    if not targets:
+        raise ValueError(f"{recording.name} has neither force nor contact place: there is nothing to learn")
+    owner = np.arange(len(counts)) * _BLOCKS // len(counts)
+    return Examples(counts, counts, owner, targets, False, recording.name, False)
+
+
+def from_set(path: pathlib.Path | str) -> Examples:
+    """A data set: measured counts of labelled interactions, or, where none is labelled, simulated ones; the
+    first row of each is its tare. The force is that of the object on the skin, measured where it is known.
+
+    Raises:
+      FileNotFoundError, ValueError: no set, or one without counts.
+    """
+    from ..data import TactileSet
+
+    with TactileSet(path) as data:
+        measured = bool(data.labelled.any())
+        name = "measured_counts" if measured else "counts"
+        chosen = np.flatnonzero(data.labelled) if measured else np.arange(len(data))
+        rows = data.steps(chosen)
+        owner, first = data.owner()[rows], np.repeat(data.start, data.stop - data.start)[rows]
+        good = (
+            data["converged"][rows].astype(bool) if "converged" in data.columns else np.ones(len(rows), bool)
+        )
+        counts = data[name]
+        tare = counts[first][:, :NELECTRODE].astype(float)
+        targets = {}
+        known = [c for c in ("measured_wrench", "wrench") if c in data.columns]
+        if known:
+            force = data[known[0]][rows][:, :3].astype(float)
+            for other in known[1:]:
+                force = np.where(np.isfinite(force), force, data[other][rows][:, :3])
+            targets["force"] = -force  # the store has that of the skin on the object
+        if "contact_force" in data.columns:
+            size = np.concatenate(
+                [np.linalg.norm(data["contact_force"][part], axis=2) for part in _parts(rows)]
+            )
+            targets["place"] = contact_centre(size, data.geometry.vert[data.outer_node])
+        if not targets:
+            raise ValueError(f"{path} has neither forces nor contacts: make a set with `biotac generate`")
+        keep = good & (rows != first)  # a tare is no reading
+        now = counts[rows][:, :NELECTRODE].astype(float)
+        return Examples(
+            now[keep],
+            tare[keep],
+            owner[keep],
+            {k: v[keep] for k, v in targets.items()},
+            True,
+            str(data.path.name),
+            not bool(np.isin(data.kind[chosen], ("recorded", "resimulated")).all()) or not measured,
+        )
+
+
+def _parts(rows):
+    return np.array_split(rows, max(1, len(rows) // 1024))

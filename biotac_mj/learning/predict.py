@@ -1,0 +1,141 @@
+"""`biotac predict`: a kept model on a recording, or on a data set's deformations; `--save` keeps one."""
+
+import pathlib
+
+import numpy as np
+import torch
+
+from ..files import hdf5, replacing
+from ..recordings import load_one
+from .arrays import load_arrays
+from .experiment import division_of
+from .protocol import conformal_width
+from .reader import TARGETS, UNITS, Prediction, Reader
+from .report import predictions_of, report_of
+from .weights import amend, describe, load_forward
+
+__all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
+
+SUFFIXES = (".csv", ".h5", ".hdf5")
+_LEVEL = 0.9
+_KIND = "ensemble"  # what `biotac train` keeps
+
+
+def predict(
+    model: pathlib.Path | str,
+    source: pathlib.Path | str,
+    sensor: str | None = None,
+    tare: int | None = None,
+    **load: object,
+) -> tuple[dict[str, np.ndarray], Prediction, dict]:
+    """Runs a model on all rows.
+
+    Args:
+      model: that reads electrodes, or, of "forward" direction, a skin's deformation.
+      source: a recording; for a forward model a data set. sensor, load: of `recordings.load_one`.
+      tare: first rows of a recording, whose mean is the sensor at rest.
+
+    Returns:
+      columns that say which row it is ("time" [s], of a set "interaction"), Prediction, and the model's
+      description.
+
+    Raises:
+      FileNotFoundError, ValueError: no such file, a model that does not fit, or no tare where one is needed.
+    """
+    meta = describe(model)
+    if meta.get("direction") == "forward":
+        return *_forward(model, source, meta), meta
+    reader = Reader.load(model)
+    recording, _ = load_one(source, sensor, **load)
+    counts, _ = recording.counts()
+    rest = None
+    if tare is not None:
+        if not 1 <= tare < len(counts):
+            raise ValueError(f"--tare {tare}: {recording.name} has {len(counts)} rows, some must be left")
+        rest = counts[:tare].mean(0)
+    return {"time": recording.time}, reader.predict(counts, rest), reader.meta
+
+
+def _forward(model, source, meta):
+    if "half" not in meta:
+        raise ValueError(f"{model} has no intervals: write it with `biotac evaluate TRAINED --save`")
+    arrays = load_arrays(source)
+    network = load_forward(model, arrays.geometry)
+    tare = torch.where(torch.isfinite(arrays.tare), arrays.tare, arrays.simulated[arrays.first])
+    value, strange = [], []
+    for rows in torch.arange(len(arrays.owner)).split(256):
+        u = arrays.field[rows].float()
+        value.append(network.counts(u, tare[rows]).numpy())
+        strange.append(_beyond(network.pod, u))
+    strange = np.concatenate(strange) / meta["usual"]
+    value = np.concatenate(value)
+    half = np.asarray(meta["half"]) * (1 + strange)[:, None]
+    where = {"interaction": arrays.owner.numpy(), "time": arrays.time.numpy().astype(float)}
+    return where, Prediction({"electrodes": value}, {"electrodes": half}, strange)
+
+
+def _beyond(pod, u):
+    """(n,) RMS [mm] of what displacements (n, nvert, 3) [mm] have beyond a model's components."""
+    return (pod.decode(pod(u)) - u).square().mean((1, 2)).sqrt().numpy()
+
+
+def save_forward_model(folder: pathlib.Path | str, out: pathlib.Path | str) -> None:
+    """Writes the forward model of the trajectory split with intervals of 90 % from its validation part, by
+    interaction; `attach(signal=FILE)` takes it.
+
+    Args:
+      folder: of `biotac train`.
+
+    Raises:
+      FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: too few interactions.
+    """
+    folder = pathlib.Path(folder)
+    source = folder / "forward-trajectory.safetensors"
+    if not source.is_file():
+        raise FileNotFoundError(f"no {source}: train seed 0 of the split trajectory")
+    report, found = report_of(folder / "trajectory-0.json"), predictions_of(folder / "trajectory-0.npz")
+    arrays = load_arrays(report["set"], limit=report["settings"].get("limit"))
+    pod = load_forward(source, arrays.geometry).pod
+    check = division_of(report["set"], "trajectory", 0, len(arrays.objects)).validation
+    rows = arrays.rows(check, labelled=True)
+    strange = np.concatenate([_beyond(pod, arrays.field[r].float()) for r in rows.split(256)])
+    usual = float(np.quantile(strange, 0.95))
+    kept = ~found["test"]
+    error = (found[f"predicted_{_KIND}"] - found["truth"])[kept] / (1 + strange / usual)[:, None]
+    half = conformal_width(error, found["owner"][kept], 1 - _LEVEL)
+    if not np.isfinite(half).all():
+        raise ValueError(
+            f"{len(check)} validation interactions are too few for intervals of 90 %: train on more"
+        )
+    amend(source, out, {"half": half.tolist(), "usual": usual, "level": _LEVEL})
+
+
+def write_prediction(
+    path: pathlib.Path | str, where: dict[str, np.ndarray], found: Prediction, meta: dict
+) -> None:
+    """A table (.csv: a column for each number and its half width) or arrays (.h5).
+
+    Raises:
+      ValueError: another suffix.
+    """
+    path = pathlib.Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{path} ends in {path.suffix or 'nothing'}: give one of {', '.join(SUFFIXES)}")
+    if path.suffix != ".csv":
+        with hdf5(path) as file:
+            file.attrs["schema"] = "biotac_mj.prediction/1"
+            file.attrs["level"] = meta["level"]
+            for name, value in {**where, "novelty": found.novelty}.items():
+                file[name] = value
+            for name, value in found.value.items():
+                file[name], file[f"{name}_half"] = value, found.half[name]
+                file[name].attrs["unit"] = file[f"{name}_half"].attrs["unit"] = UNITS[name]
+        return
+    columns = dict(where)
+    for name, value in found.value.items():
+        columns |= dict(zip(TARGETS[name], value.T))
+        columns |= {f"{one}_half": half for one, half in zip(TARGETS[name], found.half[name].T)}
+    columns["novelty"] = found.novelty
+    with replacing(path) as temporary:
+        table = np.column_stack(list(columns.values()))
+        np.savetxt(temporary, table, "%.6g", ",", header=",".join(columns), comments="")

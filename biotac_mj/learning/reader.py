@@ -1,0 +1,270 @@
+"""What the electrodes tell, instant by instant: force, contact place, and themselves through a code; each
+with an interval, and a score of how far a row is from what was trained on. Kept as one file."""
+
+import dataclasses
+import json
+import pathlib
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..data.schema import SPLITS
+from ..data.splits import assign
+from ..files import replacing
+from ..sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
+from .examples import Examples
+from .force import ridge
+from .protocol import conformal_width
+from .terms import Terms
+
+__all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "judge_in_time"]
+
+TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": tuple(ELECTRODES)}
+UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
+_CODE = 8
+_NEAR = 10  # neighbours that a row is compared with
+_KNOWN = 2000  # rows that stand for what was trained on
+_FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
+_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1)
+# arguments of `Terms.fit`; predictions are the mean over these: none alone is safe where something new comes
+_KINDS = [
+    {"common": common, **more}
+    for common in (False, True)
+    for more in ({}, {"products": 3}, {"products": 5}, {"length": 1.0})
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """n rows.
+
+    Attributes:
+      value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
+        half widths of the intervals.
+      novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row is stranger.
+    """
+
+    value: dict[str, np.ndarray]
+    half: dict[str, np.ndarray]
+    novelty: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reader:
+    """A model; made by `fit_reader`, kept by `save`.
+
+    Attributes:
+      meta: what it is: "tared" (whether ln Z is taken against a tare), "level" of the intervals, "source".
+      tensors: its numbers.
+    """
+
+    meta: dict
+    tensors: dict[str, np.ndarray]
+
+    @property
+    def targets(self) -> list[str]:
+        """Names of what it predicts, of TARGETS."""
+        return [name for name in TARGETS if f"{name}.half" in self.tensors]
+
+    def predict(self, counts: np.ndarray, tare: np.ndarray | None = None) -> Prediction:
+        """Predictions of raw counts (n, 19); tare: (19,) or (n, 19) counts at rest, of a model that is tared.
+
+        Raises:
+          ValueError: no tare where one is needed.
+        """
+        if self.meta["tared"] and tare is None:
+            raise ValueError("this model reads changes from rest: give rows at rest with --tare")
+        rest = log_impedance(tare) if self.meta["tared"] else np.zeros(len(ELECTRODES))
+        x = log_impedance(counts) - rest
+        strange = self._distance(x) / self.tensors["usual"]
+        value, half = {}, {}
+        for name in self.targets:
+            out = self._code(x) if name == "electrodes" else self._regress(name, x)
+            value[name] = counts_from_log_impedance(out + rest) if name == "electrodes" else out
+            half[name] = self.tensors[f"{name}.half"] * _scale(strange)[:, None]
+        return Prediction(value, half, strange)
+
+    def _regress(self, name, x):
+        out = 0.0
+        for k, terms in enumerate(self._kinds):
+            out = out + terms(x) @ self.tensors[f"{name}.{k}.weight"] + self.tensors[f"{name}.{k}.offset"]
+        return out / len(_KINDS)
+
+    @property
+    def _kinds(self):
+        names = [field.name for field in dataclasses.fields(Terms)]
+        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(_KINDS))]
+
+    def _code(self, x):
+        t = self.tensors
+        return (x - t["mean"]) @ t["axes"][:, :_CODE] @ t["axes"][:, :_CODE].T + t["mean"]
+
+    def _distance(self, x):
+        """(n,) from the nearest rows that are known, over how far those are from theirs."""
+        t = self.tensors
+        near, who = cKDTree(t["known"]).query((x - t["mean"]) @ t["axes"] / t["spread"], _NEAR)
+        return near.mean(1) / t["known_distance"][who].mean(1)
+
+    def save(self, path: pathlib.Path | str) -> None:
+        """Writes a safetensors file."""
+        from safetensors.numpy import save
+
+        from .weights import FORMAT
+
+        meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(ELECTRODES)}
+        tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in self.tensors.items()}
+        with replacing(path) as temporary:
+            temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
+
+    @classmethod
+    def load(cls, path: pathlib.Path | str) -> "Reader":
+        """Reads what `save` wrote.
+
+        Raises:
+          FileNotFoundError, ValueError: no such file, or no such model; the text names it.
+        """
+        from .weights import FORMAT, read_tensors
+
+        meta, tensors = read_tensors(path)
+        if meta.get("format") != FORMAT or meta.get("direction") != "reader":
+            raise ValueError(
+                f"{path} holds no model that reads electrodes: it says {meta.get('format')}, "
+                f"{meta.get('direction')}; write one with `biotac evaluate ... --save`"
+            )
+        one = cls(meta, {name: np.asarray(value, float) for name, value in tensors.items()})
+        try:
+            one.predict(np.full((2, len(ELECTRODES)), FULL_SCALE / 2), np.full(len(ELECTRODES), 2000.0))
+        except (KeyError, ValueError) as error:
+            raise ValueError(
+                f"{path} does not fit together ({error}): it is damaged, write it anew"
+            ) from None
+        return one
+
+
+def _scale(strange):
+    """Intervals widen with novelty; among ordinary rows they hardly differ."""
+    return 1 + strange
+
+
+def fit_reader(
+    data: Examples, train: np.ndarray, kept: np.ndarray, level: float = 0.9, seed: int = 0
+) -> Reader:
+    """Fits to trajectories `train` and sizes the intervals on others, `kept` (numbers of `data.owner`).
+
+    Args:
+      level: of the intervals. seed: of the random waves and of the rows that are remembered.
+
+    Raises:
+      ValueError: too few trajectories.
+    """
+    least = int(np.ceil(level / (1 - level) - 1e-9))
+    if len(kept) < least or len(train) < _FOLDS:
+        raise ValueError(
+            f"{len(train)} trajectories train and {len(kept)} are kept aside: intervals of "
+            f"{100 * level:.0f} % need {least} aside and at least {_FOLDS} to train; record more touches"
+        )
+    fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
+    x = data.log_change
+    tensors = _space(x[fit], seed)
+    kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in _KINDS]
+    for k, terms in enumerate(kinds):
+        tensors |= {f"terms.{k}.{f.name}": getattr(terms, f.name) for f in dataclasses.fields(Terms)}
+        columns = terms(x)
+        for name, y in data.targets.items():
+            rows = np.flatnonzero(fit & np.isfinite(y).all(1))
+            weight, offset = _best_ridge(columns[rows], y[rows], data.owner[rows])
+            tensors |= {f"{name}.{k}.weight": weight, f"{name}.{k}.offset": offset}
+    meta = {"tared": data.tared, "level": level, "source": data.source, "units": UNITS}
+    meta |= {"train": len(train), "aside": len(kept), "synthetic": data.synthetic}
+    tensors |= {"usual": np.array(1.0)} | {f"{name}.half": np.zeros(1) for name in data.targets}
+    tensors["electrodes.half"] = np.zeros(1)
+    raw = Reader(meta, tensors).predict(data.counts[aside], data.tare[aside])
+    tensors["usual"] = np.array(np.quantile(raw.novelty, 0.95))
+    truth = data.targets | {"electrodes": data.counts}
+    for name in raw.value:
+        error = (raw.value[name] - truth[name][aside]) / _scale(raw.novelty / tensors["usual"])[:, None]
+        there = np.isfinite(error).all(1)
+        half = conformal_width(error[there], data.owner[aside][there], 1 - level)
+        if not np.isfinite(half).all():
+            raise ValueError(
+                f"{len(np.unique(data.owner[aside][there]))} trajectories kept aside have {name}: intervals "
+                f"of {100 * level:.0f} % need {least}; record more touches"
+            )
+        tensors[f"{name}.half"] = half
+    return Reader(meta, tensors)
+
+
+def _space(x, seed):
+    """Components of rows (n, 19), and rows that stand for all of them."""
+    mean = x.mean(0)
+    size, axes = np.linalg.eigh((x - mean).T @ (x - mean) / len(x))
+    size, axes = np.maximum(size[::-1], 0), axes[:, ::-1]
+    # what the last half of the components has is noise: less counts for nothing
+    spread = np.sqrt(size + size[len(size) // 2 :].mean() + 1e-12)
+    chosen = np.random.default_rng(seed).permutation(len(x))[:_KNOWN]
+    known = (x[chosen] - mean) @ axes / spread
+    near = cKDTree(known).query(known, _NEAR + 1)[0][:, 1:].mean(1)
+    return {
+        "mean": mean,
+        "axes": axes,
+        "spread": spread,
+        "known": known,
+        "known_distance": np.maximum(near, 1e-3 * near.mean() + 1e-9),
+    }
+
+
+def _best_ridge(columns, y, owner):
+    """Weights (terms, k), offset (k,) of the strength that is best on whole trajectories left out."""
+    fold = np.unique(owner, return_inverse=True)[1] % _FOLDS
+    error = np.zeros((len(_RIDGE), y.shape[1]))
+    for i in range(_FOLDS):
+        train, test = fold != i, fold == i
+        for k, strength in enumerate(_RIDGE):
+            weight, offset = ridge(columns[train], y[train], strength)
+            error[k] += ((columns[test] @ weight + offset - y[test]) ** 2).sum(0)
+    fits = [ridge(columns, y, strength) for strength in _RIDGE]
+    best = error.argmin(0)
+    return (
+        np.column_stack([fits[b][0][:, j] for j, b in enumerate(best)]),
+        np.array([fits[b][1][j] for j, b in enumerate(best)]),
+    )
+
+
+def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
+    """A model of a set and how good it is: 72 % of the trajectories train, 18 % size the intervals, 10 % are
+    looked at once.
+
+    Raises:
+      ValueError: too few trajectories.
+    """
+    names = np.unique(data.owner)
+    part = assign(len(names), seed)
+    train, kept, test = (names[part == name] for name in SPLITS)
+    reader = fit_reader(data, train, kept, seed=seed)
+    return reader, _scores(reader, data, test)
+
+
+def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple[Reader, dict]:
+    """The same of a recording: the first rows train, the pieces after them size the intervals; nothing is
+    left to judge by, `biotac evaluate` itself does that."""
+    names = np.unique(data.owner)
+    cut = int(fraction * len(names))
+    reader = fit_reader(data, names[:cut], names[cut:], seed=seed)
+    return reader, _scores(reader, data, names[:0])
+
+
+def _scores(reader, data, test):
+    rows = np.isin(data.owner, test)
+    found = reader.predict(data.counts[rows], data.tare[rows])
+    truth = data.targets | {"electrodes": data.counts}
+    out = {}
+    for name, value in found.value.items():
+        error = np.abs(value - truth[name][rows])
+        there = np.isfinite(error).all(1)
+        out[name] = {
+            "unit": UNITS[name],
+            "half": float(reader.tensors[f"{name}.half"].mean()),
+            "rmse": float(np.sqrt((error[there] ** 2).mean())) if there.any() else None,
+            "covered": float((error <= found.half[name])[there].mean()) if there.any() else None,
+        }
+    return {"targets": out, **{key: reader.meta[key] for key in ("train", "aside")}}

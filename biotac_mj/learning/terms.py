@@ -1,0 +1,65 @@
+"""Terms of a regression on ln Z of the electrodes, instant by instant: what can be kept in a file."""
+
+import dataclasses
+
+import numpy as np
+
+from ..sensor.channels import NELECTRODE
+
+__all__ = ["Terms"]
+
+_WAVES = 200  # random waves: more changed nothing on two recordings
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Terms:
+    """ln Z (n, 19), products of its first components, and random waves over them (the features of a Gaussian
+    kernel).
+
+    Attributes:
+      common: 1.0 takes the mean over the electrodes out first: warm-up changes all of them alike.
+      mean (19,), axes (19, k): of the components that products are made of, within low and high (k,).
+      wave: (19, m) of the waves, over all components.
+    """
+
+    common: np.ndarray
+    mean: np.ndarray
+    axes: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    wave: np.ndarray
+
+    @classmethod
+    def fit(
+        cls, log_z: np.ndarray, products: int = 0, common: bool = False, length: float = 0.0, seed: int = 0
+    ) -> "Terms":
+        """Fits to rows (n, 19).
+
+        Args:
+          products: components whose products are terms. common: without the mean over the electrodes.
+          length: of the waves, in median distances between rows; 0: no waves. seed: of the waves.
+        """
+        x = log_z - log_z.mean(1, keepdims=True) if common else log_z
+        mean = x.mean(0)
+        axes = np.linalg.eigh((x - mean).T @ (x - mean))[1][:, ::-1]
+        main = (x - mean) @ axes[:, :products]
+        wave = np.zeros((NELECTRODE, 0))
+        if length:
+            rng = np.random.default_rng(seed)
+            a, b = x[rng.integers(len(x), size=(2, 2000))]
+            usual = np.median(np.linalg.norm(a - b, axis=1))
+            wave = rng.normal(size=(NELECTRODE, _WAVES)) / (length * max(usual, 1e-9))
+        return cls(np.array(float(common)), mean, axes[:, :products], main.min(0), main.max(0), wave)
+
+    def __call__(self, log_z: np.ndarray) -> np.ndarray:
+        """(n, terms) of rows (n, 19)."""
+        x = log_z - self.common * log_z.mean(1, keepdims=True)
+        columns = [x]
+        if self.axes.shape[1]:  # products must not run away beyond what was seen
+            main = np.clip((x - self.mean) @ self.axes, self.low, self.high)
+            i, j = np.triu_indices(main.shape[1])
+            columns.append(main[:, i] * main[:, j])
+        if self.wave.shape[1]:
+            phase = (x - self.mean) @ self.wave
+            columns += [np.cos(phase), np.sin(phase)]
+        return np.hstack(columns)

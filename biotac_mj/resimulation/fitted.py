@@ -1,0 +1,145 @@
+"""Poses of a plate that pressed a sensor by hand, fitted from force and electrodes: nobody recorded them."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from ..data.importers import measured
+from ..data.plan import Motion
+from ..geometry.skin_geometry import SkinGeometry
+from ..matching.fit import Rows, Setup, fit_constants, fit_states
+from ..matching.match import SIGNS, log_changes, rows_of
+from ..matching.response import Response
+from ..matching.states import PlateGrid, PlateStates, frame, plate_states
+from ..recordings import Recording
+from ..sensor.channels import NELECTRODE, counts_from_log_impedance
+from ..sensor.film import CALIBRATED_RADIUS, FilmConduction
+from ..skin import Material, SkinOptions
+from .touch import MOST, Touch
+
+__all__ = ["PLATE", "fitted_touches", "plate_way"]
+
+PLATE = "geom:plane"
+_LOADED = 0.5  # [N] from which a plate's pose is fitted; `matching` takes no lighter rows either
+_LEAD = 5e-6  # [m] before first touch: where row 0 is
+_SMOOTH = 5  # rows of the running median of states, each of which was sought by itself
+_CHUNK = 2000  # rows that are fitted together: each needs a table of its own
+_EVERY = 10  # of the loaded rows one takes part in the fit of the constants
+_FEWEST = 8  # rows of a touch
+
+
+def plate_way(
+    geometry: SkinGeometry, state: np.ndarray, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A plate's poses (n, 3) [m] and (n, 3, 3) through states (n, 4) at depths (n,) from first touch [m], and
+    its axes (n, 3, 3), rows along, across and towards the core.
+
+    From row to row it rolls on the skin where it touches, without sliding there but for what the drags
+    differ by. Its frame has +y towards the core."""
+    outer = geometry.vert[np.unique(geometry.outer_face)]
+    axes = np.array([frame(*angles) for angles in state[:, :2]])
+    along, across, inwards = np.swapaxes(axes, 0, 1)
+    height = outer @ inwards.T
+    first = height.argmin(0)  # the node that a plate meets first
+    level = height.min(0) + depth
+    mat = np.stack([np.cross(inwards, across), inwards, across], 2)
+    drag = (state[:, 2:3] * along + state[:, 3:] * across) * depth[:, None]
+    pos = np.empty((len(state), 3))
+    pos[0] = outer[first[0]] + drag[0] + depth[0] * inwards[0]
+    for k in range(1, len(state)):
+        middle = outer[first[[k - 1, k]]].mean(0)
+        here = middle + mat[k] @ mat[k - 1].T @ (pos[k - 1] - middle) + drag[k] - drag[k - 1]
+        pos[k] = here + (level[k] - here @ inwards[k]) * inwards[k]
+    return pos, mat, axes
+
+
+def fitted_touches(
+    recording: Recording,
+    geometry: SkinGeometry,
+    material: Material,
+    options: SkinOptions,
+    rate: float,
+    block: float,
+    grid: PlateGrid | None = None,
+    progress: bool = True,
+) -> tuple[list[Touch], Material, list[str]]:
+    """Touches of `block` seconds [s] each, between rests that are the fit's, not the recording's.
+
+    Args:
+      rate: [Hz] of the rows that are taken, at most. grid: of the table of states.
+
+    Returns:
+      touches, the material with the Young's modulus that was fitted, and what must be said of them.
+
+    Raises:
+      ValueError: no raw counts, no force, or too few loaded rows.
+    """
+    found = measured(recording)
+    electrodes = found.counts[:, :NELECTRODE].astype(float)
+    if recording.force is not None and not np.isfinite(recording.force).all():
+        bad = ~np.isfinite(recording.force).all(1)
+        raise ValueError(f"{recording.name} has {bad.sum()} rows without force: cut it to those that have it")
+    constant_rows = rows_of(electrodes, recording.force, _EVERY)
+    states = plate_states(geometry, material, options, grid, quiet=not progress)
+    film = FilmConduction(geometry, sensor=None, electrode_radius=CALIBRATED_RADIUS)
+    response = Response(states, log_changes(states, film))
+    const, _ = fit_constants(response, constant_rows, Setup())
+    due = np.floor(recording.time * rate + 1e-6)
+    taken = np.flatnonzero(np.r_[True, np.diff(due) > 0])
+    force = recording.force[taken] @ SIGNS
+    loaded = (np.linalg.norm(force, axis=1) > _LOADED) & (force[:, 2] > 0)
+    taken, force = taken[loaded], force[loaded]
+    rows = Rows(electrodes[taken], force, taken / len(recording))
+    parts = [fit_states(response, rows[k : k + _CHUNK], const, Setup()) for k in range(0, len(rows), _CHUNK)]
+    state = np.concatenate([part.state for part in parts])
+    misfit = np.sqrt(((np.concatenate([part.counts for part in parts]) - rows.counts) ** 2).mean(1))
+    time = recording.time[taken]
+    gap = 4 / rate
+    out, begin = [], 0
+    for k in range(1, len(taken) + 1):
+        if k < len(taken) and time[k] - time[k - 1] < gap and time[k] - time[begin] < block:
+            if k - begin < MOST - 1:
+                continue
+        piece, begin = slice(begin, k), k
+        if piece.stop - piece.start >= _FEWEST - 1:
+            out.append(
+                _touch(recording, found, taken[piece], state[piece], force[piece], const, states, geometry)
+            )
+            out[-1].motion.parameters["misfit_counts"] = float(np.median(misfit[piece]))
+    if not out:
+        raise ValueError(f"{recording.name} has no touch of {_FEWEST} rows: take a higher --rate")
+    notes = [
+        *found.notes,
+        f"the plate's poses were fitted from force and electrodes (median misfit {np.median(misfit):.0f} "
+        "counts), row 0 of each touch is the fitted rest: nobody measured either",
+        f"Young's modulus that fits the forces: {const.modulus / 1e6:.2f} MPa",
+    ]
+    return out, dataclasses.replace(material, youngs_modulus=const.modulus), notes
+
+
+def _touch(recording, found, rows, state, force, const, states: PlateStates, geometry):
+    state = median_filter(state, (_SMOOTH, 1), mode="nearest")
+    deep = Response(states, np.repeat(states.depth[..., None], NELECTRODE, -1))
+    depth = np.maximum(deep.at_load(force[:, 2] / const.modulus)(state, False)[0][:, 0], 0.0)
+    pos, mat, axes = plate_way(geometry, state, depth)
+    push = state[0, 2] * axes[0, 0] + state[0, 3] * axes[0, 1] + axes[0, 2]
+    time = recording.time[rows]
+    step = np.median(np.diff(time))
+    counts = np.concatenate([found.counts[rows[:1]], found.counts[rows]])
+    counts[0, NELECTRODE:] = np.nan  # the fit knows electrodes alone
+    counts[0, :NELECTRODE] = counts_from_log_impedance(
+        const.offset + const.drifted(rows[:1] / len(recording))[:, None]
+    )[0]
+    wrench = np.full((len(rows) + 1, 6), np.nan, np.float32)
+    wrench[0, :3] = 0
+    wrench[1:, :3] = -np.einsum("nk,nkj->nj", force, axes)
+    pac = None if found.pac is None else np.concatenate([found.pac[rows[:1]], found.pac[rows]])
+    parameters = {"poses": "fitted", "tare": "fitted", "recording": recording.name}
+    motion = Motion(
+        "resimulated",
+        parameters | {"rows": [int(rows[0]), int(rows[-1])]},
+        np.concatenate([pos[:1] - (depth[0] + _LEAD) * push, pos]),
+        np.concatenate([mat[:1], mat]),
+    )
+    return Touch(motion, np.concatenate([[time[0] - step], time]), counts, pac, wrench)

@@ -1,0 +1,286 @@
+"""`biotac resimulate`: the skin driven along the touches of a recording, stored with what the sensor read."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+
+import numpy as np
+import tqdm
+
+from ..data.generate import made_already
+from ..data.objects import OBJECTS, make_object
+from ..data.plan import Motion
+from ..data.readings import read_in_worker, readings_pool
+from ..data.schema import DISPLACEMENT_SCALE, Interaction
+from ..data.simulate import simulate
+from ..data.splits import assign
+from ..data.store import TactileSet, shard_path, write_shard
+from ..files import replacing
+from ..geometry import load_skin
+from ..geometry.rigid import quaternion
+from ..recordings import Recording
+from ..sensor.channels import NELECTRODE, log_impedance
+from ..skin import SkinModel
+from ..skin.settings import plain, read_dict, read_settings
+from .fitted import PLATE, fitted_touches
+from .touch import Touch, touches_of
+
+__all__ = ["POSES", "ResimulateOptions", "ResimulateReport", "resimulate"]
+
+POSES = ("recorded", "fitted")
+
+
+@dataclasses.dataclass(frozen=True)
+class ResimulateOptions:
+    """How a recording is simulated again. All of it but `device` is kept with the set and must be the same
+    when an interrupted run goes on.
+
+    Attributes:
+      object: what touches, see `data.objects.make_object`; None: what the recording says; fitted poses are
+        those of a plate.
+      poses: "recorded", or "fitted" from force and electrodes for a flat plate pressed by hand.
+      mount: pose x y z [m], qw qx qy qz of the BioTac frame in the frame of the recorded sensor's pose.
+      object_pose: of an object that stood still and has no recorded pose.
+      rate: [Hz] of the rows that are taken, at most; no row is made up.
+      block: [s] of a touch with fitted poses.
+      skin, material, element, liquid, options: of the simulated sensor, as in `biotac press`.
+      batch: touches that a GPU solves together; a shard holds one batch.
+      seed: of the split and of the simulated noise. device: of Warp.
+    """
+
+    object: str | None = None
+    poses: str = "recorded"
+    mount: tuple = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    object_pose: tuple | None = None
+    rate: float = 20.0
+    block: float = 5.0
+    skin: str = "default"
+    material: str | dict = "default"
+    element: str | None = None
+    liquid: bool | None = None
+    options: str | dict | None = None
+    batch: int = 8
+    seed: int = 0
+    device: str = "cpu"
+
+    def __post_init__(self):
+        object.__setattr__(self, "material", plain(self.material))
+        if self.options is not None:
+            object.__setattr__(self, "options", plain(read_dict(self.options, "options")))
+        if self.poses not in POSES:
+            raise ValueError(f"unknown poses {self.poses!r}: choose one of {', '.join(POSES)}")
+        if self.poses == "fitted" and self.object not in (None, PLATE):
+            raise ValueError(f"fitted poses are a plate's: leave --object {self.object} out")
+        if self.batch < 1 or not (self.rate > 0 and self.block > 0):
+            raise ValueError(
+                f"rate {self.rate}, block {self.block} and batch {self.batch} must all be above 0"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class ResimulateReport:
+    """What a run did.
+
+    Attributes:
+      interactions, steps, nonconverged: in the set. made: shards made by this run.
+      agreement: median over rows in touch of the correlation of simulated and measured change of ln Z over
+        the electrodes; NaN where nothing changes. force_rms: [N] between simulated and measured normal force
+        of rows that have one, NaN without. notes: what was assumed and left out.
+    """
+
+    interactions: int
+    steps: int
+    nonconverged: int
+    made: int
+    agreement: float
+    force_rms: float
+    notes: list[str]
+
+
+def resimulate(
+    recording: Recording,
+    out: pathlib.Path | str,
+    options: ResimulateOptions | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+) -> ResimulateReport:
+    """Makes a set in folder `out`, or what is missing of it: an interaction of kind "resimulated" for each
+    touch, with the simulated skin's columns and those measured.
+
+    Args:
+      recording: with poses, or with force for fitted ones. options: see ResimulateOptions.
+      workers: processes for film and readings; None takes the cores there are, 0 this process.
+      progress: whether to show a bar.
+
+    Raises:
+      ValueError: the recording lacks what is needed, the folder holds another set, or an option is not
+        possible.
+    """
+    options, out = options or ResimulateOptions(), pathlib.Path(out)
+    geometry = load_skin(options.skin)
+    rubber, skin, modulus = read_settings(
+        options.material, options.options, element=options.element, liquid=options.liquid
+    )
+    name = PLATE if options.poses == "fitted" else _object(recording, options.object)
+    make_object(name)
+    model = SkinModel(geometry, rubber, skin, options.device, modulus=modulus)
+    if options.poses == "fitted":
+        touches, rubber, notes = fitted_touches(
+            recording, geometry, rubber, skin, options.rate, options.block, progress=progress
+        )
+        model = SkinModel(geometry, rubber, skin, options.device, modulus=modulus)
+    else:
+        touches, notes = touches_of(
+            recording,
+            name,
+            options.mount,
+            options.object_pose,
+            options.rate,
+            dataclasses.replace(model.geometry, vert=model.rest.vert),
+            options.device,
+        )
+    settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"}
+    settings |= {"count": len(touches), "recording": _fingerprint(recording), "object": name}
+    settings = json.loads(json.dumps(settings))
+    groups = [range(k, min(k + options.batch, len(touches))) for k in range(0, len(touches), options.batch)]
+    paths = [shard_path(out, number) for number in range(len(groups))]
+    todo = [number for number, path in enumerate(paths) if not made_already(path, settings)]
+    split = assign(len(touches), options.seed)
+    if todo:
+        about = {
+            "settings": settings,
+            "skin": options.skin,
+            "material": dataclasses.asdict(model.material),
+            "element": model.element,
+            "tier": "full",
+            "liquid": model.has_liquid,
+            "device": str(model.device),
+            "source": recording.source,
+            "poses": options.poses,
+            "notes": notes,
+        }
+        if workers is None:
+            workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
+        total = sum(len(touches[i].time) for number in todo for i in groups[number])
+        with (
+            tqdm.tqdm(total=total, desc="resimulate", unit="step", disable=not progress, leave=False) as bar,
+            readings_pool(model.geometry, workers, start_args=(model.geometry, model.rest.vert)) as pool,
+        ):
+            waiting = None
+            for number in [*todo, None]:
+                begun = None if number is None else _begin(model, name, touches, groups[number], pool, bar)
+                if waiting is not None:  # its readings were made while the skin went on
+                    _end(waiting, touches, name, options, split, paths, model, about)
+                waiting = None if number is None else (number, groups[number], begun)
+    report = _report(out, len(todo), notes)
+    with replacing(out / "resimulate.json") as temporary:
+        pathlib.Path(temporary).write_text(json.dumps(dataclasses.asdict(report), indent=1) + "\n")
+    return report
+
+
+def _object(recording, given):
+    name = given or recording.object
+    if not name or (given is None and name not in OBJECTS and not name.startswith(("geom:", "mesh:"))):
+        raise ValueError(
+            f"{recording.name} was touched with {name or 'something that nobody named'}: give --object, one "
+            f"of {', '.join(OBJECTS)}, or geom:TYPE:SIZE[,SIZE...], or mesh:FILE"
+        )
+    return name
+
+
+def _fingerprint(recording):
+    """Digest of a recording's rows: another one does not belong into the same set."""
+    found = hashlib.sha256(np.ascontiguousarray(recording.time))
+    for field in recording.fields:
+        found.update(field.encode() + np.ascontiguousarray(getattr(recording, field)).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _begin(model, name, touches, members, pool, bar):
+    """Simulates touches: of each (fields, its number there, readings to come)."""
+    members = list(members)
+    together = [members] if model.device.is_cuda else [[i] for i in members]
+    out = []
+    for group in together:
+        longest = max(len(touches[i].time) for i in group)
+        time = [_longer(touches[i].time, longest) for i in group]
+        motions = [_longer_motion(touches[i].motion, longest) for i in group]
+        fields = simulate(model, name, motions, time=time)
+        for k, i in enumerate(group):
+            n = len(touches[i].time)
+            seed = int(np.random.SeedSequence([i, 1]).generate_state(1, np.uint64)[0])
+            answer = pool.submit(
+                read_in_worker, fields.displacement[k, :n], touches[i].time, fields.pressure[k, :n], seed
+            )
+            out.append((fields, k, answer))
+            bar.update(n)
+    return out
+
+
+def _longer(time, n):
+    """Times that go on evenly to n rows: of worlds solved together all have as many."""
+    return np.concatenate([time, time[-1] + (time[-1] - time[-2]) * np.arange(1, n - len(time) + 1)])
+
+
+def _longer_motion(motion, n):
+    """The motion, standing still where it has ended, n rows long."""
+    row = np.minimum(np.arange(n), len(motion.pos) - 1)
+    return Motion(motion.kind, motion.parameters, motion.pos[row], motion.mat[row])
+
+
+def _end(begun, touches, name, options, split, paths, model, about):
+    number, members, parts = begun
+    ones = []
+    for i, (fields, k, answer) in zip(members, parts):
+        touch: Touch = touches[i]
+        n, read = len(touch.time), answer.result()
+        ones.append(
+            Interaction(
+                id=f"{i:06d}",
+                object=name,
+                kind="resimulated",
+                split=str(split[i]),
+                seed=options.seed,
+                parameters=touch.motion.parameters | {"clock": float(touch.time[0])},
+                time=touch.time,
+                displacement=fields.displacement[k, :n] * np.float32(DISPLACEMENT_SCALE),
+                wrench=fields.wrench[k, :n],
+                contact_force=fields.contact_force[k, :n],
+                pressure=fields.pressure[k, :n],
+                impedance=read.impedance,
+                counts=read.counts,
+                pac=read.pac,
+                indenter_pos=touch.motion.pos,
+                indenter_quat=quaternion(touch.motion.mat),
+                converged=fields.converged[k, :n] & ~read.failed,
+                measured_counts=touch.counts,
+                measured_pac=touch.pac,
+                measured_wrench=touch.wrench,
+            )
+        )
+    write_shard(paths[number], ones, model.geometry, about)
+
+
+def _report(out, made, notes):
+    with TactileSet(out) as data:
+        first = np.repeat(data.start, data.stop - data.start)
+        good = data["converged"][:] & (first != np.arange(data.nstep))
+        simulated = np.log(data["impedance"][:])
+        read = log_impedance(data["measured_counts"][:][:, :NELECTRODE].astype(float))
+        a, b = ((x - x[first])[good] for x in (simulated, read))
+        a, b = (x - x.mean(1, keepdims=True) for x in (a, b))
+        size = np.sqrt((a * a).sum(1) * (b * b).sum(1))
+        pattern = (a * b).sum(1)[size > 0] / size[size > 0]
+        loads = [np.linalg.norm(data[name][:][good, :3], axis=1) for name in ("wrench", "measured_wrench")]
+        error = (loads[0] - loads[1])[np.isfinite(loads[1])]
+        return ResimulateReport(
+            interactions=len(data),
+            steps=data.nstep,
+            nonconverged=int((~data["converged"][:]).sum()),
+            made=made,
+            agreement=float(np.median(pattern)) if len(pattern) else float("nan"),
+            force_rms=float(np.sqrt((error**2).mean())) if len(error) else float("nan"),
+            notes=notes,
+        )

@@ -1,0 +1,89 @@
+"""The verb `biotac resimulate`: its arguments here, its work beside it."""
+
+import argparse
+from collections.abc import Callable
+
+from ..arguments import SEED, check_device, device, output_folder, real, whole
+from ..recordings.verbs import add_load_arguments
+
+__all__ = ["add_verb"]
+
+_TEXT = "X Y Z [m], then QW QX QY QZ where it is turned"
+
+
+def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
+    """Adds it to argparse's subparsers; verb(verbs, name, run, text) makes one."""
+    v = verb(
+        verbs,
+        "resimulate",
+        _resimulate,
+        "Drive the simulated skin along a recording: a set of deformations and measured electrodes; goes on "
+        "where it was interrupted.",
+    )
+    v.add_argument("recording", metavar="FILE", help="of any kind that `biotac import` reads")
+    v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
+    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_load_arguments(v, "what touched: a name of `biotac generate --objects`, geom:... or mesh:FILE")
+    v.add_argument(
+        "--poses",
+        choices=("recorded", "fitted"),
+        default="recorded",
+        help="recorded with the file, or fitted from force and electrodes: a plate pressed by hand",
+    )
+    for name, text in (
+        ("mount", "pose of the BioTac frame in the frame of the sensor's recorded pose (default: the same)"),
+        ("object-pose", "of an object that stood still and has no recorded pose"),
+    ):
+        v.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs="+", metavar="X", help=f"{text}: {_TEXT}")
+    v.add_argument(
+        "--at-most", type=real(0.1, 1e4), default=20.0, metavar="HZ", help="rows a second that are simulated"
+    )
+    v.add_argument(
+        "--block", type=real(0.1, 1e6), default=5.0, metavar="S", help="length of a touch with fitted poses"
+    )
+    v.add_argument("--skin", default="default", help="mesh of the skin")
+    v.add_argument("--material", default="default", help="preset, .json file or JSON of the rubber")
+    v.add_argument(
+        "--liquid", action=argparse.BooleanOptionalAction, default=None, help="(default: the material's)"
+    )
+    v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
+    v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, together on a GPU")
+    v.add_argument("--workers", type=whole(0, 1024), help="processes for the readings (default: one a core)")
+    v.add_argument("--seed", type=SEED, default=0, help="of the split, and of the simulated noise")
+    v.add_argument("--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ...")
+    v.add_argument(
+        "--out", type=output_folder("resimulate.json"), required=True, metavar="DIR", help="folder of the set"
+    )
+    v.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _resimulate(args):
+    from ..recordings import load_one
+    from .resimulate import ResimulateOptions, resimulate
+
+    check_device(args.device)
+    recording, notes = load_one(
+        args.recording, args.sensor, force=args.force, rate=args.rate, scale=args.scale
+    )
+    chosen = {name: getattr(args, name) for name in ("mount", "object_pose")}
+    options = ResimulateOptions(
+        object=args.object,
+        poses=args.poses,
+        rate=args.at_most,
+        **{name: tuple(value) for name, value in chosen.items() if value},
+        **{
+            name: getattr(args, name)
+            for name in "block skin material liquid options batch seed device".split()
+        },
+    )
+    report = resimulate(recording, args.out, options, args.workers, not args.quiet)
+    print(
+        f"{report.interactions} touches, {report.steps} time steps, {report.nonconverged} of them not "
+        f"converged; {report.made} shards made"
+    )
+    print(f"simulated and measured electrodes agree: median correlation {report.agreement:.2f}")
+    if report.force_rms == report.force_rms:
+        print(f"simulated and measured force differ by {report.force_rms:.2f} N RMS")
+    for note in [*notes, *report.notes]:
+        print(f"  note: {note}")
+    print(f"written: {args.out}; next `biotac train {args.out}`")

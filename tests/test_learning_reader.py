@@ -1,0 +1,145 @@
+"""Models that are kept: synthetic electrodes that answer to force and place by a rule written here."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("safetensors")
+
+from recorded import synthetic  # noqa: E402
+
+from biotac_mj import cli  # noqa: E402
+from biotac_mj.learning.examples import Examples, from_recording  # noqa: E402
+from biotac_mj.learning.reader import Reader, fit_reader, judge  # noqa: E402
+from biotac_mj.learning.terms import Terms  # noqa: E402
+from biotac_mj.learning.weights import shipped  # noqa: E402
+from biotac_mj.recordings import write  # noqa: E402
+from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance  # noqa: E402
+
+STEPS = 8
+
+
+def pattern(place, force):
+    """(n, 19) d ln Z of presses at places (n,) along the finger with forces (n,): near ones rise, far ones
+    fall."""
+    distance = np.linspace(-1, 1, 19) - place[:, None]
+    return 0.3 * force[:, None] * (1.5 * np.exp(-(distance**2) / 0.1) - 0.4)
+
+
+def touches(count, seed, second=False):
+    """Examples of `count` presses; second: at two places at once."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(count), STEPS)
+    force = np.tile(np.linspace(0.2, 1, STEPS), count) * np.repeat(rng.uniform(0.5, 2, count), STEPS)
+    place = np.repeat(rng.uniform(-0.5, 0.5, count), STEPS)
+    change = pattern(place, force)
+    if second:
+        change = 0.5 * (change + pattern(np.where(place > 0, place - 0.8, place + 0.8), force))
+    tare = np.tile(REST_COUNTS["1"], (len(owner), 1))
+    counts = counts_from_log_impedance(log_impedance(tare) + change) + rng.normal(0, 2, tare.shape)
+    zero = np.zeros(len(owner))
+    # what no electrode tells is part of every real force: a trajectory's own error
+    own = np.repeat(rng.normal(0, 0.1, count), STEPS)
+    targets = {
+        "force": np.column_stack([zero, force + own, zero + rng.normal(0, 0.01, len(owner))]),
+        "place": np.column_stack([place, zero, zero]),
+    }
+    return Examples(np.clip(counts, 0, 4095), tare, owner, targets, True, "synthetic", True)
+
+
+@pytest.fixture(scope="module")
+def reader():
+    return fit_reader(touches(160, 0), np.arange(100), np.arange(100, 160))
+
+
+def test_unseen_touches_are_predicted_and_covered(reader):
+    data = touches(300, 1)
+    found = reader.predict(data.counts, data.tare)
+    assert np.abs(found.value["force"] - data.targets["force"])[:, 1].mean() < 0.15
+    assert np.abs(found.value["place"] - data.targets["place"])[:, 0].mean() < 0.08
+    for name in ("force", "place", "electrodes"):
+        truth = data.counts if name == "electrodes" else data.targets[name]
+        inside = np.abs(found.value[name] - truth) <= found.half[name]
+        wide = truth.std(0) > 0  # what never varies has an interval of nothing
+        assert 0.85 < inside[:, wide].mean() < 0.96, name
+    assert found.novelty[: 50 * STEPS].mean() < 1
+
+
+def test_novelty_rises_for_what_training_did_not_have(reader):
+    """Two places at once, and an electrode that stays at rest or reads nothing."""
+    data, two = touches(100, 2), touches(100, 3, second=True)
+    usual = np.median(reader.predict(data.counts, data.tare).novelty.reshape(-1, STEPS), 1)
+    nearest = np.abs(np.linspace(-1, 1, 19) - data.targets["place"][:, :1]).argmin(1)
+    rows = np.arange(len(nearest))
+    for reads in (data.tare[rows, nearest], 0.0, None):
+        counts = data.counts.copy()
+        if reads is None:
+            counts = two.counts
+        else:
+            counts[rows, nearest] = reads
+        found = reader.predict(counts, data.tare)
+        strange = np.median(found.novelty.reshape(-1, STEPS), 1)
+        assert (strange[:, None] > usual).mean() > 0.9
+        # and an interval widens with it
+        known = reader.predict(data.counts, data.tare)
+        assert (found.half["force"].mean(0) > known.half["force"].mean(0))[1:].all()
+
+
+def test_a_model_comes_back_from_its_file(reader, tmp_path):
+    reader.save(tmp_path / "m.safetensors")
+    back, data = Reader.load(tmp_path / "m.safetensors"), touches(5, 4)
+    ours, theirs = (one.predict(data.counts, data.tare) for one in (reader, back))
+    for name in ours.value:
+        np.testing.assert_allclose(theirs.value[name], ours.value[name], rtol=1e-3, atol=2e-2)
+    np.testing.assert_allclose(theirs.novelty, ours.novelty, rtol=1e-2)
+    with pytest.raises(ValueError, match="give rows at rest with --tare"):
+        back.predict(data.counts)
+    with pytest.raises(ValueError, match="holds no model that reads electrodes"):
+        Reader.load(shipped("forward"))
+    tensors = dict(reader.tensors)
+    del tensors["known"]
+    dataclasses.replace(reader, tensors=tensors).save(tmp_path / "less.safetensors")
+    with pytest.raises(ValueError, match="does not fit together"):
+        Reader.load(tmp_path / "less.safetensors")
+
+
+def test_too_few_touches_are_refused():
+    with pytest.raises(ValueError, match="intervals of 90 % need 9 aside"):
+        judge(touches(20, 5))
+
+
+def test_terms_without_the_common_mode_do_not_see_it():
+    x = touches(20, 6).log_change
+    terms = Terms.fit(x, products=3, common=True, length=1.0)
+    np.testing.assert_allclose(terms(x + 0.3), terms(x), atol=1e-9)
+    assert np.abs(Terms.fit(x, products=3, length=1.0)(x + 0.3) - terms(x)).max() > 0.1
+
+
+def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
+    import biotac_mj.learning.real as real
+
+    monkeypatch.setattr(real, "_STEPS", (20, 20))
+    one = synthetic(n=1200)
+    write(tmp_path / "rec.h5", [one])
+    rec, model = str(tmp_path / "rec.h5"), str(tmp_path / "m.safetensors")
+    words = ["evaluate", rec, "--save", model, "--json", str(tmp_path / "r.json"), "--quiet"]
+    assert cli.main(words) == 0
+    assert "kept aside" in capsys.readouterr().out
+    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
+    table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
+    assert len(table) == len(one) and {"time", "fz", "fz_half", "e19", "novelty"} <= set(table.dtype.names)
+    assert np.sqrt(((table["fz"] - one.force[:, 2]) ** 2).mean()) < 0.3
+    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.h5")]) == 0
+    with h5py.File(tmp_path / "p.h5") as file:
+        np.testing.assert_allclose(file["force"][:, 2], table["fz"], rtol=1e-4, atol=1e-5)
+        assert file["electrodes_half"].shape == (len(one), 19) and file["force"].attrs["unit"] == "N"
+    capsys.readouterr()
+    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.txt")]) == 2
+    assert "ends in none of .csv" in capsys.readouterr().err
+    assert cli.main(["predict", str(shipped("forward")), rec, "--out", str(tmp_path / "q.csv")]) == 2
+    assert "has no intervals: write it with" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="neither force nor contact place"):
+        from_recording(dataclasses.replace(one, force=None))
