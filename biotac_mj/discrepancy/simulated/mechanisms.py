@@ -77,6 +77,7 @@ class Mechanism:
       parameter, unit: what is fitted; base, other: its value in the base model and where the change was taken
         (an amount of 1).
       film: settings of FilmConduction. material, options, shape: of a skin that is solved anew.
+      attach: what `biotac_mj.attach` takes for a value of the parameter; None: no running sensor has it.
     """
 
     id: str
@@ -91,6 +92,7 @@ class Mechanism:
     material: Material | None = None
     options: SkinOptions | None = None
     shape: Callable[[SkinGeometry], SkinGeometry] | None = None
+    attach: Callable[[float], dict] | None = None
 
     @property
     def solved(self) -> bool:
@@ -123,6 +125,7 @@ MECHANISMS = (
     Mechanism(
         "friction", "friction of the plate", "K", "skin that slips is dragged less",
         "coefficient", "1", Material().friction, 0.2, material=Material(friction=0.2),
+        attach=lambda value: {"material": {"friction": value}},
     ),
     Mechanism(
         "law_and_nu", "law and compressibility of the rubber", "C",
@@ -136,7 +139,8 @@ MECHANISMS = (
     ),
     Mechanism(
         "fill", "fill of the sensor", "C", "more liquid: a thicker film, and a skin under tension",
-        "liquid beyond that at rest", "m^3", 0.0, 40e-9, options=SkinOptions(fill_volume=40e-9),
+        "liquid beyond that at rest", "m^3", 0.0, 80e-9, options=SkinOptions(fill_volume=80e-9),
+        attach=lambda value: {"options": {"skin": {"fill_volume": value}}},
     ),
     Mechanism(
         "thickness", "thickness of the rubber", "C", "a thinner wall bends and bulges more",

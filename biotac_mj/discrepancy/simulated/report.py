@@ -9,6 +9,7 @@ from ...effects.effect import STAGES
 from ...files import replacing
 from ..plain_values import plain_values
 from .diagnosis import Finding, Simulated, names
+from .mechanisms import MECHANISMS
 
 __all__ = ["draw", "simulated_dict", "summary", "write_simulated"]
 
@@ -63,6 +64,7 @@ def _finding(f: Finding, found: Simulated) -> dict:
             {"name": f.parameter, "unit": f.unit, "sensor": s.name, "value_by_halves": t.value}
             for s, t in zip(found.sensors, f.tested)
         ],
+        "attach": _attach(f, found),
         "channels": sorted({f"e{k + 1}" for s in found.sensors for k in s.worst}),
         "significant": dict(zip((s.name for s in found.sensors), f.significant)),
         "confirmed": all(t.locked["worst"][1] < t.locked["worst"][0] for t in f.tested)
@@ -83,6 +85,12 @@ def _finding(f: Finding, found: Simulated) -> dict:
             for s, t in zip(found.sensors, f.tested)
         },
     }
+
+
+def _attach(f, found):
+    """What `biotac_mj.attach` takes to have it, by sensor; None where no running sensor can."""
+    give = next((one.attach for one in MECHANISMS if one.id == f.id), None)
+    return give and {s.name: give(float(np.mean(t.value))) for s, t in zip(found.sensors, f.tested)}
 
 
 def summary(found: Simulated) -> str:
@@ -110,6 +118,10 @@ def summary(found: Simulated) -> str:
             if t.locked:
                 (a, b), (c, d) = t.locked["worst"], t.locked["all"]
                 lines.append(f"      locked rows: {a:.0f} -> {b:.0f}; {c:.0f} -> {d:.0f}")
+        if f.id in found.named and _attach(f, found):
+            lines += [
+                f"    a simulated {name}: attach(spec, **{one})" for name, one in _attach(f, found).items()
+            ]
     return "\n".join(lines)
 
 

@@ -51,7 +51,7 @@ def _views(rows, judged, rate):
 
 
 def cells(rows: Rows, judged: Judged, noise: np.ndarray) -> list[Cell]:
-    """All cells, the largest error first.
+    """All cells, red ones first, the largest error first.
 
     Args:
       noise: (19,) of the electrodes [counts].
@@ -70,7 +70,7 @@ def cells(rows: Rows, judged: Judged, noise: np.ndarray) -> list[Cell]:
         found += [(k, view, part, float(rms[k]), float(floor[k])) for k in range(19)]
     t, p = max_t(np.concatenate(statistic, 1))
     out = [Cell(*cell, float(q) if s > 0 else 1.0) for cell, s, q in zip(found, t, p)]
-    return sorted(out, key=lambda cell: -cell.rms)
+    return sorted(out, key=lambda cell: (not cell.red, -cell.rms))
 
 
 def leading(judged: Judged) -> list[int]:
