@@ -28,11 +28,12 @@ ONE, GAINS = Setup(gains=0.0), Setup()
 
 def locked(response: dict, rows: object, aside: object) -> dict:
     """Scores of the rows kept aside by name of the model and of the gains; blocks better than the first."""
-    out, first, start = {}, None, None
+    out, first = {}, None
+    const, matched = fit_constants(response["base"], rows, ONE)
+    start = const, matched.state  # all go on from here, the base model too
     for model, answers in response.items():
         for gains, setup in (("gains 1", ONE), ("gains fitted", GAINS)):
-            const, matched = fit_constants(answers, rows, setup, start)
-            start = start or (const, matched.state)
+            const, _ = fit_constants(answers, rows, setup, start)
             seen = np.setdiff1d(np.arange(19), HELD_OUT)
             error = fit_states(answers, aside, const, setup).counts - aside.counts
             blind = fit_states(answers, aside, const, setup, electrodes=seen).counts - aside.counts
@@ -66,7 +67,7 @@ def main(argv: list[str] | None = None) -> None:
     for electrodes, force in given.press:
         recording = read_recording(electrodes, force)
         rows, aside = press_rows(recording)
-        one = judge(base, rows, ONE)
+        one = judge(base, rows, ONE, judge(base, rows, ONE))
         more = judge(whole, rows, ONE, one)
         found = {given.mechanism: [compare(one, more, TIP), compare(one, more)]}
         for k, then in enumerate(tried[1:], 1):

@@ -33,7 +33,6 @@ def main(argv: list[str] | None = None) -> None:
     if not (given.press or folder):
         sys.exit("the_tip: no recordings: set BIOTAC_RECORDINGS to their folder, or give --press E.txt F.txt")
     presses = given.press or [[pathlib.Path(folder) / name for name in pair] for pair in PRESSES]
-    given.out.mkdir(parents=True, exist_ok=True)
     try:
         diagnose_with_states([read_recording(*pair) for pair in presses], given.out, given.quiet)
     except (ValueError, FileNotFoundError) as error:

@@ -3,16 +3,18 @@ sensors; real recordings where BIOTAC_RECORDINGS has them."""
 
 import dataclasses
 import json
+import os
+import pathlib
 import types
 
 import numpy as np
 import pytest
 from synthetic_table import synthetic_table
 
-from biotac_mj.discrepancy.recordings.recording import Recording
+from biotac_mj.discrepancy.recordings.recording import Recording, read_recording
 from biotac_mj.discrepancy.simulated import diagnosis
 from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
-from biotac_mj.discrepancy.simulated.mechanisms import COARSER, MECHANISMS, bonded, moved
+from biotac_mj.discrepancy.simulated.mechanisms import COARSER, MECHANISMS, base_response, bonded, moved
 from biotac_mj.discrepancy.simulated.report import simulated_dict, summary, write_simulated
 from biotac_mj.discrepancy.verbs import diagnose_verb
 from biotac_mj.geometry.skins import load_skin
@@ -73,7 +75,7 @@ def synthetic(tables, amount, seed, memory=0.0):
 def of_both(tables):
     """Two synthetic sensors whose tips answer more than the base model's, and what is found."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis, "_ROWS", 150)
+        patch.setattr(diagnosis, "_ROWS", 100)
         patch.setattr(diagnosis, "_MEMORY", ())
         recordings = [synthetic(tables, AT_TIP, seed)[0] for seed in (1, 2)]
         return diagnose_simulated(recordings, *tables, TRIED, quiet=True)
@@ -101,6 +103,7 @@ def test_what_is_written(of_both, tmp_path):
     assert "synthetic 2" in summary(of_both)
 
 
+@pytest.mark.slow
 def test_what_one_sensor_has_alone_is_the_sensors(tables, monkeypatch):
     monkeypatch.setattr(diagnosis, "_ROWS", 150)
     monkeypatch.setattr(diagnosis, "_MEMORY", ())
@@ -156,3 +159,43 @@ def test_what_it_needs_is_told():
     given = {"electrodes": "e.txt", "force": None, "data": None, "simulate": True, "also": None}
     with pytest.raises(ValueError, match="--electrodes E.txt --force F.txt --simulate"):
         diagnose_verb(types.SimpleNamespace(**given))
+
+
+def test_one_constant_for_all_sensors_on_rows_kept_aside(tables, repo, monkeypatch):
+    """On a synthetic sensor whose tip answers more, the model that has it errs less there than gains do."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import real_tip
+
+    monkeypatch.setattr(diagnosis, "_ROWS", 100)
+    rows, aside = press_rows(synthetic(tables, AT_TIP, 4)[0])
+    whole = tables[0].amended(np.array(AT_TIP))
+    found = real_tip.locked({"base": tables[0].amended(np.zeros(2)), "tip": whole}, rows, aside)
+    assert found["tip, gains 1"]["tip"]["rms"] < 5, "3 counts are noise"
+    assert found["tip, gains 1"]["tip"]["rms"] < found["base, gains fitted"]["tip"]["rms"]
+    assert found["tip, gains 1"]["not seen"]["blocks_better"] > 12
+
+
+def test_the_example_says_what_it_needs(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "examples"))
+    import the_tip
+
+    monkeypatch.delenv("BIOTAC_RECORDINGS", raising=False)
+    with pytest.raises(SystemExit, match="set BIOTAC_RECORDINGS"):
+        the_tip.main([])
+    with pytest.raises(SystemExit, match="nowhere.txt"):
+        the_tip.main(["--press", "nowhere.txt", "nowhere.txt", "--out", "out/nowhere"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("BIOTAC_RECORDINGS" not in os.environ, reason="set BIOTAC_RECORDINGS to real recordings")
+def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "examples"))
+    import the_tip
+
+    folder = pathlib.Path(os.environ["BIOTAC_RECORDINGS"])
+    recordings = [read_recording(*(folder / name for name in pair)) for pair in the_tip.PRESSES]
+    base, straight, _ = base_response(load_skin("coarse"), quiet=True)
+    found = diagnose_simulated(recordings, base, straight, (), quiet=True)
+    for sensor in found.sensors:
+        assert {6, 7, 8} <= set(sensor.worst) and all(sensor.slope[[6, 7, 8]] > 0)
+    assert found.alike[0] > 0.5 and found.alike[1] < 0.05

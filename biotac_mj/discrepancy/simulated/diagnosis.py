@@ -194,7 +194,8 @@ def diagnose_simulated(
     bar = tqdm(total=len(recordings) * (1 + len(models)), desc="models", unit="model", disable=quiet)
     for recording in recordings:
         rows, locked = press_rows(recording)
-        judged = judge(plain, rows, base)
+        # every model goes on from here: what going on alone brings must not count for it
+        judged = judge(plain, rows, base, judge(plain, rows, base))
         slope, error = missing(judged)
         noise = noise_level(recording.electrodes, recording.repeated)
         worst = leading(judged)

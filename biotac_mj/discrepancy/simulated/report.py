@@ -163,8 +163,7 @@ def draw(found: Simulated) -> object:
     slope.axhline(0, color="k", lw=0.6)
     models.axvline(0, color="k", lw=0.6)
     models.set_yticks(y, [f"{f.name}{' *' if f.id in found.named else ''}" for f in tried], fontsize=8)
-    low = min(-10.0, *(100 * t.worst.closed for f in tried for t in f.tested))
-    models.set_xlim(max(low, -60.0) * 1.05, 105)
+    models.set_xlim(left=max(models.get_xlim()[0], -50))
     models.set_title(
         "squared error of the worst electrodes that each model takes away [%], blocks not fitted on "
         "(* named)",
