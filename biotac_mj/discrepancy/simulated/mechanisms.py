@@ -18,6 +18,7 @@ from ...sensor.core_surface import CoreSurface
 from ...sensor.film import CALIBRATED_RADIUS, EXCITATION, FilmConduction
 from ...skin import Material, SkinOptions
 from ...skin.cache import kept
+from ...skin.rubber.material import CALIBRATED_FILL
 
 __all__ = ["MECHANISMS", "COARSER", "Mechanism", "base_response", "bonded", "moved", "with_mechanisms"]
 
@@ -139,7 +140,8 @@ MECHANISMS = (
     ),
     Mechanism(
         "fill", "fill of the sensor", "C", "more liquid: a thicker film, and a skin under tension",
-        "liquid beyond that at rest", "m^3", 0.0, 80e-9, options=SkinOptions(fill_volume=80e-9),
+        "liquid beyond that at rest", "m^3", 0.0, CALIBRATED_FILL,
+        options=SkinOptions(fill_volume=CALIBRATED_FILL),
         attach=lambda value: {"options": {"skin": {"fill_volume": value}}},
     ),
     Mechanism(
