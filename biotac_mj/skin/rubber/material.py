@@ -160,7 +160,7 @@ PRESETS = {
 }
 
 
-# [m^3] of liquid beyond what the unstressed skin holds, FITTED to two real sensors pressed on a plate: 6.6e-8
+# [m^3] of liquid beyond what the unstressed skin holds, FITTED to two real sensors pressed on a plate: 6.7e-8
 # to 1.14e-7 by sensor and by half of the rows (docs/real_match.md, 'The tip'). For
 # `SkinOptions.fill_volume`; not the default, with which all else was fitted
 CALIBRATED_FILL = 8.0e-8
