@@ -199,3 +199,21 @@ def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
     for sensor in found.sensors:
         assert {6, 7, 8} <= set(sensor.worst) and all(sensor.slope[[6, 7, 8]] > 0)
     assert found.alike[0] > 0.5 and found.alike[1] < 0.05
+
+
+def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, capsys):
+    """From the verb on, with synthetic tables in place of the skin's."""
+    from biotac_mj.discrepancy.simulated import verb
+
+    monkeypatch.setattr(diagnosis, "_ROWS", 60)
+    monkeypatch.setattr(diagnosis, "_MEMORY", ())
+    base, straight = tables[0].amended(np.zeros(2)), tables[1]
+    monkeypatch.setattr(verb, "base_response", lambda *_: (base, straight, None))
+    monkeypatch.setattr(verb, "with_mechanisms", lambda base, *_: base)
+    recording = synthetic(tables, AT_TIP, 5)[0]
+    found = verb.diagnose_with_states([recording], tmp_path, True, ())
+    drag = next(f for f in found.findings if f.id == "drag")
+    assert drag.significant == (True,) and drag.whose == "unknown"
+    assert found.alike is None and "verdict:" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="no force"):
+        verb.diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, ())
