@@ -669,6 +669,19 @@ def _add_diagnose(verbs):
         metavar="HZ",
         help="rows per second (default: guessed from repeated rows, else 100)",
     )
+    verb.add_argument(
+        "--simulate",
+        action="store_true",
+        help="flat presses with --force: fit each row's pose in simulated states (made the first time, in "
+        "minutes) and say in which stage of the model the rest disagrees",
+    )
+    verb.add_argument(
+        "--also",
+        nargs=2,
+        action="append",
+        metavar=("E", "F"),
+        help="electrodes and force of another sensor: with --simulate what both share is the base model's",
+    )
     kept = (
         "of the data, kept aside for the proof (default: "
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"

@@ -9,12 +9,13 @@ __all__ = ["MIRROR", "made_up_states"]
 MIRROR = [10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18]  # E1..E6 and E11..E16, E8 and E9
 
 
-def made_up_states():
+def made_up_states(drag: tuple = PlateGrid().drag):
     """PlateStates and log_z of a made-up sensor whose electrodes answer smoothly to where the plate faces,
     how it is dragged and how hard it presses, in mirror symmetry."""
     grid = PlateGrid(
         pitch=tuple(np.linspace(-0.1, 0.6, 6)),
         roll=tuple(np.linspace(0, 0.8, 4)),
+        drag=drag,
         load=tuple(np.geomspace(2e-7, 2e-5, 8)),
     )
     way = np.array(grid.ways)

@@ -31,7 +31,7 @@ LAYERS = {
     "tasks": "coupling plugin sensor effects geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading",
-    "discrepancy": "effects recordings data skin sensor geometry fields files reading",
+    "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
     "resimulation": "arguments matching data recordings skin sensor geometry files",
     "biotac_mj": "plugin",

@@ -22,6 +22,11 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         recordings = load(args.data, force=args.force, tdc=args.tdc, rate=args.rate, object_name=args.object)
         if all(one.object_pos is None for one in recordings):
             args.electrodes = args.data
+    if args.also and not args.simulate or args.simulate and not (args.electrodes and args.force):
+        raise ValueError(
+            "--simulate needs a flat press with its force, and --also needs --simulate: give "
+            "--electrodes E.txt --force F.txt --simulate"
+        )
     if args.electrodes:
         from .recordings.recording import read_recording
         from .recordings.report import summary, write_report
@@ -32,6 +37,11 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         files = write_report(diagnosis, pathlib.Path(args.out))
         print(summary(diagnosis))
         print("  " + " ".join(str(f) for f in files[:2]))
+        if args.simulate:
+            from .simulated.verb import diagnose_with_states
+
+            others = [read_recording(*pair) for pair in args.also or ()]
+            diagnose_with_states([recording, *others], pathlib.Path(args.out), args.quiet)
         return
     from .trajectories.report import diagnose_data
 

@@ -12,6 +12,7 @@ __all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
 _COUNTS = 20.0  # [counts] of an electrode that weigh as much as one sigma of a force or a prior
 _TOGETHER = 25  # rows that count as one against the priors: a model's errors hardly change from row to row
 _STEPS, _LEAST = 40, 16  # joint steps at most, and before which none is the last
+_NESTED = 8  # the latter where the search goes on from a model that this one contains
 _AGAIN = (6, 14)  # steps before which all states are sought anew: some began in the wrong valley
 _STARTS = 3  # directions of the table from which a row's state is sought
 
@@ -29,6 +30,8 @@ class Setup:
       shear: [N] sigma of the plate's tangential force against the measured one; 0: it is not looked at.
       modulus: Young's modulus at which the search begins [Pa]. hold_modulus: it is known.
       spread: sigma of the states about the middle of the table, in half widths of its axes; weak.
+      memory: sigma of the share of the load that answers as it was, see `Rows.past`; 0: none.
+      amount: sigma of how much of each of the response's changes there is; 0: none of them.
     """
 
     gains: float = 0.3
@@ -38,6 +41,8 @@ class Setup:
     modulus: float = 1.2e6
     hold_modulus: bool = False
     spread: float = 2.0
+    memory: float = 0.0
+    amount: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,14 +52,22 @@ class Rows:
     Attributes:
       counts: (n, 19). force: (n, 3) of the plate on the skin, along the finger (towards the tip), across (to
         +z), pressing [N]. time: (n,) as a share of the recording.
+      past: (n,) what has pressed before, as rubber that creeps remembers it [N]; None: not known.
     """
 
     counts: np.ndarray
     force: np.ndarray
     time: np.ndarray
+    past: np.ndarray | None = None
 
     def __getitem__(self, which) -> "Rows":
-        return Rows(self.counts[which], self.force[which], self.time[which])
+        past = None if self.past is None else self.past[which]
+        return Rows(self.counts[which], self.force[which], self.time[which], past)
+
+    def pressing(self, memory: float) -> np.ndarray:
+        """(n,) [N] that the skin answers to, a share of it as it was."""
+        now = self.force[:, 2]
+        return now if self.past is None else now + memory * (self.past - now)
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -66,13 +79,16 @@ class Constants:
 
     Attributes:
       offset: (19,) ln Z at rest at the first row. gain: (19,) on its change. drift: size a, ln tau (tau as a
-        share of the recording). modulus: Young's modulus [Pa].
+        share of the recording). modulus: Young's modulus [Pa]. memory: share of the load that answers as it
+        was. amount: (k,) of each of the response's changes.
     """
 
     offset: np.ndarray
     gain: np.ndarray
     drift: np.ndarray
     modulus: float
+    memory: float = 0.0
+    amount: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
     def drifted(self, time: np.ndarray) -> np.ndarray:
         """(n,) common change of ln Z at times (n,)."""
@@ -84,12 +100,14 @@ class Constants:
 
     @property
     def _vector(self):
-        return np.concatenate([self.offset, self.gain, self.drift, [np.log(self.modulus)]])
+        tail = [np.log(self.modulus), self.memory], self.amount
+        return np.concatenate([self.offset, self.gain, self.drift, *tail])
 
     @classmethod
     def _of(cls, vector):
         drift = np.array([vector[38], np.clip(vector[39], -3.0, 1.0)])
-        return cls(vector[:19], np.clip(vector[19:38], 0.1, 5.0), drift, float(np.exp(vector[40])))
+        gain, memory = np.clip(vector[19:38], 0.1, 5.0), float(np.clip(vector[41], -0.5, 0.95))
+        return cls(vector[:19], gain, drift, float(np.exp(vector[40])), memory, vector[42:])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,21 +125,31 @@ class Match:
     cost: np.ndarray
 
 
-def fit_constants(response: Response, rows: Rows, setup: Setup) -> tuple[Constants, Match]:
-    """Constants and the states of all rows together: Gauss and Newton, the states eliminated in each step."""
-    const = _begin(response, rows, setup)
+def fit_constants(
+    response: Response, rows: Rows, setup: Setup, begin: tuple[Constants, np.ndarray] | None = None
+) -> tuple[Constants, Match]:
+    """Constants and the states of all rows together: Gauss and Newton, the states eliminated in each step.
+
+    Args:
+      begin: constants and states (n, 4) from which to begin, as of a model that this one contains; None seeks
+        them.
+    """
+    const, state = begin or (_begin(response, rows, setup), None)
+    more = len(response.changes) - len(const.amount)
+    const = dataclasses.replace(const, amount=np.concatenate([const.amount, np.zeros(max(more, 0))]))
     problem = _Problem(response, rows, const, setup)
-    state = fit_states(response, rows, const, setup).state
+    if state is None:
+        state = fit_states(response, rows, const, setup).state
     now, damp = problem.evaluate(state, const), 1e-2
     for number in range(_STEPS):
-        if number in _AGAIN:
+        if number in _AGAIN and not begin:
             const, state = now.const, fit_states(response, rows, now.const, setup, also=now.state).state
             now = problem.evaluate(state, const)
         new = problem.evaluate(*problem.step(now, damp))
         if new.cost < now.cost:
             small = now.cost - new.cost < 1e-4 * now.cost
             now, damp = new, max(damp / 5, 1e-6)
-            if small and number > _LEAST:
+            if small and number > (_NESTED if begin else _LEAST):
                 break
         else:
             damp *= 8
@@ -178,14 +206,17 @@ class _Problem:
         self._middle = (response.high + response.low) / 2
         half = (response.high - response.low) / 2
         self._pull = _COUNTS / (setup.spread * np.where(half > 0, half, 1.0))
-        self._loaded = const.modulus, response.at_load(rows.force[:, 2] / const.modulus)
+        self._loaded = None, None
         self._free, self._prior, self._prior_at = _prior(setup, const)
 
     def loaded(self, const: Constants) -> Loaded:
-        if const.modulus != self._loaded[0]:
-            at = self.response.at_load(self.rows.force[:, 2] / const.modulus)
-            self._loaded = const.modulus, at
+        key = const._vector[40:].tobytes()
+        if key != self._loaded[0]:
+            self._loaded = key, self._at(const)
         return self._loaded[1]
+
+    def _at(self, const):
+        return self.response.at_load(self.rows.pressing(const.memory) / const.modulus, const.amount)
 
     def residuals(self, value, state, const):
         """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n, 19)."""
@@ -233,18 +264,20 @@ class _Problem:
         return state, Constants._of(vector)
 
     def _constant_slopes(self, now):
-        """(n, m, 41) of the residuals by the constants."""
+        """(n, m, 42 + k) of the residuals by the constants."""
         const, time = now.const, self.rows.time
         counts = counts_from_log_impedance(const.log_z(now.value[:, :19], time))
-        J, e, slope = np.zeros((*now.r.shape, 41)), np.arange(19), _slope(counts)
+        vector = const._vector
+        J, e, slope = np.zeros((*now.r.shape, len(vector))), np.arange(19), _slope(counts)
         J[:, e, e] = slope
         J[:, e, 19 + e] = slope * now.value[:, :19]
         ratio, tau = np.exp(-time / np.exp(const.drift[1])), np.exp(const.drift[1])
         J[:, :19, 38] = slope * (1 - ratio)[:, None]
         J[:, :19, 39] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
-        there = dataclasses.replace(const, modulus=const.modulus * np.exp(_PROBE))
-        value, _ = self.response.at_load(self.rows.force[:, 2] / there.modulus)(now.state, False)
-        J[..., 40] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
+        for i in self._free[self._free >= 40]:  # what moves the table itself
+            there = Constants._of(vector + _PROBE * (np.arange(len(vector)) == i))
+            value, _ = self._at(there)(now.state, False)
+            J[..., i] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
         return J
 
     def descend(self, state, const, steps=12):
@@ -287,7 +320,7 @@ class _Problem:
         return out
 
 
-_PROBE = 1e-2  # of ln E, for a difference
+_PROBE = 1e-2  # of ln E, memory and amounts, for a difference
 
 
 def _slope(counts):
@@ -302,23 +335,28 @@ def _published_rest():
 
 def _prior(setup, const):
     """Which constants are free (k,), and the priors' matrix and right side: residuals P vector - at."""
-    weight = _COUNTS * np.sqrt(_TOGETHER)
+    weight, size = _COUNTS * np.sqrt(_TOGETHER), len(const._vector)
     free = [np.arange(19)]
-    P, at = [np.zeros((19, 41))], [np.zeros(19)]
+    P, at = [np.zeros((19, size))], [np.zeros(19)]
     P[0][:, :19] = (np.eye(19) - 1 / 19) * weight / setup.offsets
     at[0] = P[0][:, :19] @ _published_rest()
     if setup.gains:
         free.append(np.arange(19, 38))
-        P.append(np.zeros((19, 41)))
+        P.append(np.zeros((19, size)))
         P[-1][:, 19:38] = np.eye(19) * weight / setup.gains
         at.append(np.full(19, weight / setup.gains))
     if setup.drift:
         free.append(np.array([38, 39]))
-        P.append(np.zeros((2, 41)))
+        P.append(np.zeros((2, size)))
         P[-1][[0, 1], [38, 39]] = weight / setup.drift, weight
         at.append(np.array([0.0, weight * np.log(_TAU)]))
     if not setup.hold_modulus:
         free.append(np.array([40]))
+    for sigma, which in ((setup.memory, [41]), (setup.amount, np.arange(42, size))):
+        if sigma and len(which):
+            free.append(np.array(which))
+            P.append(np.eye(size)[which] * weight / sigma)
+            at.append(np.zeros(len(which)))
     return np.concatenate(free), np.concatenate(P), np.concatenate(at)
 
 
@@ -327,7 +365,9 @@ _TAU = 0.4  # of the recording: where the search for the drift's time constant b
 
 def _begin(response, rows, setup):
     """Constants from the published rest, its common level such that the table's best nodes fit the rows."""
-    const = Constants(_published_rest(), np.ones(19), np.array([0.0, np.log(_TAU)]), setup.modulus)
+    start = np.array([0.0, np.log(_TAU)])
+    none = np.zeros(len(response.changes))
+    const = Constants(_published_rest(), np.ones(19), start, setup.modulus, amount=none)
     for _ in range(4):
         problem = _Problem(response, rows, const, setup)
         value, _ = problem.loaded(const)(problem.best_nodes(const)[0], False)

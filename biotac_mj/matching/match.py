@@ -10,12 +10,12 @@ from .fit import Constants, Rows, Setup, fit_constants, fit_states
 from .response import Response
 from .states import PlateStates
 
-__all__ = ["SIGNS", "Scores", "log_changes", "match", "rows_of"]
+__all__ = ["HELD_OUT", "SIGNS", "Scores", "log_changes", "match", "rows_of"]
 
 _LOADED = 0.5  # [N] of force from which a row counts as loaded
 _SHARE = 0.7  # of the rows, in time, that constants are fitted on
 _FEWEST = 40  # loaded rows that are compared
-_HELD_OUT = (1, 7, 8, 12, 16)  # of e2 e8 e9 e13 e17: sides, tip and pad
+HELD_OUT = (1, 7, 8, 12, 16)  # of e2 e8 e9 e13 e17: sides, tip and pad
 _TRIED = 13  # loads from which a row's force is sought, by a factor 10 below the largest
 FREE = 4  # numbers of a row's state
 
@@ -97,7 +97,7 @@ def match(
     first, last = rows[:cut], rows[cut:]
     const, fitted = fit_constants(response, first, setup)
     found = fit_states(response, last, const, setup)
-    seen = np.setdiff1d(np.arange(19), _HELD_OUT)
+    seen = np.setdiff1d(np.arange(19), HELD_OUT)
     fewer = fit_states(response, last, const, setup, electrodes=seen)
     mean = first.counts.mean(0)
     out = dataclasses.asdict(_scores(last, found.counts, const, mean))
@@ -106,8 +106,8 @@ def match(
         "free_per_row": FREE if len(response.ways) > 1 else 2,
         "known_per_row": 19 + 2 * bool(setup.shear),
         "fitted_part": dataclasses.asdict(_scores(first, fitted.counts, const, mean)),
-        "held_out_electrodes": [f"e{i + 1}" for i in _HELD_OUT],
-        "held_out": dataclasses.asdict(_scores(last, fewer.counts, const, mean, np.array(_HELD_OUT))),
+        "held_out_electrodes": [f"e{i + 1}" for i in HELD_OUT],
+        "held_out": dataclasses.asdict(_scores(last, fewer.counts, const, mean, np.array(HELD_OUT))),
         "mean_pattern": dataclasses.asdict(
             _scores(last, np.broadcast_to(mean, last.counts.shape), const, mean)
         ),

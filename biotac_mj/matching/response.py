@@ -1,5 +1,6 @@
 """What electrodes and force plate say in a table of states, between its nodes too."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -26,7 +27,8 @@ class Response:
     Attributes:
       states, log_z: as given.
       axes: nodes of pitch and roll (both sides). ways: (nway, 2) drags. nodes: (ndirection, nway, 4)
-        states of the table. low, high: (4,) ends of a state.
+        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, nway, 21)
+        that the table may have in part, see `with_changes`.
     """
 
     def __init__(self, states: PlateStates, log_z: np.ndarray):
@@ -55,13 +57,44 @@ class Response:
         self.nodes = np.concatenate(parts, -1)
         self._log_load, self._first = np.log(grid.load), grid.load[0]
         self._over_load = _cardinal(self._log_load)
+        self.changes = np.zeros((0, *self._table.shape))
 
-    def at_load(self, load: np.ndarray) -> "Loaded":
-        """The response at loads (n,) of normal force over Young's modulus [m^2]."""
+    def with_changes(self, *pairs: tuple["Response", "Response"]) -> "Response":
+        """This response, and from it to others: a pair is what it is on some grid, which may be coarser, and
+        what it would be there. An amount of 1 of a change is all of it."""
+        out, nodes = copy.copy(self), self.nodes.reshape(-1, 4)
+        new = np.empty((len(pairs), *self._table.shape))
+        for change, (here, there) in zip(new, pairs):
+            for k, load in enumerate(np.exp(self._log_load)):
+                at = np.full(len(nodes), load)
+                difference = there.at_load(at)(nodes, False)[0] - here.at_load(at)(nodes, False)[0]
+                change[k] = difference.reshape(change.shape[1:])
+        out.changes = np.concatenate([self.changes, new])
+        return out
+
+    def only(self, k: int) -> "Response":
+        """The response with one of its changes."""
+        out = copy.copy(self)
+        out.changes = self.changes[k : k + 1]
+        return out
+
+    def amended(self, amount: np.ndarray) -> "Response":
+        """The response that has amounts (k,) of its changes for good."""
+        out = copy.copy(self)
+        out._table = self._table + np.tensordot(amount, self.changes, 1)
+        out.changes = self.changes[:0]
+        return out
+
+    def at_load(self, load: np.ndarray, amount: np.ndarray | tuple = ()) -> "Loaded":
+        """The response at loads (n,) of normal force over Young's modulus [m^2], with amounts (k,) of its
+        changes."""
         inside = np.clip(np.log(np.maximum(load, 1e-30)), self._log_load[0], self._log_load[-1])
         weight = self._over_load(inside)
         small = np.minimum(load / self._first, 1.0)  # below the first load in proportion
-        table = (weight @ self._table.reshape(len(self._log_load), -1)) * small[:, None]
+        whole = self._table
+        if np.any(amount):
+            whole = whole + np.tensordot(amount, self.changes, 1)
+        table = (weight @ whole.reshape(len(self._log_load), -1)) * small[:, None]
         return Loaded(self, table.reshape(len(load), *self._table.shape[1:]).astype(np.float32))
 
 

@@ -84,6 +84,24 @@ class PlateStates:
     reached: np.ndarray
     depth: np.ndarray
 
+    def on(self, grid: PlateGrid) -> "PlateStates":
+        """Those on a grid of some of its pitches, rolls and drags.
+
+        Raises:
+          ValueError: the grid has others, or other loads.
+        """
+        mine, found = self.grid, []
+        pairs = (mine.pitch, grid.pitch), (mine.roll, grid.roll), (mine.ways, grid.ways)
+        for have, wanted in pairs:
+            have, wanted = (np.array(v, float).reshape(len(v), -1) for v in (have, wanted))
+            off = np.abs(have[:, None] - wanted).sum(-1)
+            found.append(off.argmin(0))
+            if off.min(0).max() > 1e-9 or grid.load != mine.load:
+                raise ValueError("a grid has other pitches, rolls, drags or loads: choose among these")
+        at = np.ix_(*found)
+        parts = (getattr(self, name)[at] for name in ("xpos", "force", "pressure", "reached"))
+        return PlateStates(grid, self.node, self.rest, *parts)
+
 
 def frame(pitch: float, roll: float) -> np.ndarray:
     """(3, 3) rows in the BioTac frame: towards the tip along the plate, across it (to +z), from the plate

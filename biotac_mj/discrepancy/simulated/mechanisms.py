@@ -1,0 +1,213 @@
+"""What the simulated sensor may have otherwise than it has: mechanisms of transduction, contact and rubber,
+each a table of states or of readings beside the base model's, and an amount of it."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...geometry.skin_geometry import SkinGeometry
+from ...matching.match import log_changes
+from ...matching.response import Response
+from ...matching.states import PlateGrid, PlateStates, plate_states
+from ...sensor import core_surface, film_kernels
+from ...sensor import film as film_module
+from ...sensor.core_surface import CoreSurface
+from ...sensor.film import CALIBRATED_RADIUS, EXCITATION, FilmConduction
+from ...skin import Material, SkinOptions
+from ...skin.cache import kept
+from ...skin.rubber.material import CALIBRATED_FILL
+
+__all__ = ["MECHANISMS", "COARSER", "Mechanism", "base_response", "bonded", "moved", "with_mechanisms"]
+
+# Where mechanisms that need states of their own have them: a change is smoother than what it changes.
+_BASE = PlateGrid()
+COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])
+_HELD = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
+_TIP = -14e-3, -10e-3  # [m] between which a shift of the tip's wall fades
+
+
+def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False) -> SkinGeometry:
+    """The skin with its outer and inner surface shifted outwards [m], at the tip alone or everywhere but
+    where it is held.
+
+    Raises:
+      ValueError: a shift that turns a tetrahedron over.
+    """
+    vert, faces = geometry.vert, geometry.outer_face
+    a, b, c = vert[faces].transpose(1, 0, 2)
+    normal = np.zeros_like(vert)
+    np.add.at(normal, faces, np.cross(b - a, c - a)[:, None])
+    outside, inside = np.unique(faces), np.unique(geometry.inner_face)
+    normal = normal[outside] / np.linalg.norm(normal[outside], axis=1, keepdims=True)
+    to_outside, nearest = cKDTree(vert[outside]).query(vert)
+    to_inside = cKDTree(vert[inside]).query(vert)[0]
+    share = to_inside / (to_inside + to_outside)
+    fade = _smooth(cKDTree(vert[geometry.fixed]).query(vert)[0] / _HELD)
+    if tip:
+        fade = fade * _smooth((_TIP[1] - vert[:, 0]) / (_TIP[1] - _TIP[0]))
+    out = vert + ((outer * share + inner * (1 - share)) * fade)[:, None] * normal[nearest]
+    edges = out[geometry.tets][:, 1:] - out[geometry.tets][:, :1]
+    if not (np.linalg.det(edges) > 0).all():
+        raise ValueError(f"a shift of {outer:g} and {inner:g} m turns tetrahedra over: give a smaller one")
+    return dataclasses.replace(geometry, vert=out)
+
+
+def _smooth(x):
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def bonded(geometry: SkinGeometry, below: float) -> SkinGeometry:
+    """The skin held, too, where its inner side faces the core's upper half nearer than this [m]: no liquid
+    comes there."""
+    inside = np.unique(geometry.inner_face)
+    gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inside])[0]
+    near = inside[(gap < below) & (geometry.vert[inside, 1] > -1e-3)]
+    return dataclasses.replace(geometry, fixed=np.union1d(geometry.fixed, near))
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """One way in which the sensor may differ from the base model.
+
+    Attributes:
+      id, name, stage, physics: what it is. stage: "T" transduction, "K" contact, "C" constitutive.
+      parameter, unit: what is fitted; base, other: its value in the base model and where the change was taken
+        (an amount of 1).
+      film: settings of FilmConduction. material, options, shape: of a skin that is solved anew.
+      attach: what `biotac_mj.attach` takes for a value of the parameter; None: no running sensor has it.
+    """
+
+    id: str
+    name: str
+    stage: str
+    physics: str
+    parameter: str
+    unit: str
+    base: float
+    other: float
+    film: dict | None = None
+    material: Material | None = None
+    options: SkinOptions | None = None
+    shape: Callable[[SkinGeometry], SkinGeometry] | None = None
+    attach: Callable[[float], dict] | None = None
+
+    @property
+    def solved(self) -> bool:
+        """Whether it needs states of its own."""
+        return self.film is None
+
+    def value(self, amount: float) -> float:
+        """Of the parameter."""
+        return self.base + amount * (self.other - self.base)
+
+
+def _drawn_back(by):
+    return {"excitation": tuple((x + by, angle) for x, angle in EXCITATION)}
+
+
+MECHANISMS = (
+    Mechanism(
+        "electrode_radius", "radius of the electrodes", "T",
+        "a wide disc feels the thick film at the tip more", "radius", "m", CALIBRATED_RADIUS, 1.2e-3,
+        film={"electrode_radius": 1.2e-3},
+    ),
+    Mechanism(
+        "residual_film", "film that stays under pressed skin", "T", "texture holds the skin off the core",
+        "thickness", "m", 50e-6, 25e-6, film={"residual_film": 25e-6},
+    ),
+    Mechanism(
+        "excitation_place", "place of X1 to X4", "T", "the current's way from the tip is longer",
+        "shift to the clamp", "m", 0.0, 2e-3, film=_drawn_back(2e-3),
+    ),
+    Mechanism(
+        "friction", "friction of the plate", "K", "skin that slips is dragged less",
+        "coefficient", "1", Material().friction, 0.2, material=Material(friction=0.2),
+        attach=lambda value: {"material": {"friction": value}},
+    ),
+    Mechanism(
+        "law_and_nu", "law and compressibility of the rubber", "C",
+        "Neo-Hookean rubber with nu 0.45 keeps its volume more", "share of it", "1", 0.0, 1.0,
+        material=Material("neo_hookean", poissons_ratio=0.45),
+    ),
+    Mechanism(
+        "soft_liquid", "liquid that gives way (a bubble)", "C",
+        "what is displaced is not all bulged elsewhere", "share of a bulk modulus of 0.64 E", "1", 0.0, 1.0,
+        options=SkinOptions(bulk_modulus=1e6),
+    ),
+    Mechanism(
+        "fill", "fill of the sensor", "C", "more liquid: a thicker film, and a skin under tension",
+        "liquid beyond that at rest", "m^3", 0.0, CALIBRATED_FILL,
+        options=SkinOptions(fill_volume=CALIBRATED_FILL),
+        attach=lambda value: {"options": {"skin": {"fill_volume": value}}},
+    ),
+    Mechanism(
+        "thickness", "thickness of the rubber", "C", "a thinner wall bends and bulges more",
+        "outer surface", "m", 0.0, -0.3e-3, shape=lambda skin: moved(skin, -0.3e-3, 0.0),
+    ),
+    Mechanism(
+        "film_thickness", "film between core and skin", "T",
+        "where the film is thicker at rest a bulge changes it less", "wall outwards", "m", 0.0, 0.2e-3,
+        shape=lambda skin: moved(skin, 0.2e-3, 0.2e-3),
+    ),
+    Mechanism(
+        "tip_film", "film at the tip", "T", "a thinner film over E7 to E10 changes more",
+        "tip's wall outwards", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, -0.4e-3, tip=True),
+    ),
+    Mechanism(
+        "tip_rubber", "rubber at the tip", "C", "a thinner wall over E7 to E10 gives way more",
+        "tip's outer surface", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, 0.0, tip=True),
+    ),
+    Mechanism(
+        "bond", "bond of the skin above the core's waist", "C",
+        "skin that cannot lift off there leaves no way for liquid and current around the tip",
+        "share of a bond below 0.1 mm", "1", 0.0, 1.0, shape=lambda skin: bonded(skin, 0.1e-3),
+    ),
+)  # fmt: skip
+
+
+def base_response(geometry: SkinGeometry, quiet: bool = False) -> tuple[Response, Response, PlateStates]:
+    """The base model's answers, those without drag, and its states."""
+    states = plate_states(geometry, Material(), quiet=quiet)
+    log_z = _readings(states, geometry, {})
+    plain = dataclasses.replace(states.grid, drag=())
+    return Response(states, log_z), Response(states.on(plain), log_z[:, :, :1]), states
+
+
+def with_mechanisms(
+    response: Response,
+    states: PlateStates,
+    geometry: SkinGeometry,
+    mechanisms: Sequence[Mechanism] = MECHANISMS,
+    quiet: bool = False,
+) -> Response:
+    """The base model's answers with a change for each mechanism, in their order."""
+    coarser = states.on(COARSER)
+    here = Response(coarser, _readings(coarser, geometry, {}))
+    pairs = []
+    for one in mechanisms:
+        skin = one.shape(geometry) if one.shape else geometry
+        there = coarser
+        if one.solved:
+            there = plate_states(skin, one.material or Material(), one.options, COARSER, quiet)
+        pairs.append((here, Response(there, _readings(there, skin, one.film or {}))))
+    return response.with_changes(*pairs)
+
+
+def _readings(states, geometry, film):
+    """Change of ln Z in states of a skin, kept on disk: it takes as long as a fit."""
+    settings = {"electrode_radius": CALIBRATED_RADIUS} | film
+    shape = [
+        getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
+    ]
+    code = [
+        pathlib.Path(module.__file__).read_bytes() for module in (film_module, film_kernels, core_surface)
+    ]
+
+    def make():
+        return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
+
+    return kept("readings", [states.xpos, states.rest, *shape, settings, *code], make)["log_z"]

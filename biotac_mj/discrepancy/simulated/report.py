@@ -1,0 +1,173 @@
+"""What simulation in the loop found: simulated.json, a figure, and the summary for the terminal."""
+
+import json
+import pathlib
+
+import numpy as np
+
+from ...effects.effect import STAGES
+from ...files import replacing
+from ..plain_values import plain_values
+from .diagnosis import Finding, Simulated, names
+from .mechanisms import MECHANISMS
+
+__all__ = ["draw", "simulated_dict", "summary", "write_simulated"]
+
+_SHOWN = 6  # cells of a sensor in the summary
+_TRIED = {"has": "without what the model has", "lacks": "with it", "fits": "a fit, no reason"}
+
+
+def simulated_dict(found: Simulated) -> dict:
+    """What simulated.json holds."""
+    by_id = {f.id: f for f in found.findings}
+    return plain_values(
+        {
+            "kind": "plain recordings of flat presses, simulated",
+            "verdict": found.verdict,
+            "effects": [_finding(by_id[i], found) for i in found.named],
+            "tried": [_finding(f, found) for f in found.findings],
+            "where": {
+                s.name: {
+                    "worst": [f"e{k + 1}" for k in s.worst],
+                    "rms": float(np.sqrt((s.judged.error**2).mean())),
+                    "missing": dict(zip((f"e{k + 1}" for k in range(19)), s.slope.tolist())),
+                    "missing_error": s.error.tolist(),
+                    "cells": [
+                        {
+                            "channel": f"e{c.channel + 1}",
+                            "view": c.view,
+                            "part": c.part,
+                            "counts": c.rms,
+                            "expected": c.expected,
+                            "p": c.p,
+                            "red": c.red,
+                        }
+                        for c in s.cells
+                    ],
+                }
+                for s in found.sensors
+            },
+            "alike": found.alike and {"correlation": found.alike[0], "p": found.alike[1]},
+        }
+    )
+
+
+def _finding(f: Finding, found: Simulated) -> dict:
+    return {
+        "id": f.id,
+        "name": f.name,
+        "stage": STAGES[f.stage],
+        "kind": f.kind,
+        "whose": f.whose,
+        "ties": [i for i in found.named if i != f.id] if f.id in found.named else [],
+        "parameters": [
+            {"name": f.parameter, "unit": f.unit, "sensor": s.name, "value_by_halves": t.value}
+            for s, t in zip(found.sensors, f.tested)
+        ],
+        "attach": _attach(f, found),
+        "channels": sorted({f"e{k + 1}" for s in found.sensors for k in s.worst}),
+        "significant": dict(zip((s.name for s in found.sensors), f.significant)),
+        "confirmed": all(t.locked["worst"][1] < t.locked["worst"][0] for t in f.tested)
+        if f.tested[0].locked
+        else None,
+        "gap": {
+            s.name: {
+                where: {
+                    "before": c.before,
+                    "after": c.after,
+                    "closed": c.closed,
+                    "p": c.p,
+                    "better": c.better,
+                }
+                for where, c in (("worst", t.worst), ("all", t.all))
+            }
+            | {"locked": t.locked}
+            for s, t in zip(found.sensors, f.tested)
+        },
+    }
+
+
+def _attach(f, found):
+    """What `biotac_mj.attach` takes to have it, by sensor; None where no running sensor can."""
+    give = next((one.attach for one in MECHANISMS if one.id == f.id), None)
+    return give and {s.name: give(float(np.mean(t.value))) for s, t in zip(found.sensors, f.tested)}
+
+
+def summary(found: Simulated) -> str:
+    """Text for the terminal."""
+    lines = [f"verdict: {found.verdict}"]
+    for s in found.sensors:
+        red = [c for c in s.cells if c.red]
+        lines.append(
+            f"  {s.name}: RMS {np.sqrt((s.judged.error**2).mean()):.0f} counts, {len(red)} of {len(s.cells)} "
+            f"cells above noise and the fit's own uncertainty; most at {names(s.worst)}"
+        )
+        for c in red[:_SHOWN]:
+            lines.append(
+                f"    e{c.channel + 1} {c.view} {c.part}: {c.rms:.0f} counts, {c.expected:.0f} expected"
+            )
+    lines.append("  RMS on blocks not fitted on, first 70 %, worst electrodes (p); all (p); value by halves:")
+    for f in found.findings:
+        lines.append(f"  {f.name} [{STAGES[f.stage]}], {_TRIED[f.kind]}: {f.whose}")
+        for s, t in zip(found.sensors, f.tested):
+            value = f"; {f.parameter} {', '.join(f'{v:.3g}' for v in t.value)} {f.unit}" if t.value else ""
+            lines.append(
+                f"    {s.name}: {t.worst.before:.0f} -> {t.worst.after:.0f} ({t.worst.p:.2g}); "
+                f"{t.all.before:.0f} -> {t.all.after:.0f} ({t.all.p:.2g}){value}"
+            )
+            if t.locked:
+                (a, b), (c, d) = t.locked["worst"], t.locked["all"]
+                lines.append(f"      locked rows: {a:.0f} -> {b:.0f}; {c:.0f} -> {d:.0f}")
+        if f.id in found.named and _attach(f, found):
+            lines += [
+                f"    a simulated {name}: attach(spec, **{one})" for name, one in _attach(f, found).items()
+            ]
+    return "\n".join(lines)
+
+
+def write_simulated(found: Simulated, folder: pathlib.Path | str) -> list:
+    """Writes simulated.json and simulated.png; returns the paths."""
+    folder = pathlib.Path(folder)
+    paths = [folder / "simulated.json", folder / "simulated.png"]
+    with replacing(paths[0]) as temporary:
+        temporary.write_text(json.dumps(simulated_dict(found), indent=1, allow_nan=False))
+    with replacing(paths[1]) as temporary:
+        draw(found).savefig(temporary, dpi=110, format="png")
+    return paths
+
+
+def draw(found: Simulated) -> object:
+    """A matplotlib figure: error by electrode, what each electrode's change lacks, what each model takes
+    away."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.5])
+    rms, slope, models = (figure.add_subplot(g) for g in (grid[0, 0], grid[0, 1], grid[1, :]))
+    x, width = np.arange(19), 0.8 / len(found.sensors)
+    tried = [f for f in found.findings if f.kind != "has"]
+    y = np.arange(len(tried))[::-1]
+    for i, s in enumerate(found.sensors):
+        at = (i - (len(found.sensors) - 1) / 2) * width
+        rms.bar(x + at, np.sqrt((s.judged.error**2).mean(0)), width, label=s.name)
+        slope.bar(x + at, 100 * s.slope, width, yerr=100 * s.error, error_kw={"lw": 0.7})
+        closed = [100 * f.tested[i].worst.closed for f in tried]
+        models.barh(y - at, closed, width, label=f"{s.name}, {names(s.worst)}")
+    for ax, title in ((rms, "error [counts RMS]"), (slope, "what the modelled change lacks [%]")):
+        ax.set_xticks(x, [f"e{k + 1}" for k in x], fontsize=7, rotation=60)
+        ax.set_title(title + ", blocks not fitted on", fontsize=9)
+    rms.legend(fontsize=7)
+    slope.axhline(0, color="k", lw=0.6)
+    models.axvline(0, color="k", lw=0.6)
+    models.set_yticks(y, [f"{f.name}{' *' if f.id in found.named else ''}" for f in tried], fontsize=8)
+    models.set_xlim(left=max(models.get_xlim()[0], -50))
+    models.set_title(
+        "squared error of the worst electrodes that each model takes away [%], blocks not fitted on "
+        "(* named)",
+        fontsize=9,
+    )
+    models.legend(fontsize=7)
+    return figure

@@ -1,0 +1,38 @@
+"""`biotac diagnose --simulate`."""
+
+import pathlib
+
+from ...geometry.skins import load_skin
+from ..recordings.recording import Recording
+from .diagnosis import Simulated, diagnose_simulated
+from .mechanisms import MECHANISMS, Mechanism, base_response, with_mechanisms
+from .report import summary, write_simulated
+
+__all__ = ["diagnose_with_states"]
+
+_SKIN = "coarse"  # of the tables of states: the default's take ten times as long
+
+
+def diagnose_with_states(
+    recordings: list[Recording],
+    folder: pathlib.Path,
+    quiet: bool = False,
+    mechanisms: tuple[Mechanism, ...] = MECHANISMS,
+) -> Simulated:
+    """Diagnoses recordings of flat presses against simulated states, prints and writes what it found.
+
+    Raises:
+      ValueError: a recording without force, or with too few loaded rows.
+    """
+    for k, one in enumerate(recordings):
+        if one.force is None:
+            raise ValueError(f"{one.name}: no force, which a fit of states needs: give Fx Fy Fz [N]")
+        if [r.name for r in recordings].count(one.name) > 1:
+            one.name = f"{one.name} ({k + 1})"
+    geometry = load_skin(_SKIN)
+    base, straight, states = base_response(geometry, quiet)
+    response = with_mechanisms(base, states, geometry, mechanisms, quiet)
+    found = diagnose_simulated(recordings, response, straight, mechanisms, quiet)
+    print(summary(found))
+    print("  " + " ".join(str(f) for f in write_simulated(found, folder)))
+    return found

@@ -1,0 +1,219 @@
+"""Simulation in the loop for recordings: what disagrees, in which stage, whose it is. Synthetic tables and
+sensors; real recordings where BIOTAC_RECORDINGS has them."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import types
+
+import numpy as np
+import pytest
+from made_up_plate import made_up_states
+
+from biotac_mj.discrepancy.recordings.recording import Recording, read_recording
+from biotac_mj.discrepancy.simulated import diagnosis
+from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
+from biotac_mj.discrepancy.simulated.mechanisms import COARSER, MECHANISMS, base_response, bonded, moved
+from biotac_mj.discrepancy.simulated.report import simulated_dict, summary, write_simulated
+from biotac_mj.discrepancy.verbs import diagnose_verb
+from biotac_mj.geometry.skins import load_skin
+from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
+from biotac_mj.matching.match import SIGNS
+from biotac_mj.matching.response import Response
+from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
+
+TIP = [6, 7, 8, 9]
+MODULUS = 1.2e6  # [Pa] of the synthetic sensors
+TRIED = tuple(
+    dataclasses.replace(m, base=0.0, other=1.0) for m in MECHANISMS if m.id in ("tip_film", "friction")
+)
+AT_TIP = [0.8 if m.id == "tip_film" else 0.0 for m in TRIED]
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """A synthetic base model with two changes, of the tip's answers and of E17 to E19, and one without
+    drag."""
+    states, log_z = made_up_states(drag=(1.0,))
+    at_tip = np.isin(np.arange(19), TIP)
+    here = Response(states, log_z)
+    pairs = {
+        "friction": (here, Response(states, log_z * np.where(np.arange(19) > 15, 0.6, 1.0))),
+        "tip_film": (here, Response(states, log_z * np.where(at_tip, 1.8, 1.0))),
+    }
+    straight = dataclasses.replace(states.grid, drag=())
+    return (
+        here.with_changes(*(pairs[m.id] for m in TRIED)),
+        Response(states.on(straight), log_z[:, :, :1]),
+    )
+
+
+def synthetic(tables, amount, seed, memory=0.0):
+    """A synthetic recording of a sensor that has an amount (2,) of the changes, with 3 counts of noise."""
+    rng, n = np.random.default_rng(seed), 420
+    time = np.arange(n) / n
+    turn = lambda w, phase: np.sin(w * time + phase + seed)  # noqa: E731
+    state = np.column_stack(
+        [0.25 + 0.2 * turn(29, 0), 0.5 * turn(41, 1), 0.5 * turn(53, 2), 0.5 * turn(37, 3)]
+    )
+    pressing = 3 + 2 * turn(83, 4)
+    past, keep = np.zeros(n), np.exp(-1 / 50)
+    past[0] = pressing[0]
+    for i in range(1, n):
+        past[i] = keep * past[i - 1] + (1 - keep) * pressing[i]
+    rest = log_impedance(REST_COUNTS["2"]) + rng.normal(0, 0.02, 19)
+    const = Constants(rest, np.ones(19), np.array([-0.1, np.log(0.3)]), MODULUS, memory, np.array(amount))
+    load = (pressing + memory * (past - pressing)) / MODULUS
+    value, _ = tables[0].at_load(load, const.amount)(state, False)
+    counts = counts_from_log_impedance(const.log_z(value[:, :19], time)) + rng.normal(0, 3, (n, 19))
+    force = np.column_stack([value[:, 19:] * MODULUS, pressing]) @ np.linalg.inv(SIGNS)
+    return Recording(counts, force, rate=100.0, name=f"synthetic {seed}"), past
+
+
+@pytest.fixture(scope="module")
+def of_both(tables):
+    """Two synthetic sensors whose tips answer more than the base model's, and what is found."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosis, "_ROWS", 100)
+        patch.setattr(diagnosis, "_MEMORY", ())
+        recordings = [synthetic(tables, AT_TIP, seed)[0] for seed in (1, 2)]
+        return diagnose_simulated(recordings, *tables, TRIED, quiet=True)
+
+
+def test_what_two_sensors_share_is_the_base_models(of_both):
+    assert of_both.named == ("tip_film",) and "base model" in of_both.verdict
+    by_id = {f.id: f for f in of_both.findings}
+    for sensor, tested in zip(of_both.sensors, by_id["tip_film"].tested):
+        assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
+        assert np.allclose(tested.value, 0.8, atol=0.25)
+        assert tested.locked["worst"][1] < 0.6 * tested.locked["worst"][0]
+    assert all(by_id["drag"].significant), "drag, which it has, is missed where it is left out"
+
+
+def test_what_is_written(of_both, tmp_path):
+    verdict = simulated_dict(of_both)
+    assert verdict["effects"][0]["id"] == "tip_film" and verdict["effects"][0]["confirmed"]
+    assert verdict["effects"][0]["ties"] == []
+    cells = verdict["where"]["synthetic 1"]["cells"]
+    assert cells[0]["red"] and cells[0]["counts"] > cells[0]["expected"]
+    paths = write_simulated(of_both, tmp_path)
+    assert json.loads(paths[0].read_text())["verdict"] == of_both.verdict
+    assert paths[1].stat().st_size > 10_000
+    assert "synthetic 2" in summary(of_both)
+
+
+@pytest.mark.slow
+def test_what_one_sensor_has_alone_is_the_sensors(tables, monkeypatch):
+    monkeypatch.setattr(diagnosis, "_ROWS", 150)
+    monkeypatch.setattr(diagnosis, "_MEMORY", ())
+    recordings = [synthetic(tables, AT_TIP, 1)[0], synthetic(tables, [0.0, 0.0], 2)[0]]
+    found = diagnose_simulated(recordings, *tables, TRIED, quiet=True)
+    finding = next(f for f in found.findings if f.id == "tip_film")
+    assert finding.significant == (True, False) and finding.whose == "sensor synthetic 1"
+    assert found.named == ()
+    clean = found.sensors[1]
+    assert not [c for c in clean.cells if c.red], "noise and the fit's own uncertainty are all there is"
+
+
+def test_a_load_that_is_remembered(tables):
+    recording, past = synthetic(tables, [0.0, 0.0], 3, memory=0.4)
+    rows, _ = press_rows(recording)
+    plain = tables[0].amended(np.zeros(2))
+    at = np.rint(rows.time * len(past)).astype(int)
+    rows = Rows(rows.counts, rows.force, rows.time, past[at])
+    const, _ = fit_constants(plain, rows[::2], Setup(gains=0.0, memory=0.3))
+    assert abs(const.memory - 0.4) < 0.1
+
+
+def test_a_change_on_a_coarser_table():
+    """One that is the same in all directions is so between the coarser table's nodes, too."""
+    states, log_z = made_up_states()
+    fewer = dataclasses.replace(states.grid, pitch=states.grid.pitch[::5], drag=states.grid.drag[-1:])
+    drags = np.isin(np.abs(states.grid.ways).sum(1), (0.0, states.grid.drag[-1]))
+    part = log_z[::5][:, :, drags]
+    more = 0.3 * np.array(states.grid.load)[:, None] / 1e-6 * np.isin(np.arange(19), TIP)
+    pair = Response(states.on(fewer), part), Response(states.on(fewer), part + more)
+    base = Response(states, log_z)
+    there = base.with_changes(pair).amended(np.array([0.5]))
+    load, state = np.full(2, states.grid.load[3]), np.array([[0.2, 0.3, 0.4, 0.1], [0.1, -0.2, 0.0, -0.5]])
+    change = there.at_load(load)(state, False)[0] - base.at_load(load)(state, False)[0]
+    assert np.allclose(change[:, :19], 0.5 * more[3], atol=1e-5) and np.allclose(change[:, 19:], 0, atol=1e-9)
+
+
+def test_shapes_of_the_wall():
+    geometry = load_skin("coarse")
+    tip = moved(geometry, -0.4e-3, -0.4e-3, tip=True)
+    shift = np.linalg.norm(tip.vert - geometry.vert, axis=1)
+    assert shift[geometry.fixed].max() == 0 and shift[geometry.vert[:, 0] > -10e-3].max() == 0
+    assert 0.35e-3 < shift.max() <= 0.4e-3 + 1e-9
+    assert set(geometry.fixed) < set(bonded(geometry, 1e-4).fixed)
+    with pytest.raises(ValueError, match="turns tetrahedra over"):
+        moved(geometry, -2e-3, 1e-3)
+    states, _ = made_up_states()
+    with pytest.raises(ValueError, match="choose among these"):
+        states.on(COARSER)
+
+
+def test_what_it_needs_is_told():
+    given = {"electrodes": "e.txt", "force": None, "data": None, "simulate": True, "also": None}
+    with pytest.raises(ValueError, match="--electrodes E.txt --force F.txt --simulate"):
+        diagnose_verb(types.SimpleNamespace(**given))
+
+
+def test_one_constant_for_all_sensors_on_rows_kept_aside(tables, repo, monkeypatch):
+    """On a synthetic sensor whose tip answers more, the model that has it errs less there than gains do."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import real_tip
+
+    monkeypatch.setattr(diagnosis, "_ROWS", 100)
+    rows, aside = press_rows(synthetic(tables, AT_TIP, 4)[0])
+    whole = tables[0].amended(np.array(AT_TIP))
+    found = real_tip.locked({"base": tables[0].amended(np.zeros(2)), "tip": whole}, rows, aside)
+    assert found["tip, gains 1"]["tip"]["rms"] < 5, "3 counts are noise"
+    assert found["tip, gains 1"]["tip"]["rms"] < found["base, gains fitted"]["tip"]["rms"]
+    assert found["tip, gains 1"]["not seen"]["blocks_better"] > 12
+
+
+def test_the_example_says_what_it_needs(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "examples"))
+    import the_tip
+
+    monkeypatch.delenv("BIOTAC_RECORDINGS", raising=False)
+    with pytest.raises(SystemExit, match="set BIOTAC_RECORDINGS"):
+        the_tip.main([])
+    with pytest.raises(SystemExit, match="nowhere.txt"):
+        the_tip.main(["--press", "nowhere.txt", "nowhere.txt", "--out", "out/nowhere"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("BIOTAC_RECORDINGS" not in os.environ, reason="set BIOTAC_RECORDINGS to real recordings")
+def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "examples"))
+    import the_tip
+
+    folder = pathlib.Path(os.environ["BIOTAC_RECORDINGS"])
+    recordings = [read_recording(*(folder / name for name in pair)) for pair in the_tip.PRESSES]
+    base, straight, _ = base_response(load_skin("coarse"), quiet=True)
+    found = diagnose_simulated(recordings, base, straight, (), quiet=True)
+    for sensor in found.sensors:
+        assert {6, 7, 8} <= set(sensor.worst) and all(sensor.slope[[6, 7, 8]] > 0)
+    assert found.alike[0] > 0.5 and found.alike[1] < 0.05
+
+
+def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, capsys):
+    """From the verb on, with synthetic tables in place of the skin's."""
+    from biotac_mj.discrepancy.simulated import verb
+
+    monkeypatch.setattr(diagnosis, "_ROWS", 60)
+    monkeypatch.setattr(diagnosis, "_MEMORY", ())
+    base, straight = tables[0].amended(np.zeros(2)), tables[1]
+    monkeypatch.setattr(verb, "base_response", lambda *_: (base, straight, None))
+    monkeypatch.setattr(verb, "with_mechanisms", lambda base, *_: base)
+    recording = synthetic(tables, AT_TIP, 5)[0]
+    found = verb.diagnose_with_states([recording], tmp_path, True, ())
+    drag = next(f for f in found.findings if f.id == "drag")
+    assert drag.significant == (True,) and drag.whose == "unknown"
+    assert found.alike is None and "verdict:" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="no force"):
+        verb.diagnose_with_states([dataclasses.replace(recording, force=None)], tmp_path, True, ())
