@@ -99,7 +99,7 @@ class PlateStates:
             if off.min(0).max() > 1e-9 or grid.load != mine.load:
                 raise ValueError("a grid has other pitches, rolls, drags or loads: choose among these")
         at = np.ix_(*found)
-        parts = (getattr(self, name)[at] for name in ("xpos", "force", "pressure", "reached"))
+        parts = (getattr(self, name)[at] for name in ("xpos", "force", "pressure", "reached", "depth"))
         return PlateStates(grid, self.node, self.rest, *parts)
 
 

@@ -14,8 +14,8 @@ from ..matching.response import Response
 from ..matching.states import PlateGrid, PlateStates, frame, plate_states
 from ..recordings import Recording
 from ..sensor.channels import NELECTRODE, counts_from_log_impedance
-from ..sensor.film import CALIBRATED_RADIUS, FilmConduction
-from ..skin import Material, SkinOptions
+from ..sensor.film import FilmConduction
+from ..skin import PRESETS, Material, SkinOptions
 from .touch import MOST, Touch
 
 __all__ = ["PLATE", "fitted_touches", "plate_way"]
@@ -82,7 +82,7 @@ def fitted_touches(
         raise ValueError(f"{recording.name} has {bad.sum()} rows without force: cut it to those that have it")
     constant_rows = rows_of(electrodes, recording.force, _EVERY)
     states = plate_states(geometry, material, options, grid, quiet=not progress)
-    film = FilmConduction(geometry, sensor=None, electrode_radius=CALIBRATED_RADIUS)
+    film = FilmConduction(geometry, sensor=None, electrode_radius=PRESETS["calibrated"].electrode_radius)
     response = Response(states, log_changes(states, film))
     const, _ = fit_constants(response, constant_rows, Setup())
     due = np.floor(recording.time * rate + 1e-6)

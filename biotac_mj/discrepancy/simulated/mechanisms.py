@@ -15,16 +15,17 @@ from ...matching.states import PlateGrid, PlateStates, plate_states
 from ...sensor import core_surface, film_kernels
 from ...sensor import film as film_module
 from ...sensor.core_surface import CoreSurface
-from ...sensor.film import CALIBRATED_RADIUS, EXCITATION, FilmConduction
+from ...sensor.film import EXCITATION, FilmConduction
 from ...skin import Material, SkinOptions
 from ...skin.cache import kept
-from ...skin.rubber.material import CALIBRATED_FILL
+from ...skin.rubber.material import CALIBRATED_FILL, PRESETS
 
 __all__ = ["MECHANISMS", "COARSER", "Mechanism", "base_response", "bonded", "moved", "with_mechanisms"]
 
 # Where mechanisms that need states of their own have them: a change is smoother than what it changes.
 _BASE = PlateGrid()
 COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])
+_RADIUS = PRESETS["calibrated"].electrode_radius
 _HELD = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
 _TIP = -14e-3, -10e-3  # [m] between which a shift of the tip's wall fades
 
@@ -112,7 +113,7 @@ def _drawn_back(by):
 MECHANISMS = (
     Mechanism(
         "electrode_radius", "radius of the electrodes", "T",
-        "a wide disc feels the thick film at the tip more", "radius", "m", CALIBRATED_RADIUS, 1.2e-3,
+        "a wide disc feels the thick film at the tip more", "radius", "m", _RADIUS, 1.2e-3,
         film={"electrode_radius": 1.2e-3},
     ),
     Mechanism(
@@ -199,7 +200,7 @@ def with_mechanisms(
 
 def _readings(states, geometry, film):
     """Change of ln Z in states of a skin, kept on disk: it takes as long as a fit."""
-    settings = {"electrode_radius": CALIBRATED_RADIUS} | film
+    settings = {"electrode_radius": _RADIUS} | film
     shape = [
         getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
     ]
