@@ -45,7 +45,7 @@ def test_effects_become_what_the_rubber_is():
     np.testing.assert_allclose(inside.material["hysteresis"], [(0.495, 0.00319)])
     at = np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
     factors = inside.model["modulus"](at)
-    run = SimpleNamespace()
+    run = SimpleNamespace(answers={})
     for place, factor in zip(at, factors):
         run.place, run.scale_load = (
             place,

@@ -7,7 +7,7 @@ import pytest
 
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.acquisition import SLOT_RATE
-from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.sensor.film import FilmConduction, NoFilmError
 from biotac_mj.sensor.readings import PhysicsReadings, record
 
 REFERENCE = pathlib.Path(__file__).resolve().parents[1] / "../shared/reference"
@@ -139,3 +139,20 @@ def test_stored_deformations_raise_the_electrode_under_the_indenter(case, electr
         last = stored["displacement"][-1]
     change = np.log(film.impedance(skin.vert + last) / film.impedance(skin.vert))
     assert np.argmax(change) == electrode - 1 and change[electrode - 1] > 0.1
+
+
+def test_without_a_film_electrodes_hold(geometry, film):
+    """Of a skin that a blow has lifted off its core; the other channels go on."""
+    away = geometry.vert.copy()
+    away[film.node] += 4e-3 * np.array([0.0, -1.0, 0.0])
+    with pytest.raises(NoFilmError):
+        film.impedance(away)
+    readings = PhysicsReadings(geometry, film=film, noise=False)
+    state = np.zeros(readings.nstate)
+    readings.reset(state)
+    rest = readings.readings(state)
+    for k in range(20):
+        readings.advance(state, k * 2e-3, 2e-3, away, 5e3)
+    now = readings.readings(state)
+    np.testing.assert_array_equal(now["electrodes"], rest["electrodes"])
+    assert (np.asarray(now["pdc"]) > np.asarray(rest["pdc"])).all()

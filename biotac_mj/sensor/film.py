@@ -41,6 +41,7 @@ __all__ = [
     "EXCITATION",
     "BatchFilm",
     "FilmConduction",
+    "NoFilmError",
     "read_film",
     "sheet_laplacian",
     "spreading_resistance",
@@ -58,6 +59,10 @@ _CORE_RADIUS = 5.325e-3
 _FOOTPRINT = 0.8e-3  # [m], radius over which a disc's current enters the sheet: wide enough for 0.8 mm edges
 # [m], tangential motion of the skin over an electrode that the list of candidate faces allows for
 _SLACK = 2.0e-3
+
+
+class NoFilmError(ValueError):
+    """The deformed skin leaves no film that conducts."""
 
 
 class FilmConduction:
@@ -135,8 +140,8 @@ class FilmConduction:
           (19,) or (nworld, 19) [ohm].
 
         Raises:
-          ValueError: wrong shape, a position that is not finite, or a skin so far off that it leaves an
-            electrode uncovered.
+          ValueError: wrong shape, or a position that is not finite.
+          NoFilmError: a skin so far off that it leaves an electrode uncovered, or folded.
         """
         vert_xpos = np.asarray(vert_xpos, dtype=float)
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
@@ -159,11 +164,11 @@ class FilmConduction:
             local = alone.local.numpy()[:, 0].copy()
         missing = [name for name, thickness in zip(DISCS, local) if thickness == 0]
         if missing:
-            raise ValueError(
+            raise NoFilmError(
                 f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than "
                 f"{_SLACK * 1e3:g} mm, or is bonded there"
             )
-        raise ValueError(
+        raise NoFilmError(
             "the film's conductance is not positive definite: the inner surface is folded; keep the last "
             "good state"
         )

@@ -1,13 +1,15 @@
 """What a BioTac on this skin would report: film conduction and acquisition tied together, for a step and for
 stored motions."""
 
+import contextlib
+
 import numpy as np
 
 from biotac_mj.fields import check_entries, refuse_unknown
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import check_temperature
-from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.sensor.film import FilmConduction, NoFilmError
 from biotac_mj.sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from biotac_mj.sensor.materials import Material
 from biotac_mj.sensor.presets import Sensor, read_sensor
@@ -144,7 +146,10 @@ class PhysicsReadings:
         if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
             # a skin that nothing touches need not be solved again
             still = np.array_equal(vert_xpos, self._rest_vert)
-            impedance = self._rest if still else self.film.impedance(vert_xpos)
+            with contextlib.suppress(
+                NoFilmError
+            ):  # of a skin that was hit hard: electrodes hold, as in batches
+                impedance = self._rest if still else self.film.impedance(vert_xpos)
         moved, shaken = self._vibrate(state, time, dt, shaking)
         self.acquisition.advance(counts, time, dt, impedance, pressure, temperature, shaken, liquid)
         if heat is not None:
