@@ -123,9 +123,10 @@ def wrenches(
     total = vec6()
     if is_finite(pos[g, w], mat[g, w]):
         total = wrench_at(model, g, w, pos[g, w], mat[g, w])
-        if here == 1:
-            held = real(1.0) - r.push[w]
-            total -= held * wrench_at(model, g, w, r.here_pos[g, w], r.here_mat[g, w])
+        push = r.push[w]
+        if here == 1 and push < real(1.0):
+            # against the drift itself: the way from here to the pose is another one where bodies turn far
+            total = push * total - (real(1.0) - push) * (model.tangent0[g, w] * r.drift[g, w])
     wrench_out[g, w] = total
 
 

@@ -130,7 +130,11 @@ class Coupled:
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
         wrench = self._model(self.pose)
-        return wrench if self.push == 1.0 else wrench - (1.0 - self.push) * self._model(self.here)
+        if self.push == 1.0:
+            return wrench
+        # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
+        damper = (self.tangent @ self.drift[:, :, None])[:, :, 0]
+        return self.push * wrench - (1.0 - self.push) * damper
 
     def _acting(self):
         """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
