@@ -459,7 +459,9 @@ def test_no_ball_gains_energy(mass, spin, seed):
         assert (energy <= 1.05 * start).all()
         force = np.maximum(force, np.linalg.norm(read(mjm, d, "contact_force")[:, :3], axis=1))
     assert (force[:3] > 5e-3).all() and (d.qpos.numpy()[:, 1] < -4e-3).all()  # none is past the middle
-    np.testing.assert_allclose(d.qpos.numpy()[3], other.qpos.numpy()[0], atol=1e-6)  # single precision
+    # on CUDA four worlds are multiplied in single precision in another order than one
+    bound = 1e-6 if d.qpos.device.is_cuda else 1e-7
+    np.testing.assert_allclose(d.qpos.numpy()[3], other.qpos.numpy()[0], atol=bound)
 
 
 def test_a_skin_without_energy_pushes_nobody():
