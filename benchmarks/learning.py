@@ -15,11 +15,11 @@ import time
 import torch
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.learning.config import LearningConfig
-from biotac_mj.learning.electrode_vae import ElectrodeVAE
-from biotac_mj.learning.hierarchy import build_hierarchy
-from biotac_mj.learning.mesh_vae import MeshVAE
-from biotac_mj.learning.paper import LatentProjection
+from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE
+from biotac_mj.learning.networks.hierarchy import build_hierarchy
+from biotac_mj.learning.networks.mesh_vae import MeshVAE
+from biotac_mj.learning.training.config import LearningConfig
+from biotac_mj.learning.training.paper import LatentProjection
 from biotac_mj.learning.weights import load_forward, shipped
 
 

@@ -25,8 +25,8 @@ from biotac_mj.data.simulate import simulate, simulate_condensed
 from biotac_mj.data.splits import assign
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import rotation
-from biotac_mj.learning.examples import Examples, from_set
-from biotac_mj.learning.reader import Reader, fit_reader
+from biotac_mj.learning.instants.examples import Examples, from_set
+from biotac_mj.learning.instants.reader import Reader, fit_reader
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import SkinModel
 from biotac_mj.skin.settings import read_material

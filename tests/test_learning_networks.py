@@ -10,15 +10,15 @@ from learning_set import dent  # noqa: E402
 from scipy.sparse import csr_matrix  # noqa: E402
 
 from biotac_mj.geometry import load_skin  # noqa: E402
-from biotac_mj.learning.config import LearningConfig  # noqa: E402
-from biotac_mj.learning.electrode_vae import ElectrodeVAE  # noqa: E402
-from biotac_mj.learning.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
-from biotac_mj.learning.fitting import _one_cycle, cycle  # noqa: E402
-from biotac_mj.learning.graph import ChebConv, SparseMatrix  # noqa: E402
-from biotac_mj.learning.heads import LocalHead, PodHead, averages, next_average  # noqa: E402
-from biotac_mj.learning.hierarchy import build_hierarchy  # noqa: E402
-from biotac_mj.learning.mesh_vae import MeshVAE  # noqa: E402
-from biotac_mj.learning.pointnet import PointNet  # noqa: E402
+from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE  # noqa: E402
+from biotac_mj.learning.networks.graph import ChebConv, SparseMatrix  # noqa: E402
+from biotac_mj.learning.networks.heads import LocalHead, PodHead, averages, next_average  # noqa: E402
+from biotac_mj.learning.networks.hierarchy import build_hierarchy  # noqa: E402
+from biotac_mj.learning.networks.mesh_vae import MeshVAE  # noqa: E402
+from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
+from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
+from biotac_mj.learning.training.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
+from biotac_mj.learning.training.fitting import _one_cycle, cycle  # noqa: E402
 
 
 @pytest.fixture(scope="module")

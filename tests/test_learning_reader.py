@@ -12,9 +12,9 @@ pytest.importorskip("safetensors")
 from recorded import synthetic  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
-from biotac_mj.learning.examples import Examples, from_recording  # noqa: E402
-from biotac_mj.learning.reader import Reader, fit_reader, judge  # noqa: E402
-from biotac_mj.learning.terms import Terms  # noqa: E402
+from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
+from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
+from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.weights import shipped  # noqa: E402
 from biotac_mj.recordings import write  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance  # noqa: E402
@@ -119,7 +119,7 @@ def test_terms_without_the_common_mode_do_not_see_it():
 
 
 def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
-    import biotac_mj.learning.real as real
+    import biotac_mj.learning.instants.real as real
 
     monkeypatch.setattr(real, "_STEPS", (20, 20))
     one = synthetic(n=1200)

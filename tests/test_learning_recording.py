@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from biotac_mj.cli import main
-from biotac_mj.learning.force import causal_average, fit_force, ridge, shared_gain, walk_forward
-from biotac_mj.learning.real import evaluate_recording
+from biotac_mj.learning.instants.force import causal_average, fit_force, ridge, shared_gain, walk_forward
+from biotac_mj.learning.instants.real import evaluate_recording
 from biotac_mj.recordings import load_one
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 
@@ -105,7 +105,7 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
 
 def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
     pytest.importorskip("torch")
-    import biotac_mj.learning.real as real
+    import biotac_mj.learning.instants.real as real
 
     monkeypatch.setattr(real, "_STEPS", (20, 20))
     counts, force = synthetic_log(800)

@@ -18,15 +18,15 @@ import biotac_mj  # noqa: E402
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.data import TactileSet  # noqa: E402
 from biotac_mj.geometry import load_skin  # noqa: E402
-from biotac_mj.learning.arrays import load_arrays  # noqa: E402
-from biotac_mj.learning.config import LearningConfig  # noqa: E402
-from biotac_mj.learning.experiment import train_all  # noqa: E402
-from biotac_mj.learning.few_shot import adapt, evaluate_new_sensor  # noqa: E402
-from biotac_mj.learning.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.patch import contact_patch  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
+from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
+from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
+from biotac_mj.learning.training.experiment import train_all  # noqa: E402
+from biotac_mj.learning.training.few_shot import adapt, evaluate_new_sensor  # noqa: E402
+from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
@@ -231,8 +231,8 @@ def test_attach_takes_the_file_of_a_model(weights):
 def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     from types import SimpleNamespace
 
-    from biotac_mj.learning.features import FilmFeatures, Pod
-    from biotac_mj.learning.heads import LocalHead
+    from biotac_mj.learning.networks.heads import LocalHead
+    from biotac_mj.learning.training.features import FilmFeatures, Pod
     from biotac_mj.learning.weights import save_forward
     from biotac_mj.sensor.acquisition import Acquisition
 

@@ -11,7 +11,7 @@ import torch
 from ..files import replacing
 from ..geometry import load_skin
 from ..recordings import load_one
-from .inverse import PATCH, contact_centre, log_change_of
+from .training.inverse import PATCH, contact_centre, log_change_of
 from .weights import load_inverse, shipped
 
 if typing.TYPE_CHECKING:

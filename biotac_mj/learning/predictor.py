@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from ..sensor.channels import NELECTRODE
-from .features import FilmFeatures, Pod
-from .heads import LocalHead, PodHead, next_average
-from .local import counts_change
+from .networks.heads import LocalHead, PodHead, next_average
+from .training.features import FilmFeatures, Pod
+from .training.local import counts_change
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry

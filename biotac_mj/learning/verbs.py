@@ -65,8 +65,8 @@ def _add_train(verbs, verb):
 def _train(args):
     import dataclasses
 
-    from .config import LearningConfig
-    from .experiment import train_all
+    from .training.config import LearningConfig
+    from .training.experiment import train_all
 
     _check_device(args.device)
     settings = (
@@ -180,7 +180,7 @@ def _evaluate(args):
     if args.electrodes:
         _evaluate_recording(args)
     elif args.new_sensor:
-        from .few_shot import evaluate_new_sensor
+        from .training.few_shot import evaluate_new_sensor
         from .weights import shipped
 
         one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json)
@@ -209,15 +209,15 @@ def _evaluate_models(args):
         print("written: " + ", ".join(map(str, ship(args.folder, result, args.ship))))
 
     if args.save:
-        from .predict import save_forward_model
+        from .instants.predict import save_forward_model
 
         save_forward_model(args.folder, args.save)
         print(f"written: {args.save}")
 
 
 def _evaluate_set(args):
-    from .examples import from_set
-    from .reader import judge
+    from .instants.examples import from_set
+    from .instants.reader import judge
 
     _save_reader(args, *judge(from_set(args.folder), args.seed))
 
@@ -259,7 +259,7 @@ def _add_predict(verbs, verb):
 def _predict(args):
     import numpy as np
 
-    from .predict import SUFFIXES, predict, write_prediction
+    from .instants.predict import SUFFIXES, predict, write_prediction
 
     if not args.out.endswith(SUFFIXES):
         raise ValueError(f"--out {args.out} ends in none of {', '.join(SUFFIXES)}: give such a name")
@@ -320,7 +320,7 @@ def _contact_patch(args):
 
 def _evaluate_recording(args):
     from ..recordings import load_one
-    from .real import evaluate_recording
+    from .instants.real import evaluate_recording
 
     recording, notes = load_one(args.electrodes, args.sensor, force=args.force)
     result = evaluate_recording(
@@ -351,7 +351,7 @@ def _evaluate_recording(args):
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")
     if args.save:
-        from .examples import from_recording
-        from .reader import judge_in_time
+        from .instants.examples import from_recording
+        from .instants.reader import judge_in_time
 
         _save_reader(args, *judge_in_time(from_recording(recording), args.fraction, args.seed))

@@ -16,10 +16,10 @@ from ..sensor.channels import ELECTRODES, NELECTRODE
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
-    from .config import LearningConfig
-    from .features import Pod
-    from .inverse import InverseHead
     from .predictor import ForwardModel
+    from .training.config import LearningConfig
+    from .training.features import Pod
+    from .training.inverse import InverseHead
 
 __all__ = [
     "FORMAT",
@@ -205,7 +205,7 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
 def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
     """Shape of what a forward model's window remembers, from the file's header alone: (0,) where it has
     none; raises as `load_forward` where it is not for this skin."""
-    from .features import FilmFeatures
+    from .training.features import FilmFeatures
 
     meta = describe(path)
     _refuse_other(meta, path, geometry, "forward")
@@ -214,8 +214,8 @@ def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
 
 def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead":
     """An `inverse.InverseHead` of weights; raises as `load_forward`."""
-    from .features import Pod
-    from .inverse import InverseHead
+    from .training.features import Pod
+    from .training.inverse import InverseHead
 
     meta, tensors = _load(path, geometry, "inverse")
     with reading(path, "file of weights that fit together", _DAMAGED):

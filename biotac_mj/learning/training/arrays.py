@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
+from ...sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
 
 __all__ = ["Arrays", "load_arrays"]
 
@@ -95,7 +95,7 @@ def load_arrays(
       ValueError: no displacements or measured counts in it, channels in another order, NaN, or interactions
         without a row before touch.
     """
-    from ..data import TactileSet
+    from ...data import TactileSet
 
     with TactileSet(path) as data:
         for name in ("displacement", "counts", "measured_counts", "contact_force"):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from ..sensor.channels import NELECTRODE
+from ...sensor.channels import NELECTRODE
 
 __all__ = ["Terms"]
 

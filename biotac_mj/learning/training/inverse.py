@@ -8,11 +8,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from ..sensor.channels import NELECTRODE, check_counts, log_impedance
-from .electrode_vae import mlp
+from ...sensor.channels import NELECTRODE, check_counts, log_impedance
+from ..networks.electrode_vae import mlp
+from ..networks.heads import steady
 from .features import ELECTRODE_MIRROR
 from .fitting import cycle, root_mean_square
-from .heads import steady
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays

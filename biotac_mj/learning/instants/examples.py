@@ -5,9 +5,9 @@ import pathlib
 
 import numpy as np
 
-from ..recordings import Recording
-from ..sensor.channels import NELECTRODE, log_impedance
-from .inverse import contact_centre
+from ...recordings import Recording
+from ...sensor.channels import NELECTRODE, log_impedance
+from ..training.inverse import contact_centre
 
 __all__ = ["Examples", "from_recording", "from_set"]
 
@@ -60,7 +60,7 @@ def from_set(path: pathlib.Path | str) -> Examples:
     Raises:
       FileNotFoundError, ValueError: no set, or one without counts.
     """
-    from ..data import TactileSet
+    from ...data import TactileSet
 
     with TactileSet(path) as data:
         measured = bool(data.labelled.any())

@@ -8,13 +8,13 @@ import pathlib
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..data.schema import SPLITS
-from ..data.splits import assign
-from ..files import replacing
-from ..sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
+from ...data.schema import SPLITS
+from ...data.splits import assign
+from ...files import replacing
+from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
+from ..protocol import conformal_width
 from .examples import Examples
 from .force import ridge
-from .protocol import conformal_width
 from .terms import Terms
 
 __all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "judge_in_time"]
@@ -109,7 +109,7 @@ class Reader:
         """Writes a safetensors file."""
         from safetensors.numpy import save
 
-        from .weights import FORMAT
+        from ..weights import FORMAT
 
         meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(ELECTRODES)}
         tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in self.tensors.items()}
@@ -123,7 +123,7 @@ class Reader:
         Raises:
           FileNotFoundError, ValueError: no such file, or no such model; the text names it.
         """
-        from .weights import FORMAT, read_tensors
+        from ..weights import FORMAT, read_tensors
 
         meta, tensors = read_tensors(path)
         if meta.get("format") != FORMAT or meta.get("direction") != "reader":

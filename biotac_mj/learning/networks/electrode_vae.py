@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from ..sensor.channels import NELECTRODE
+from ...sensor.channels import NELECTRODE
 
 __all__ = ["ElectrodeVAE", "mlp"]
 

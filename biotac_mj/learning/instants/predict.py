@@ -5,14 +5,14 @@ import pathlib
 import numpy as np
 import torch
 
-from ..files import hdf5, replacing
-from ..recordings import load_one
-from .arrays import load_arrays
-from .experiment import division_of
-from .protocol import conformal_width
+from ...files import hdf5, replacing
+from ...recordings import load_one
+from ..protocol import conformal_width
+from ..report import predictions_of, report_of
+from ..training.arrays import load_arrays
+from ..training.experiment import division_of
+from ..weights import amend, describe, load_forward
 from .reader import TARGETS, UNITS, Prediction, Reader
-from .report import predictions_of, report_of
-from .weights import amend, describe, load_forward
 
 __all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
 

@@ -10,19 +10,19 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import torch
 
-from ..data import Split, TactileSet, split_by_interaction, split_by_object
-from ..fields import refuse_unknown
-from ..files import replacing, write_npz
-from ..reading import read_json
-from ..sensor.channels import FULL_SCALE
+from ...data import Split, TactileSet, split_by_interaction, split_by_object
+from ...fields import refuse_unknown
+from ...files import replacing, write_npz
+from ...reading import read_json
+from ...sensor.channels import FULL_SCALE
+from ..instants.force import ridge
+from ..weights import save_forward, save_inverse
 from .arrays import Arrays, load_arrays
 from .config import LearningConfig
 from .features import Pod
-from .force import ridge
 from .inverse import contact_centre, field_errors, patch_overlap, train_inverse
 from .local import Features, train_head
 from .paper import train_latent_projection, train_pointnet
-from .weights import save_forward, save_inverse
 
 __all__ = ["FORWARD", "division_of", "train_all", "train_split"]
 
@@ -277,7 +277,7 @@ def _linear(arrays, now, fit, check, both):
 
 def _physics_gain(arrays, fit, both):
     """The simulation's own d ln Z, times one gain for each electrode."""
-    from ..sensor.channels import log_impedance
+    from ...sensor.channels import log_impedance
     from .local import counts_change
 
     z = torch.as_tensor(

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from scipy.stats import t as t_quantile
 
-from ..files import replacing
-from ..sensor.channels import FULL_SCALE, NELECTRODE
+from ...files import replacing
+from ...sensor.channels import FULL_SCALE, NELECTRODE
+from ..protocol import interaction_errors
+from ..weights import load_forward
 from .arrays import load_arrays
 from .local import counts_change
-from .protocol import interaction_errors
-from .weights import load_forward
 
 __all__ = ["adapt", "evaluate_new_sensor"]
 

@@ -9,10 +9,10 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 from torch import nn
 
-from ..sensor.channels import NELECTRODE
+from ...sensor.channels import NELECTRODE
 
 if typing.TYPE_CHECKING:
-    from ..geometry.skin_geometry import SkinGeometry
+    from ...geometry.skin_geometry import SkinGeometry
 
 __all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix"]
 
@@ -84,8 +84,8 @@ class FilmFeatures(nn.Module):
 
     def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
-        from ..sensor.core_surface import CoreSurface
-        from ..sensor.film import _CORE_RADIUS, EXCITATION
+        from ...sensor.core_surface import CoreSurface
+        from ...sensor.film import _CORE_RADIUS, EXCITATION
 
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
         place = geometry.vert[node]

@@ -4,7 +4,7 @@ skin at rest."""
 import torch
 from torch import nn
 
-from ..sensor.channels import NELECTRODE
+from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["LocalHead", "PodHead", "averages", "next_average", "steady"]

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..sensor.channels import FULL_SCALE, log_impedance
+from ...sensor.channels import FULL_SCALE, log_impedance
+from ..networks.graph import SparseMatrix
+from ..networks.heads import LocalHead, PodHead, averages
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
 from .fitting import cycle, root_mean_square
-from .graph import SparseMatrix
-from .heads import LocalHead, PodHead, averages
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays

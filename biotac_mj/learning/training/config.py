@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from ..fields import check_types
+from ...fields import check_types
 
 __all__ = ["LearningConfig"]
 

@@ -7,9 +7,9 @@ import time
 
 import numpy as np
 
-from ..files import replacing
-from ..recordings.recording import Recording
-from ..sensor.channels import FULL_SCALE
+from ...files import replacing
+from ...recordings.recording import Recording
+from ...sensor.channels import FULL_SCALE
 from .force import TRIALS, fit_force, ridge
 
 __all__ = ["evaluate_recording"]
@@ -156,7 +156,7 @@ def _vae(counts, mean, ntrain, linear, seed):
     """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows."""
     import torch
 
-    from .electrode_vae import ElectrodeVAE
+    from ..networks.electrode_vae import ElectrodeVAE
 
     torch.manual_seed(seed)
     size = counts[:ntrain].std()  # one scale for all: an error counts alike in every channel

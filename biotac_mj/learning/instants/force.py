@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.signal import lfilter
 
-from ..sensor.channels import counts_from_log_impedance, log_impedance
+from ...sensor.channels import counts_from_log_impedance, log_impedance
 from .terms import Terms
 
 __all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
-from ..sensor.channels import NELECTRODE
+from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
 __all__ = ["PointNet", "farthest_points"]

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from .electrode_vae import ElectrodeVAE, mlp
+from ..networks.electrode_vae import ElectrodeVAE, mlp
+from ..networks.hierarchy import build_hierarchy
+from ..networks.mesh_vae import MeshVAE
+from ..networks.pointnet import PointNet
 from .fitting import cycle, fast_products, root_mean_square
-from .hierarchy import build_hierarchy
-from .mesh_vae import MeshVAE
-from .pointnet import PointNet
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays

@@ -1,0 +1,1 @@
+"""What the electrodes tell instant by instant, from recordings or data sets: force, place, code."""

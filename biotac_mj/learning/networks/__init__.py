@@ -1,0 +1,1 @@
+"""The networks: VAEs of skin and electrodes, PointNet++, heads on features of the skin."""
