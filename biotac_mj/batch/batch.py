@@ -11,6 +11,7 @@ Once per step, when mujoco_warp asks for passive forces, as `coupling/world.py` 
 The readings are written when it asks for the velocity sensors.
 """
 
+import functools
 import typing
 
 import mujoco
@@ -68,19 +69,21 @@ class Batch(Skins):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             for name in ("drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            for name in ("spent", "far", "trial", "placed", "inside"):
+            for name in ("spent", "far", "trial", "placed", "inside", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
             r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
             r.off, r.share, r.store, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(4))
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
+        if self.moving:
+            skin.prepare_keep()
         self._solid = rounds.Solid()
         self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
         self._solid.area = float(skin.model.outer.area.numpy().sum())
 
-    def predict(self, m: "mjw.Model", d: "mjw.Data") -> None:
+    def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
-        finds this step's rows."""
+        who takes part; finds this step's rows."""
         r = self._of_step
         bodies = [self._core, self._body, d.xpos, d.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
@@ -91,10 +94,9 @@ class Batch(Skins):
             [self._core, self._body, self.dt, *arrays],
             [r.start_pos, r.start_mat, self._jacobian, r.drift],
         )
-        self.begin_step()
+        self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
         if self.moving:
-            self._launch(rounds.begin_rounds, self.nworld, [], [r])
-            self.skin.keep()
+            self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
@@ -152,18 +154,31 @@ class Batch(Skins):
             )
         self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
 
+    def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Solves the skins that take part where the bodies go without acceleration."""
+
+        def solve():
+            self.keep_models()
+            self.solve_skins(m, d)
+
+        wp.capture_if(self.rest.any, solve)
+
     def solve_first(self, m: "mjw.Model", d: "mjw.Data", again: wp.array) -> None:
         """The first round; sets again[0] where the bodies of a world may go elsewhere under its new model."""
         from mujoco_warp._src import smooth
 
         r = self._of_step
+        self.keep_models()
+        self.skin.keep()
         self._find_wrenches(r.pos, r.mat, 0, self._wrench_before)
         self.solve_skins(m, d)
         self._find_wrenches(r.pos, r.mat, 0, self._wrench)
         forces = [self._jacobian, self._wrench, self._wrench_before]
         self._launch(rounds.change_forces, self._change.shape, forces, [self._change])
         smooth.solve_m(m, d, self._changed, self._change)
-        self._launch(rounds.look, self.nworld, [self.dt**2, self._jacobian, self._changed], [r, again])
+        self._launch(
+            rounds.look, self.nworld, [self.rest.awake, self.dt**2, self._jacobian, self._changed], [r, again]
+        )
 
     def judge(self, again: wp.array) -> None:
         """Sets again[0] where a skin is to be solved again, after `aim`."""
@@ -192,6 +207,10 @@ class Batch(Skins):
         """Ends the step, after `aim`."""
         self._settle(rounds.conclude, solid=[self._solid])
 
+    def pass_by(self) -> None:
+        """Ends a step in which no skin takes part."""
+        self._launch(rounds.pass_by, self.nworld, [self._solid.area], [self._of_step])
+
     def _settle(self, kernel, last=(), solid=(), outputs=()):
         r = self._of_step
         self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
@@ -211,6 +230,7 @@ class Hook:
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
         self._outside = None
+        self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
 
     @classmethod
@@ -226,12 +246,13 @@ class Hook:
         if self._passive:
             self._passive(m, d)
         batches = [b for b in self.batches if b.active]
+        self._any.zero_()
         for batch in batches:
-            batch.predict(m, d)
+            batch.predict(m, d, self._any)
         moving = [b for b in batches if b.moving]
         for batch in batches:
             if batch not in moving:
-                batch.solve_skins(m, d)
+                batch.solve_one_way(m, d)
         if moving:
             if self._outside is None:
                 if d.qacc.device.is_cuda and d.qacc.device.is_capturing:
@@ -243,7 +264,11 @@ class Hook:
                 self._scratch = Scratch(d.qacc.device)
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
-                self._find_balance(m, d, moving)
+                wp.capture_if(
+                    self._any,
+                    lambda: self._find_balance(m, d, moving),
+                    lambda: [batch.pass_by() for batch in moving],
+                )
             self._act(m, d, moving)
         for batch in batches:
             batch.end_step()
@@ -261,7 +286,7 @@ class Hook:
 
         def solve():
             for batch in moving:
-                batch.solve_again(m, d)
+                wp.capture_if(batch.rest.any, functools.partial(batch.solve_again, m, d))
 
         def withhold():
             self._accelerate(m, d, moving)
@@ -279,7 +304,7 @@ class Hook:
         self._accelerate(m, d, moving, first=True)
         again.zero_()
         for batch in moving:
-            batch.solve_first(m, d, again)
+            wp.capture_if(batch.rest.any, functools.partial(batch.solve_first, m, d, again))
         wp.capture_while(again, go_on)
         for batch in moving:
             batch.restrain(again)

@@ -24,6 +24,7 @@ __all__ = [
     "judge",
     "look",
     "look_ahead",
+    "pass_by",
     "restrain",
     "share_push",
     "withhold",
@@ -75,6 +76,7 @@ class Rounds:
     began: wp.array(dtype=int)  # a step was made since the reset
     placed: wp.array(dtype=int)  # bodies were put where they are from outside
     inside: wp.array(dtype=int)  # and into the skin
+    passed: wp.array(dtype=int)  # the last step was one in which no skin took part
     far: wp.array(dtype=int)  # so far the bodies go from where nothing touches that they may cross the skin
     depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
@@ -131,16 +133,20 @@ def wrenches(
 
 
 @wp.kernel
-def begin_rounds(r: Rounds):
+def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     w = wp.tid()
     r.placed[w] = 1 - r.began[w]
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.drift[g, w])):
             r.placed[w] = 1
+        if r.passed[w] == 1:  # where it ended is only about known, and nobody touched it
+            r.end_pos[g, w] = r.here_pos[g, w]
+            r.end_mat[g, w] = r.here_mat[g, w]
+    r.passed[w] = 0
     r.inside[w] = r.placed[w]
     r.settled[w] = 1
-    r.rounds[w] = 0
+    r.rounds[w] = 1 - awake[w]
     r.spent[w] = 0
     r.off[w] = real(wp.inf)
     r.share[w] = real(1.0)
@@ -289,6 +295,7 @@ def change_forces(
 @wp.kernel
 def look(
     # In:
+    awake: wp.array(dtype=int),
     h2: real,
     jacobian: wp.array3d(dtype=vec6),
     change: wp.array2d(dtype=float),
@@ -301,6 +308,8 @@ def look(
 
     Rows, contacts and limits only hold: what they leave of a change of forces is smaller."""
     w = wp.tid()
+    if awake[w] == 0:
+        return
     off = distance_off(r, w)
     for g in range(r.pos.shape[0]):
         way = vec6()
@@ -492,3 +501,17 @@ def conclude(
     for g in range(r.pos.shape[0]):
         r.end_pos[g, w] = r.pos[g, w]
         r.end_mat[g, w] = r.mat[g, w]
+
+
+@wp.kernel
+def pass_by(area: real, r: Rounds):
+    """Instead of all rounds where no skin takes part: bodies go where they go, a skin has the energy of its
+    adhesion."""
+    w = wp.tid()
+    r.store[w] = real(0.0)
+    if r.surface.shape[0] > 0:
+        r.store[w] = r.surface[w] * area
+    r.passed[w] = 1
+    for g in range(r.pos.shape[0]):
+        r.end_pos[g, w] = r.start_pos[g, w]
+        r.end_mat[g, w] = r.start_mat[g, w]

@@ -11,6 +11,7 @@ from ..coupling.readings import materials_of, textures_of
 from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
 from ..sensor.acquisition import BatchAcquisition
+from ..sensor.film import BatchFilm
 from ..sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from ..sensor.materials import Material
 from ..sensor.presets import Sensor
@@ -100,6 +101,29 @@ def reset_rows(
         state_out[w, i] = rest[row[w], i]
 
 
+@wp.kernel
+def find_changed(
+    # In:
+    due: wp.array(dtype=int),
+    awake: wp.array(dtype=int),
+    # In and out:
+    known: wp.array(dtype=int),
+    # Out:
+    changed_out: wp.array(dtype=int),
+    any_out: wp.array(dtype=int),
+):
+    """Which due worlds have another film than when it was solved last; `known` where it was since the skin
+    moved."""
+    w = wp.tid()
+    if awake[w] == 1:
+        known[w] = 0
+    changed_out[w] = 0
+    if due[w] == 1 and known[w] == 0:
+        known[w] = 1
+        changed_out[w] = 1
+        any_out[0] = 1
+
+
 class Senses:
     """Of the skins of a batch.
 
@@ -131,6 +155,9 @@ class Senses:
         device, nworld, ngroup = skin.model.device, skin.nworld, skin.ngroup
         warm, shaken = rows[0].bodies is not None, rows[0].textures is not None
         self.heat = self.vibration = self._touched = None
+        with wp.ScopedDevice(device):
+            self._known, self._changed = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self._any = wp.zeros(1, dtype=int)
         self._rests, begins = [], None
         if warm:
             self.heat = Heat(rows[0].bodies, nworld=nworld, device=device)
@@ -188,15 +215,22 @@ class Senses:
         if self.vibration:
             self._touched.begin()
 
-    def advance(self, wrench: wp.array, tangent: wp.array) -> wp.array:
-        """After it; wrench, tangent (ngroup, nworld) of the skins ON the bodies. Returns the states (nworld,
-        NSTATE)."""
+    def advance(self, wrench: wp.array, tangent: wp.array, awake: wp.array) -> wp.array:
+        """After it; wrench, tangent (ngroup, nworld) of the skins ON the bodies, awake (nworld,) int, 1 where
+        the skin may have moved. Returns the states (nworld, NSTATE)."""
         skin, acquisition = self._skin, self.acquisition
         if self._touched:
             self._touched.end(wrench, tangent)
         if self.heat:
             self.heat.advance(self._dt)
-        self.film.solve_film(skin.x, acquisition.find_due(self._dt))
+        due = acquisition.find_due(self._dt)
+        if isinstance(self.film, BatchFilm):  # a network may remember, and sees every frame
+            self._any.zero_()
+            outputs = [self._known, self._changed, self._any]
+            wp.launch(find_changed, skin.nworld, [due, awake], outputs, device=due.device)
+            wp.capture_if(self._any, lambda: self.film.solve_film(skin.x, self._changed))
+        else:
+            self.film.solve_film(skin.x, due)
         shaken = None
         if self.vibration:
             self.vibration.advance(self._dt)

@@ -37,6 +37,7 @@ class BatchSkin:
         data.frame_mat when it ends.
       fresh: (nworld,) int, 1 where no step was made since the reset: such a skin begins at rest on its core.
       x: (nvert, nworld) nodes [m].
+      motion: (ngeom, nworld) of the geoms in the last step [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
@@ -77,7 +78,7 @@ class BatchSkin:
         self.ngroup, struct, st = self.geoms.ngroup, self.geoms.struct, self.data.worlds
         self.pos, self.mat = struct.pos, struct.mat
         self.x, self.reason, self.iterations, self.error = self.data.x, st.reason, st.iterations, st.error
-        self._motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
+        self.motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
         self.data.laws.refuse_coarse_grids(self.geoms)
         prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):
@@ -87,8 +88,7 @@ class BatchSkin:
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
             self.fresh = wp.full(nworld, 1, dtype=int)
-            self._rest = self.data.rest_vert
-        self._kept = None
+            self._rest, self._kept = self.data.rest_vert, {}
 
     @property
     def nbytes(self) -> int:
@@ -121,13 +121,14 @@ class BatchSkin:
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
 
+    def prepare_keep(self) -> None:
+        """Allocates what `keep` needs."""
+        for array in self._memory():
+            if array.size:
+                self._kept[array.ptr] = array, wp.empty_like(array)
+
     def keep(self) -> None:
-        """Keeps what the skins remember, for `put_back`. Launches only, but for the first time."""
-        if self._kept is None:
-            self._kept = {}
-            for array in self._memory():
-                if array.size:
-                    self._kept[array.ptr] = array, wp.empty_like(array)
+        """Keeps what the skins remember, for `put_back`. Launches only."""
         for array, kept in self._kept.values():
             wp.copy(kept, array)
 
@@ -135,7 +136,7 @@ class BatchSkin:
         """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
         begins from it, as if the skin had gone there in the last step already. Launches only."""
         wanted = self.data.worlds.wanted
-        last = self.data.increment.ptr, self._motion.ptr, self._touched_by.ptr
+        last = self.data.increment.ptr, self.motion.ptr, self._touched_by.ptr
         for array, kept in self._kept.values():
             now, then = _words(array), _words(kept)
             given = [then, wanted, int(array.ptr in last), self.reason]
@@ -145,7 +146,7 @@ class BatchSkin:
         """All that a step starts from, and changes."""
         d, geoms, st = self.data, self.geoms.struct, self.data.worlds
         arrays = [d.x, d.x_last, d.increment, d.outer.anchor_geom, d.outer.anchor, d.outer.kept]
-        arrays += [geoms.pos_last, geoms.mat_last, self._motion, self._touched_by]
+        arrays += [geoms.pos_last, geoms.mat_last, self.motion, self._touched_by]
         arrays += [st.last_pressure, st.nonconverged]
         if d.memory:
             rubber = d.memory.rubber
@@ -177,7 +178,7 @@ class BatchSkin:
             kernels.reset_geoms,
             self.pos.shape,
             [mask],
-            [self.geoms.struct.pos_last, self._motion, self._touched_by],
+            [self.geoms.struct.pos_last, self.motion, self._touched_by],
         )
         self._launch(
             kernels.reset_worlds,

@@ -10,6 +10,7 @@ from ..coupling.touching import Touching
 from ..sensor.acquisition import NSTATE
 from ..sensor.channels import WIDTHS
 from . import kernels
+from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
 
@@ -30,6 +31,7 @@ class Skins:
       failed: (nworld,) wp.array int, steps that found no balance since the reset.
       model: `kernels.Model`, linear models in force: of the skin ON each touching body in the BioTac frame.
       began: (nworld,) wp.array int, whether a step was made since the reset.
+      rest: `rest.Rest`, which skins take part in the step.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Skins:
             self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
             self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
+        self.rest = Rest(skin)
         self.reset()
 
     def reset(self, world_mask: wp.array | np.ndarray | None = None) -> None:
@@ -86,6 +89,7 @@ class Skins:
             )
         self.skin.reset(mask)
         self._launch(kernels.reset_models, self.nworld, [mask], [self.model, self.failed, self.began])
+        self.rest.reset(mask)
         if self.senses:
             self.senses.reset(mask)
 
@@ -105,16 +109,24 @@ class Skins:
         """Device memory that grows with the number of worlds, of skins and sensors together [bytes]."""
         return self.skin.nbytes + (self.senses.nbytes if self.senses else 0)
 
-    def begin_step(self) -> None:
-        """Before the first `solve_at` of a step. Launches only."""
-        for name in kernels.Model.vars:
-            wp.copy(getattr(self._last, name), getattr(self.model, name))
-        self.skin.data.worlds.wanted.fill_(1)
+    def begin_step(
+        self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array, any_of_all: wp.array
+    ) -> None:
+        """Before the first `solve_at` of a step, with the bodies where they go without acceleration; sets
+        any_of_all[0] where a skin takes part in it. Launches only."""
+        self.place_geoms(pos, mat, geom_pos, geom_quat)
+        self.rest.begin_step(any_of_all)
         if self.senses:
             self.senses.begin_step()
 
+    def keep_models(self) -> None:
+        """Keeps the linear models of the last step, before the first `solve_at`. Launches only."""
+        for name in kernels.Model.vars:
+            wp.copy(getattr(self._last, name), getattr(self.model, name))
+
     def end_step(self) -> None:
         """After the last one. Launches only."""
+        self.rest.end_step(self.model, self._settled, self._rounds)
         how = [self.skin.reason, self._settled]
         self._launch(kernels.count_failures, self.nworld, how, [self.failed, self.began])
 
@@ -144,7 +156,7 @@ class Skins:
         only."""
         state, skin = self._no_state, self.skin
         if self.senses:
-            state = self.senses.advance(self.model.wrench0, self.model.tangent0)
+            state = self.senses.advance(self.model.wrench0, self.model.tangent0, self.rest.awake)
         outputs = [state, self.model.wrench0, skin.reason, self._valid, self._settled, self.failed]
         how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
         self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs, *how], [sensordata])
@@ -182,6 +194,7 @@ class PoseBatch(Skins):
             )  # (w, x, y, z), as mujoco_warp keeps it
             self._pos = wp.zeros(self.groups, dtype=wp.vec3d)
             self._mat = wp.zeros(self.groups, dtype=wp.mat33d)
+            self._any = wp.zeros(1, dtype=int)
             self.xfrc_applied = wp.zeros((self.nworld, mjm.nbody, 6), dtype=float)
             self.sensordata = wp.zeros((self.nworld, sum(widths)), dtype=float)
 
@@ -216,8 +229,9 @@ class PoseBatch(Skins):
                 [self._core, xpos, xmat, skin.fresh],
                 [data.frame_pos, data.frame_mat, skin.core_pos, skin.core_mat],
             )
-        self.begin_step()
-        self.solve_at(self._pos, self._mat, self._geom_pos, self._geom_quat)
+        where = self._pos, self._mat, self._geom_pos, self._geom_quat
+        self.begin_step(*where, self._any)
+        wp.capture_if(self.rest.any, lambda: (self.keep_models(), self.solve_at(*where)))
         self.end_step()
         bodies = [self._core, self._body, self.model.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])

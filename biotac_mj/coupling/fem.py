@@ -18,13 +18,13 @@ from .config import Config
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
-__all__ = ["FemStepper", "rest_geometry", "shared_model", "skin_settings"]
+__all__ = ["CLEAR", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
 _WORK = 200  # of two-way skins, see SkinOptions.max_work
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
-_CLEAR = 1e-3
+CLEAR = 1e-3
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
@@ -207,7 +207,7 @@ class FemStepper:
         return (
             self.resting(state)
             and not self._model.device.is_cuda
-            and self._search.clear(geom_pos, geom_mat, _CLEAR)
+            and self._search.clear(geom_pos, geom_mat, CLEAR)
         )
 
     def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
