@@ -2,11 +2,17 @@
 tiers.
 
     MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands.json [--tiers condensed,full] [--steps 40]
+    MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands_gpu.json --worlds 256,1024
+                                                  [--device cuda:0] [--pressing 0,2] [--depth 0.6e-3]
 
 A ball of 10 mm radius that does not move is pushed 0.6 mm into the pad of each finger that touches; the hand
 is held by its servos, with no gravity. Milliseconds of processor time of the thread per mj_step of 4 ms,
 median and mean over the steps: the film of the electrodes is solved once per 10 ms, so in two of five steps.
-Beside it the hand alone."""
+Beside it the hand alone.
+
+--worlds: five BioTacs in every world of mujoco_warp batches, of which --pressing fingers touch: wall time of
+a step (on CUDA one graph), the least of the means over runs of --steps; beside it the same hand without
+BioTacs."""
 
 import os
 
@@ -14,6 +20,7 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import argparse
+import functools
 import pathlib
 import sys
 import time
@@ -33,32 +40,105 @@ __all__ = ["build", "main", "measure"]
 
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 RADIUS, DEPTH, TIMESTEP = 10e-3, 0.6e-3, 4e-3
+RUNS = 5
 PAD = np.array([-10e-3, -8.2e-3, 0.0])  # middle of the pad in the BioTac frame [m]
 
 
-def build(hand, count, tier, skin):
-    """A hand with `count` BioTacs and a ball for each finger, far away: model, handles."""
+def build(hand, count, **settings):
+    """A hand with `count` BioTacs and a ball for each finger, far away: model, what `attach_to_hand`
+    returns."""
     spec = mujoco.MjSpec.from_file(str(hand))
     spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = [0, 0, 0]
-    for i in range(count):
+    for i in range(len(FINGERS)):
         ball = spec.worldbody.add_body(name=f"ball{i}", mocap=True, pos=[0, 0, 2 + 0.1 * i])
         ball.add_geom(name=f"ball{i}", size=[RADIUS, 0, 0])
     handles = {}
     if count:
-        handles = biotac_mj.attach_to_hand(spec, "shadow_hand", fingers=FINGERS[:count], tier=tier, skin=skin)
+        handles = biotac_mj.attach_to_hand(spec, "shadow_hand", fingers=FINGERS[:count], **settings)
     return spec.compile(), handles
+
+
+def pressed(data, body, depth=DEPTH):
+    """Where a ball presses the pad of a BioTac."""
+    body = data.body(body)
+    return body.xpos + body.xmat.reshape(3, 3) @ (PAD - [0, RADIUS - depth, 0])
+
+
+def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40, depth=DEPTH) -> dict:
+    """Milliseconds of a step of a batch, after a settling time."""
+    import mujoco_warp as mjw
+
+    from biotac_mj import batch
+
+    begin = time.perf_counter()
+    with wp.ScopedDevice(device):
+        mjm, prefixes = build(hand, count, batch=True, skin=skin) if count else build(hand, 0)
+        mjd = mujoco.MjData(mjm)
+        mujoco.mj_forward(mjm, mjd)
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=worlds)
+        batches = [batch.attach(mjm, m, d, prefix=p, skin=skin) for p in prefixes.values()]
+        mocap = d.mocap_pos.numpy()
+        for i, prefix in enumerate(list(prefixes.values())[:pressing]):
+            mocap[:, i] = pressed(mjd, f"{prefix}core", depth)
+        d.mocap_pos.assign(mocap)
+        mjw.step(m, d)
+        run = functools.partial(mjw.step, m, d)
+        if wp.get_device(device).is_cuda:
+            with wp.ScopedCapture() as capture:
+                mjw.step(m, d)
+            run = functools.partial(wp.capture_launch, capture.graph)
+        setup, seconds = time.perf_counter() - begin, []
+        for _ in range(RUNS + 1):  # the first is the settling time
+            wp.synchronize()
+            begin = time.perf_counter()
+            for _ in range(steps):
+                run()
+            wp.synchronize()
+            seconds.append((time.perf_counter() - begin) / steps)
+        force = np.array([np.linalg.norm(b.wrench[..., :3].sum(1), axis=1) for b in batches])
+    return {
+        "sensors": count,
+        "pressing": pressing,
+        "touching_share": float((force[:pressing] > 0.01).mean()) if pressing else 0.0,
+        "worlds": worlds,
+        "device": wp.get_device(device).name,
+        "skin": skin,
+        "depth_m": depth,
+        "setup_s": setup,
+        "ms_per_step": 1e3 * min(seconds[1:]),
+        "hand_steps_per_s": worlds / min(seconds[1:]),
+        "failed": int(sum(b.failed.numpy().sum() for b in batches)),
+    }
+
+
+def compare_batches(hand, options) -> list[dict]:
+    """A row for each number of worlds and of pressing fingers, and for the hand without BioTacs."""
+    rows = []
+    print("| worlds | BioTacs | pressing | ms per step | hand-steps per s | failed | set-up s |")
+    print("|---|---|---|---|---|---|---|")
+    for worlds in map(int, options.worlds.split(",")):
+        for count, pressing in [(0, 0), *((len(FINGERS), int(p)) for p in options.pressing.split(","))]:
+            row = measure_batch(
+                hand, count, pressing, worlds, options.device, options.skin, options.steps, options.depth
+            )
+            rows.append(row)
+            print(
+                f"| {worlds} | {count} | {pressing} | {row['ms_per_step']:.2f} | "
+                f"{row['hand_steps_per_s']:.0f} | {row['failed']} | {row['setup_s']:.0f} |",
+                flush=True,
+            )
+            write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
+    return rows
 
 
 def measure(hand, count, touching, tier, skin="coarse", steps=40) -> dict:
     """Median and mean milliseconds of a step after a settling time, and how many skins carry a force."""
-    model, handles = build(hand, count, tier, skin)
+    model, handles = build(hand, count, tier=tier, skin=skin)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for i, handle in enumerate(list(handles.values())[:touching]):
-        body = data.body(handle.body)
-        mat = body.xmat.reshape(3, 3)
-        data.mocap_pos[i] = body.xpos + mat @ (PAD - [0, RADIUS - DEPTH, 0])
+        data.mocap_pos[i] = pressed(data, handle.body)
     for _ in range(10):
         mujoco.mj_step(model, data)
     seconds = []
@@ -85,6 +165,10 @@ def main(arguments=None) -> int:
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--most", type=int, default=5, help="sensors")
+    parser.add_argument("--worlds", help="comma-separated numbers of worlds of mujoco_warp batches")
+    parser.add_argument("--pressing", default="0,2", help="of a batch: comma-separated numbers of fingers")
+    parser.add_argument("--depth", type=float, default=DEPTH, help="of a batch [m]")
+    parser.add_argument("--device", default=None, help="of a batch; Warp's default")
     options = parser.parse_args(arguments)
     root = os.environ.get("MENAGERIE_ROOT")
     if not root or not (pathlib.Path(root) / "shadow_hand").is_dir():
@@ -93,6 +177,9 @@ def main(arguments=None) -> int:
         )
     hand = pathlib.Path(root) / "shadow_hand" / "right_hand.xml"
     wp.config.log_level = wp.LOG_WARNING
+    if options.worlds:
+        compare_batches(hand, options)
+        return 0
     rows = []
     print("| tier | sensors | touching | ms per step, median | mean |\n|---|---|---|---|---|")
     cases = [("condensed", 0, 0)]

@@ -235,3 +235,51 @@ def test_shadow_hand_lifts(name, monkeypatch, repo):
         result["force"][-1] > 0.1
     ).all()
     assert (np.abs(result["counts"] - result["counts"][0]).max(axis=(0, 2)) > 20).sum() >= 4
+
+
+def test_a_hand_in_a_batch_presses_as_the_single_one():
+    """Of two fingers in two worlds of mujoco_warp one is pressed; in the second world none."""
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    def build(**settings):
+        spec = small_hand()
+        spec.option.gravity, spec.option.timestep = [0, 0, 0], 2e-3
+        pin = spec.worldbody.add_body(name="pin", mocap=True, pos=[0, 0.2, 0])
+        pin.add_geom(size=[4e-3, 0, 0])  # without a name
+        return attach_to_hand(spec, mounts(), skin="coarse", **settings), spec.compile()
+
+    def place(data, core):
+        body = data.body(core)
+        return body.xpos + body.xmat.reshape(3, 3) @ [-12e-3, -11.6e-3, 0]
+
+    handles, model = build()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    data.mocap_pos[0] = place(data, handles["a"].body)
+    expected = []
+    for _ in range(8):
+        mujoco.mj_step(model, data)
+        expected.append([handles[f].read(data, "contact_force")[:3] for f in ("a", "b")])
+    expected = np.array(expected)
+    prefixes, mjm = build(batch=True)
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+    both = [batch.attach(mjm, m, d, prefix=p, skin="coarse", readings=False) for p in prefixes.values()]
+    mocap = d.mocap_pos.numpy()
+    mocap[0, 0] = place(mjd, f"{prefixes['a']}core")
+    d.mocap_pos.assign(mocap)
+    found = []
+    for _ in range(8):
+        mjw.step(m, d)
+        rows = [
+            d.sensordata.numpy()[:, mjm.sensor(f"{p}contact_force").adr[0] :][:, :3].copy()
+            for p in prefixes.values()
+        ]
+        found.append(rows)
+    found = np.moveaxis(np.array(found), 2, 0)
+    peak = np.abs(expected).max()
+    assert peak > 0.05 and not expected[:, 1].any() and not found[1].any()
+    np.testing.assert_allclose(found[0], expected, atol=5e-3 * peak)
+    assert not both[1].rest.any.numpy()[0]

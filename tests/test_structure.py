@@ -28,7 +28,7 @@ LAYERS = {
     "recordings": "arguments sensor geometry files reading",
     "data": "recordings geometry skin sensor effects fields files reading versions press.approach "
     "press.indenter press.path",
-    "tasks": "coupling plugin sensor effects geometry files reading data.objects view.offscreen",
+    "tasks": "coupling plugin batch sensor effects geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading",
     "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",

@@ -387,15 +387,18 @@ def _check_model(mjm, coupling):
 def _warn_of_damping(mjm, touching):
     trees = {int(mjm.body_treeid[b]) for b in (touching.core, *touching.body)} - {-1}
     damped = mjm.opt.timestep * mjm.dof_damping / mjm.dof_M0
-    for i in np.flatnonzero(np.isin(mjm.dof_treeid, list(trees)) & (damped > _DAMPED)):
-        joint = mjm.jnt(int(mjm.dof_jntid[i])).name or f"#{mjm.dof_jntid[i]}"
-        warnings.warn(
-            f"joint {joint!r} is damped strongly (time step x damping / inertia = {damped[i]:.2g}): the "
-            "batch solves its skins where "
-            "the body would go without the integrator's damping; "
-            "take smaller steps, less damping, or biotac_mj.attach on the CPU",
-            stacklevel=3,
-        )
+    found = np.flatnonzero(np.isin(mjm.dof_treeid, list(trees)) & (damped > _DAMPED))
+    if not len(found):
+        return
+    worst = found[damped[found].argmax()]
+    joint = mjm.jnt(int(mjm.dof_jntid[worst])).name or f"#{mjm.dof_jntid[worst]}"
+    others = f", and {len(found) - 1} others less," if len(found) > 1 else ""
+    warnings.warn(
+        f"joint {joint!r}{others} is damped strongly (time step x damping / inertia = {damped[worst]:.2g}): "
+        "the batch solves its skins where the body would go without the integrator's damping; take smaller "
+        "steps, less damping, or biotac_mj.attach on the CPU",
+        stacklevel=3,
+    )
 
 
 def _slots(mjm, m, d, touching, prefix):

@@ -115,8 +115,9 @@ def attach_to_hand(
     prefix: str = "biotac_",
     self_touch: bool = False,
     slots: int | None = None,
+    batch: bool = False,
     **settings: object,
-) -> dict[str, "Handle"]:
+) -> dict[str, "Handle"] | dict[str, str]:
     """Puts BioTacs onto the fingertips of a hand.
 
     What a BioTac stands for stays in the model, for tendons, sensors and whatever else refers to it, but
@@ -134,10 +135,11 @@ def attach_to_hand(
       prefix: each finger's names begin with prefix + finger + "_".
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
+      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
       settings: further ones of `attach`, for every finger (each gets its own noise seed).
 
     Returns:
-      {finger: Handle}, in the order of `fingers`.
+      {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.
 
     Raises:
       ValueError: unknown hand, variant or finger; a link, or a geom of it to replace, that the model does not
@@ -170,6 +172,11 @@ def attach_to_hand(
         _replace(spec, link, mounts[finger], set() if self_touch else names)
         if link.explicitinertial and link.mass > 2 * _CORE_MASS:
             link.mass -= _CORE_MASS
+    if batch:
+        prefixes = _add(spec, links, mounts, prefix, None if self_touch else own, settings)
+        if not self_touch:
+            _exclude(spec, [f"{p}core" for p in prefixes.values()], own)
+        return prefixes
     if slots is None:
         outside = {
             g.parent.name or id(g.parent)
@@ -190,8 +197,34 @@ def attach_to_hand(
             **settings,
         )
     if not self_touch:
-        _exclude(spec, handles, own)
+        _exclude(spec, [handle.body for handle in handles.values()], own)
     return handles
+
+
+def _add(spec, links, mounts, prefix, own, settings):
+    """`batch.add` at each link; rows are made for bodies that are not of `own`."""
+    from ..batch import add
+
+    touching = settings.pop("geoms", None)
+    if touching is None and own is not None:
+        taken, inside = {g.name for g in spec.geoms}, {body.name for body in own}
+        free = (name for i in itertools.count() if (name := f"{prefix}geom{i}") not in taken)
+        outside = [g for g in spec.geoms if (g.contype or g.conaffinity) and g.parent.name not in inside]
+        for geom in outside:
+            geom.name = geom.name or next(free)
+        touching = [geom.name for geom in outside]
+    return {
+        finger: add(
+            spec,
+            body=link.name,
+            pos=mounts[finger].pos,
+            quat=mounts[finger].quat,
+            prefix=f"{prefix}{finger}_",
+            geoms=touching,
+            **settings,
+        )
+        for finger, link in links.items()
+    }
 
 
 def _mounts(hand, variant):
@@ -334,8 +367,8 @@ def _take_out(spec, element, kind):
     spec.delete(element)
 
 
-def _exclude(spec, handles, own):
+def _exclude(spec, cores, own):
     colliding = [b for b in own if any(g.contype or g.conaffinity for g in b.geoms)]
-    for handle in handles.values():
+    for core in cores:
         for body in colliding:
-            spec.add_exclude(bodyname1=handle.body, bodyname2=body.name)
+            spec.add_exclude(bodyname1=core, bodyname2=body.name)
