@@ -57,6 +57,8 @@ def _as_rst(app, what, name, thing, options, lines):
     """Our docstrings are plain text: examples are indented, stars are stars, a heading may say more."""
     out, code = [], False
     for before, line in zip(["", *lines], lines):
+        if before.strip() == "Returns:":  # else the colon of a dict ends its type
+            line = re.sub(r"(\{[^{}]*\})", r"``\1``", line)
         line = re.sub(r"^(Args|Attributes) \(.*\):$", r"\1:", line)
         indent = len(line) - len(line.lstrip())
         if indent >= 4 and not before.strip() and not code:

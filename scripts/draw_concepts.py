@@ -8,8 +8,10 @@ import pathlib
 
 import mujoco
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
@@ -19,6 +21,7 @@ from biotac_mj.press import PressOptions, press
 from biotac_mj.press.report import draw_electrodes, unroll
 
 SKIN, WARM, COLD, DARK = "#3d9970", "#d9722a", "#7fb7d9", "#444444"
+GREENS = ListedColormap(colormaps["Greens"](np.linspace(0.3, 1.0, 256)))  # seen at rest too
 
 
 def sheet(columns, width=9.0, height=3.6, rows=1):
@@ -61,8 +64,8 @@ def draw_section(axes, record, step, title, what=None):
     xpos = np.asarray(record.vert_xpos[step], float)
     polygons, owner = cut_tets(xpos, geometry.elem[:, :4])
     moved = 1e3 * np.linalg.norm(xpos - geometry.vert, axis=1)[geometry.elem[:, :4]].mean(1)
-    skin = PolyCollection(polygons, array=moved[owner], cmap="Greens", edgecolors="face", linewidths=0.3)
-    skin.set_clim(-0.5e3 * record.depth.max(), 1e3 * record.depth.max())
+    skin = PolyCollection(polygons, array=moved[owner], cmap=GREENS, edgecolors="face", linewidths=0.3)
+    skin.set_clim(0, 1e3 * record.depth.max())
     center = np.array([-6.0, 0.0])  # sees the whole of both outlines [mm]
     for vert, face, color in (
         (xpos, geometry.outer_face, COLD),

@@ -21,7 +21,8 @@ def in_menu(page):
     for tree in re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         for name in tree.splitlines():
             if name.strip() and not name.startswith(":"):
-                yield (page.parent / f"{name.strip()}.md").resolve()
+                name = re.sub(r".*<(.*)>", r"\1", name.strip())
+                yield (page.parent / f"{name}.md").resolve()
 
 
 def links(text):
@@ -83,6 +84,7 @@ def test_code_names_pages_that_are_there(repo):
     assert not lost, "\n".join(lost)
 
 
+@pytest.mark.slow
 def test_the_site_builds(repo, tmp_path):
     """Without running the tutorials, which `make docs` does."""
     for name in ("sphinx", "myst_nb", "furo", "sphinx_copybutton"):
