@@ -35,6 +35,7 @@ nb_output_stderr = "remove"  # drivers that are missing
 default_role = "code"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
+napoleon_use_ivar = True
 autodoc_member_order = "bysource"
 # what is not installed is not needed to read the signatures
 autodoc_mock_imports = [
@@ -57,8 +58,14 @@ def _as_rst(app, what, name, thing, options, lines):
     """Our docstrings are plain text: examples are indented, stars are stars, a heading may say more."""
     out, code = [], False
     for before, line in zip(["", *lines], lines):
-        if before.strip() == "Returns:":  # else the colon of a dict ends its type
-            line = re.sub(r"(\{[^{}]*\})", r"``\1``", line)
+        if line == "Returns:":  # not napoleon's: there what stands before a colon is a type
+            continue
+        if before == "Returns:":
+            line = f":returns: {line.strip()}"
+        if what == "class":  # two names of one line are no type and a name
+            line = re.sub(r"^  (\w+(, \w+)+):", lambda names: names[0].replace(", ", "/"), line)
+        if what == "property":
+            line = line.replace(": ", " – ")
         line = re.sub(r"^(Args|Attributes) \(.*\):$", r"\1:", line)
         indent = len(line) - len(line.lstrip())
         if indent >= 4 and not before.strip() and not code:
