@@ -1,6 +1,7 @@
 # make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1")
 # make test        style and the quick tests;  make test-all: the slow ones too
 # make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with
+# make docs        the site, in docs/_build/html: tutorials run, warnings and broken links are errors
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
 # make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
 # make clean       remove results and the environment
@@ -16,7 +17,7 @@ PYTEST := pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling*.py impacts.py batch.py press.py scenes.py errors.py)
 test test-all test-newest: export OMP_NUM_THREADS := 1
 
-.PHONY: press test test-all test-newest benchmarks assets clean
+.PHONY: press test test-all test-newest docs benchmarks assets clean
 
 press: $(VENV)/.installed
 	$(BIN)/biotac press $(ARGS)
@@ -35,6 +36,9 @@ test-newest: $(NEWEST)/.installed
 	$(NEWEST)/bin/python $(PIP) --force-reinstall --no-deps .
 	$(NEWEST)/bin/$(PYTEST) --override-ini pythonpath= $(ARGS) $(wildcard $(ON_MUJOCO))
 
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going docs docs/_build/html
+
 benchmarks: $(VENV)/.installed-test
 	mkdir -p out/benchmarks
 	$(BIN)/python benchmarks/speed.py --device cpu --json out/benchmarks/speed.json $(ARGS)
@@ -46,7 +50,7 @@ assets: $(VENV)/.installed-mesh
 	$(BIN)/python scripts/make_assets.py $(ARGS)
 
 clean:
-	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache $(VENV) $(NEWEST)
+	rm -rf out build dist docs/_build *.egg-info .pytest_cache .ruff_cache $(VENV) $(NEWEST)
 
 # Each stamp stands for one set of extras, installed once and again when the requirements change.
 $(BIN)/python:
@@ -62,6 +66,10 @@ $(VENV)/.installed-test: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python $(PIP) --editable ".[mesh]"
+	touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python $(PIP) --editable ".[control,batch,learning,gymnasium,docs]"
 	touch $@ $(VENV)/.installed
 
 $(NEWEST)/.installed: pyproject.toml constraints.txt

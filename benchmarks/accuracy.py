@@ -5,8 +5,8 @@ mesh.
     [--picture out/accuracy.png]
 
 Every .npz of the folder is one case: held nodes, material, indenter, path, contact stiffness, stick slope and
-friction are read from it (docs/benchmarks.md says what the fields are). The same path is walked with one step
-per stored increment; nothing is fitted.
+friction are read from it (docs/lab/benchmarks.md says what the fields are). The same path is walked with one
+step per stored increment; nothing is fitted.
 
 force_error_rel: mean over increments of |F - F_ref|, over the largest |F_ref|.
 displacement_error_rel: mean over increments of the root mean square over all nodes of |u - u_ref|, over

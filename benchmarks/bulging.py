@@ -1,5 +1,5 @@
 """Where the liquid goes: PDC and the electrodes' impedances while a sphere presses at many places, for
-docs/liquid.md.
+docs/lab/liquid.md.
 
 python benchmarks/bulging.py --skin coarse
 """

@@ -245,7 +245,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--indenters", default=",".join(INDENTERS), help="comma-separated")
     parser.add_argument("--depth", type=float, default=2.4, help="of the presses [mm]")
     parser.add_argument("--locations", type=int, default=2, help="how many of the two locations")
-    parser.add_argument("--markdown", action="store_true", help="tables for docs/condensed.md")
+    parser.add_argument("--markdown", action="store_true", help="tables for docs/lab/condensed.md")
     parser.add_argument(
         "--time", action="store_true", help="processor time of steps instead, without the full tier"
     )

@@ -17,7 +17,7 @@ solved on the CPU in double precision to a tolerance of 1e-6: what stopping earl
 precision cost, not what the mesh costs.
 mb_per_world: device memory that a world of the batch takes; what the model takes once is `mb_model`. A row
 that does not fit says so.
-For the condensed tier F_tight is the full tier's press of the row above (docs/condensed.md says more).
+For the condensed tier F_tight is the full tier's press of the row above (docs/lab/condensed.md says more).
 
 --against DIR: only the press, in turns with that of another checkout, each in a process of its own: the
 least of the times of 5 presses each, and the ratio of this one's to that one's; processor time on the CPU,

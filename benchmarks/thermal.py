@@ -31,7 +31,7 @@ _EVERY = 10  # samples of a recording that are compared, 0.1 s apart
 _SIGMA_T, _SIGMA_TAC = 0.03, 6.0  # [C], [counts]: what differs between like trials
 _TOGETHER = 9  # compared samples that count as one: residuals are correlated over about a second
 _FORCE = 12.0  # [N] at which `area` is meant
-# Value and relative width of what sources say. Of HeatParameters: see docs/sensor.md. area [m^2] at 12 N and
+# Value and relative width of what sources say. Of HeatParameters: docs/lab/sensor.md. area [m^2] at 12 N and
 # its exponent over the force (Hertz 2/3, a cushion between plates 1); lead: time that closing takes [s].
 _START = {
     "near": (1.0, 0.7),

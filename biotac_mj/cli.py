@@ -381,7 +381,7 @@ def _add_calibrate(verbs):
         "data",
         nargs="?",
         metavar="DATA",
-        help="CSV of the indentation (docs/calibration.md), or skin.h5 of a press",
+        help="CSV of the indentation (docs/lab/calibration.md), or skin.h5 of a press",
     )
     verb.add_argument(
         "--synthetic",
@@ -636,7 +636,7 @@ def _add_diagnose(verbs):
         nargs="?",
         metavar="DATA",
         help="HDF5 of measured trajectories, or a recording, with the object's poses or without "
-        "(docs/discrepancy.md)",
+        "(docs/lab/discrepancy.md)",
     )
     verb.add_argument(
         "--object", metavar="NAME", help="what touched in DATA, where it does not say, as sphere_7mm"

@@ -258,7 +258,7 @@ _TRAVEL = """\
 like), on the command line `--options`, JSON or a file of it. `modulus` is a factor for each element, a `.npy`
 file of them or, in Python, a function of positions. On paths with a sensor `options` may have "film" too.
 `attach` writes all of it into the model as JSON. `material="calibrated"` is the one name for what was fitted
-to real sensors (docs/real_match.md), rubber, filling and electrodes, on every path.
+to real sensors (docs/lab/real_match.md), rubber, filling and electrodes, on every path.
 
 Rubber that relaxes, and inertia, take their time step from: `mj_step`'s timestep (attach, batch, press),
 `time_s` of an indentation (calibrate, compare; planned ones have 20 ms a sample), 1 / rate (generate), `time`

@@ -8,8 +8,8 @@ import biotac_mj
 XML = """<mujoco><option timestep="0.004"/>
   <worldbody>
     <site name="fingertip" quat="1 -1 0 0"/>
-    <body name="ball" pos="-0.01 0 0.0135"> <joint type="slide" axis="0 0 1"/> <geom size="0.005" mass="0.1"/>
-    </body>
+    <body name="ball" pos="-0.01 0 0.0135">
+      <joint type="slide" axis="0 0 1"/> <geom size="0.005" mass="0.1"/></body>
   </worldbody></mujoco>"""
 
 

@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 import biotac_mj
 
 FINGERS = ("ff", "mf", "rf", "lf", "th")
+NAMES = dict(zip(FINGERS, ("first", "middle", "ring", "little", "thumb")))
 OBJECTS = {  # MuJoCo's geom type and sizes [m], mass [kg]
     "ball": ("sphere", (0.036, 0, 0), 0.06),
     "cube": ("box", (0.03, 0.03, 0.03), 0.06),
@@ -281,7 +282,7 @@ def targets(model, address, angle):
 
 
 def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress=True):
-    """Grasps and lifts. `frame(data)` is called every 80 ms.
+    """Grasps and lifts. `frame(data, handles)` is called every 40 ms.
 
     Returns:
       dict: time (n,), height of the object (n,) [m], and per finger counts (n, 5, 19), pdc (n, 5), force (n,
@@ -335,8 +336,8 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
         log["counts"].append([h.read(data, "electrodes") for h in handles.values()])
         log["pdc"].append(pdc - rest)
         log["force"].append([np.linalg.norm(h.read(data, "contact_force")[:3]) for h in handles.values()])
-        if frame is not None and i % round(0.08 / TIMESTEP) == 0:
-            frame(data)
+        if frame is not None and i % round(0.04 / TIMESTEP) == 0:
+            frame(data, handles)
     return {key: np.array(value) for key, value in log.items()} | {
         "model": model,
         "data": data,
@@ -347,8 +348,69 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
 
 def camera():
     out = mujoco.MjvCamera()
-    out.lookat[:], out.distance, out.azimuth, out.elevation = [0, 0, 0.06], 0.42, 55, -12
+    out.lookat[:], out.distance, out.azimuth, out.elevation = [0.0, 0, 0.115], 0.31, 152, -14
     return out
+
+
+class Film:
+    """Frames of a moving picture: the hand, and under it what the electrodes of each fingertip say."""
+
+    SIZE, STRIP, SCALE = (720, 400), 190, 7.0  # of the render, height of the maps [pixel]; [pixel / mm]
+
+    def __init__(self):
+        from PIL import ImageFont
+
+        from biotac_mj.geometry import load_skin
+        from biotac_mj.press.report import unroll
+
+        around = unroll(load_skin("coarse").electrode_pos)[:, ::-1]  # tip up
+        self.place = self.SCALE * (around - (around.min(0) + around.max(0)) / 2)
+        self.font = ImageFont.load_default(size=14)
+        self.frames, self.screen, self.rest = [], None, None
+
+    def __call__(self, data, handles):
+        from PIL import Image, ImageDraw
+
+        from biotac_mj.coupling.show import electrode_colors
+        from biotac_mj.view.offscreen import Offscreen, find_gl
+
+        self.screen = self.screen or Offscreen(data.model, *self.SIZE, find_gl())
+        counts = np.array([h.read(data, "electrodes") for h in handles.values()])
+        self.rest = counts if self.rest is None else self.rest
+        (width, height), strip = self.SIZE, self.STRIP
+        picture = Image.new("RGB", (width, height + strip), "white")
+        picture.paste(Image.fromarray(self.screen.render(data, camera())))
+        draw = ImageDraw.Draw(picture)
+        for i, (finger, handle) in enumerate(handles.items()):
+            center = np.array([(i + 0.5) * width / len(handles), height + 24 + 0.5 * (strip - 30)])
+            force = np.linalg.norm(handle.read(data, "contact_force")[:3])
+            draw.text(
+                (center[0], height + 4), f"{NAMES[finger]}  {force:.1f} N", "black", self.font, anchor="ma"
+            )
+            low, high = self.place.min(0), self.place.max(0)
+            tip = np.concatenate([center + low - 12, center + high + 12])
+            draw.rounded_rectangle(tip.tolist(), radius=(tip[2] - tip[0]) / 2.5, fill="#cfe8da")
+            for place, color in zip(self.place, electrode_colors(counts[i] - self.rest[i])):
+                box = np.concatenate([center + place - 6, center + place + 6])
+                draw.ellipse(box.tolist(), tuple((255 * color[:3]).astype(int)), "#555")
+        self.frames.append(picture)
+
+    def write(self, path):
+        """An animated GIF whose frames share their colours."""
+        from PIL import Image
+
+        from biotac_mj.coupling.show import electrode_colors
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # the dots are few pixels: their colours have to be asked for
+        ramp = (255 * electrode_colors(np.linspace(-300, 300, 48))[:, :3]).astype(np.uint8)
+        middle = self.frames[len(self.frames) // 2].quantize(208, method=Image.Quantize.MAXCOVERAGE)
+        palette = Image.new("P", (1, 1))
+        palette.putpalette(middle.getpalette()[: 3 * 208] + ramp.ravel().tolist())
+        first, *rest = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in self.frames]
+        duration = [40] * len(rest) + [1500]  # the last one stays
+        first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+        self.screen.close()
 
 
 def draw_traces(result, path, name):
@@ -386,24 +448,10 @@ def main(arguments=None):
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
-    frames, screen = [], None
-    if options.video:
-        from biotac_mj.view.offscreen import Offscreen, find_gl
-
-        def frame(data):
-            nonlocal screen
-            screen = screen or Offscreen(data.model, 360, 270, find_gl())
-            frames.append(screen.render(data, camera()))
-    else:
-        frame = None
-    result = run(options.object, tier=options.tier, skin=options.skin, frame=frame)
-    if options.video:
-        from PIL import Image
-
-        options.video.parent.mkdir(parents=True, exist_ok=True)
-        first, *rest = [Image.fromarray(f).quantize(128, method=Image.Quantize.MAXCOVERAGE) for f in frames]
-        first.save(options.video, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
-        screen.__exit__()
+    film = Film() if options.video else None
+    result = run(options.object, tier=options.tier, skin=options.skin, frame=film)
+    if film:
+        film.write(options.video)
     if options.traces:
         draw_traces(result, options.traces, options.object)
     touching = [f for f, force in zip(FINGERS, result["force"][-1]) if force > HELD]

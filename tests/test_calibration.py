@@ -66,7 +66,7 @@ def test_recovers_stiffness_and_friction_quickly(shell):
 
 @pytest.mark.slow
 def test_recovers_known_parameters_from_noisy_forces(way, shell):
-    """Same mesh and noise of half a per cent of the peak; docs/calibration.md has what another mesh does."""
+    """Same mesh, noise of half a per cent of the peak; docs/lab/calibration.md has what another mesh does."""
     true = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
     noise = 0.002
     data = dataclasses.replace(way, force=true + noise * np.random.default_rng(1).standard_normal(true.shape))

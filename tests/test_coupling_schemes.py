@@ -1,7 +1,7 @@
 """Why the coupling is what it is: ways to tie two free masses by a stiff spring, by the eigenvalues of one
 step.
 
-Run as a script for the table of docs/coupling.md.
+Run as a script for the table of docs/lab/coupling.md.
 """
 
 import numpy as np

@@ -117,8 +117,8 @@ def test_the_condensed_tier_is_refused():
 
 @pytest.mark.slow
 def test_stiffening_hysteresis_and_place_as_the_reduced_forms_say():
-    """Force of a press and a retreat: same sign and about the size of the reduced form, which docs/memory.md
-    has the misses of."""
+    """Force of a press and a retreat: same sign and about the size of the reduced form, whose misses are in
+    docs/lab/memory.md."""
     depth = np.array([-0.1, 0.2, 0.4, 0.55, 0.7, 0.85, 1.0, 0.85, 0.7, 0.55, 0.4]) * 1e-3
     t = np.arange(len(depth)) * 0.5
     from biotac_mj.geometry import load_skin

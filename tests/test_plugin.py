@@ -350,7 +350,7 @@ def test_disabled_equalities_are_refused_two_way(model):
 
 @pytest.mark.parametrize("coupling, limit", [("one-way", 0.4e-3), ("two-way", 2e-3)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
-    """CPU time: 0.1 ms and 0.5 ms (docs/coupling.md); the limits leave room for slower machines."""
+    """CPU time: 0.1 ms and 0.5 ms (docs/lab/coupling.md); the limits leave room for slower machines."""
     ball = (
         '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '
         'size=".01" mass=".1"/></body>'

@@ -553,7 +553,7 @@ def test_flags_that_matter_are_named(flags, text):
 
 
 def test_a_binary_model_needs_the_import(tmp_path):
-    """docs/coupling.md says so; with it, the model loads in a process that has seen nothing else."""
+    """docs/lab/coupling.md says so; with it, the model loads in a process that has seen nothing else."""
     spec, _ = resting(readings="none")
     mujoco.mj_saveModel(spec.compile(), str(tmp_path / "scene.mjb"))
     code = (

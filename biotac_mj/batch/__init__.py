@@ -1,5 +1,5 @@
 """Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step`
-(docs/batch.md)."""
+(docs/lab/batch.md)."""
 
 from .attach import add, attach, make
 from .batch import Batch

@@ -230,8 +230,8 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed, readings, sensor, randomise,
-      thermal, effects, textures, options, worlds: as for `attach`.
+      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed: as for `attach`.
+      readings, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
 
     Raises:
       ValueError: see `attach`.

@@ -59,7 +59,7 @@ class Handle:
         on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
         converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
         measured; rounds through MuJoCo's solver; share of the bodies' motion for which the skin was solved;
-        share of its push that was withheld): see docs/coupling.md."""
+        share of its push that was withheld): see docs/lab/coupling.md."""
         return np.array(data.sensor(self.sensor(channel)).data)
 
     @property

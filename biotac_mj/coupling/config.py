@@ -44,7 +44,7 @@ class Config:
     Attributes:
       skin: name or file of the `SkinGeometry`.
       stepper: what solves the skin: a name known to `biotac_mj.coupling.stepper`.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/condensed.md); the
+      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/lab/condensed.md); the
         number of its place in TIERS is in the status sensor.
       readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
       material: name of the skin's material, a dict of its parameters or a .json file; None is the default

@@ -6,7 +6,7 @@ without acceleration, S = -dW/dx and J the Jacobian of the touching body relativ
 `qfrc_passive`. The rest is exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference
 acceleration zero gives, one row for each of the six eigenvalues s of S. MuJoCo's solver so finds the
 accelerations of object and finger together, with every other contact and limit: equal and opposite forces
-whatever the masses, nothing at rest, where a = 0. `docs/coupling.md` compares this with the alternatives.
+whatever the masses, nothing at rest, where a = 0. `docs/lab/coupling.md` compares this with the alternatives.
 
 `attach` leaves inactive weld constraints in the model ("slots") to make room for the rows; each body that can
 touch gets one."""

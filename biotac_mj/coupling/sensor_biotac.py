@@ -50,8 +50,8 @@ class SensorBioTac:
 
     Attributes:
       signal: "physics": conduction in the liquid film; "learned": a network on film and strain over each
-        electrode, the one that did best on unseen objects, trained on synthetic data (docs/learning.md); or
-        its file, *.safetensors.
+        electrode, the one that did best on unseen objects, trained on synthetic data (docs/lab/learning.md);
+        or its file, *.safetensors.
       sensor: which one it is, see `sensor.presets.read_sensor`. randomise: see `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.

@@ -1,5 +1,5 @@
 """What a data set of tactile interactions holds: names, shapes, units. The file's layout is in
-`docs/data.md`."""
+`docs/lab/data.md`."""
 
 import dataclasses
 

@@ -1,7 +1,7 @@
 """Constitutive effects inside the finite elements instead of on the forces that they bear: what each becomes
 of a skin's material, contact, model and film.
 
-`docs/discrepancy.md` says how much the reduced forms differ."""
+`docs/lab/discrepancy.md` says how much the reduced forms differ."""
 
 import typing
 from collections.abc import Callable
@@ -14,7 +14,7 @@ __all__ = ["Inside", "memory_of", "modulus_of"]
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 
-# what benchmarks/discrepancy_in_skin_maps.py measured on presses of the coarse skin (docs/memory.md):
+# what benchmarks/discrepancy_in_skin_maps.py measured on presses of the coarse skin (docs/lab/memory.md):
 # the c2 that the force of a stiffening c2 / c1 of the rubber looks like
 _STIFFENING = (-120, -40, -12, -4, -1, 0, 1, 4, 12, 40, 120, 400, 1000)
 

@@ -57,7 +57,7 @@ def _card(name, meta, size, result):
         "",
         "Trained on **synthetic** data: "
         "touches of the simulated skin, counts of a synthetic sensor with another mesh, material and",
-        "conduction (`docs/data.md`). No real sensor was involved; expect more error on one.",
+        "conduction (`docs/lab/data.md`). No real sensor was involved; expect more error on one.",
         "",
         "| | |",
         "|---|---|",

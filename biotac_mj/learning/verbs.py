@@ -55,7 +55,9 @@ def _add_train(verbs, verb):
         default=True,
         help="latent projection and PointNet++; slow without a GPU",
     )
-    v.add_argument("--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/learning.md)")
+    v.add_argument(
+        "--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/lab/learning.md)"
+    )
     v.add_argument("--steps", type=whole(1, 10_000_000), help="of each training (default: the config's)")
     v.add_argument("--limit", type=whole(1, 10_000_000), help="interactions to read, the first ones")
     v.add_argument("--device", type=device, default="cpu", help="of torch: cpu, cuda")
@@ -70,7 +72,7 @@ def _train(args):
 
     _check_device(args.device)
     settings = (
-        read_json(args.config, "config", "give a file of JSON (docs/learning.md)") if args.config else {}
+        read_json(args.config, "config", "give a file of JSON (docs/lab/learning.md)") if args.config else {}
     )
     refuse_unknown(settings, [f.name for f in dataclasses.fields(LearningConfig)], args.config)
     if args.steps:

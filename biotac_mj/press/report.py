@@ -13,7 +13,7 @@ from ..files import replacing
 from ..geometry.rigid import matrix
 from .record import PressRecord
 
-__all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "write_picture"]
+__all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "unroll", "write_picture"]
 
 _CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
 _SKIN = np.array([0.20, 0.55, 0.42])
@@ -23,8 +23,9 @@ _INDENTER = np.array([0.85, 0.45, 0.15])
 _TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def _unroll(points):
-    """(n, 2) [mm]: along the finger, and around it from the pad's midline as an arc on the core."""
+def unroll(points: np.ndarray) -> np.ndarray:
+    """(n, 2) [mm] of (n, 3) [m]: along the finger, and around it from the pad's midline as an arc
+    on the core; BioTac frame."""
     return 1e3 * np.stack([points[:, 0], _CORE_RADIUS * np.arctan2(points[:, 2], -points[:, 1])], axis=1)
 
 
@@ -38,10 +39,10 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
     moved = 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
     if np.ptp(moved) > 0:
         axes.tricontour(
-            *_unroll(geometry.vert[outer]).T, moved, levels=6, colors="0.75", linewidths=0.8, zorder=1
+            *unroll(geometry.vert[outer]).T, moved, levels=6, colors="0.75", linewidths=0.8, zorder=1
         )
     limit = max(np.abs(change).max(), 1.0)
-    place = _unroll(geometry.electrode_pos)
+    place = unroll(geometry.electrode_pos)
     dots = axes.scatter(
         *place.T, c=change, cmap="RdBu", vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2
     )

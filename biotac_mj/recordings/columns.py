@@ -103,7 +103,9 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     """
     path = pathlib.Path(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise ValueError(f"{path} is no recording: it holds bytes, not text; docs/data.md lists what is read")
+        raise ValueError(
+            f"{path} is no recording: it holds bytes, not text; docs/lab/data.md lists what is read"
+        )
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     comment, rows = "", []

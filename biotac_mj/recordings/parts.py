@@ -73,7 +73,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         names = ", ".join(list(columns)[:8])
         raise ValueError(
             f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
-            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/data.md has all names"
+            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/lab/data.md has all names"
         )
     if left:
         notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")

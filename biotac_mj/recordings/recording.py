@@ -226,7 +226,7 @@ def _published_rest():
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
-    """Recordings as one HDF5 file, written whole or not at all (`files.hdf5`); docs/data.md has its layout.
+    """Recordings as one HDF5 file, written whole or not at all (`files.hdf5`); layout: docs/lab/data.md.
 
     Raises:
       ValueError: none, or two of one name. OSError: it cannot be written.

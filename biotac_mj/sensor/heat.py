@@ -74,7 +74,7 @@ def state_size(ngroup: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class HeatParameters:
-    """Constants of one sensor. Sources and intervals: docs/sensor.md.
+    """Constants of one sensor. Sources and intervals: docs/lab/sensor.md.
 
     Attributes:
       power: of the heater, which is the sensor's own electronics [W].

@@ -4,7 +4,7 @@ The inner surface of the skin is closed, so the divergence theorem gives the cav
 the core inside is rigid and only subtracts a constant. Liquid is what is between the two: where the skin lies
 on the core there is none, so the overlap that penalty contact needs is no volume, and no pressure acts there.
 p = -K (V - Vn) / Vn with the bulk modulus K and the volume Vn that the liquid has without pressure; with
-infinite K the pressure is an unknown of its own (see `docs/liquid.md`).
+infinite K the pressure is an unknown of its own (see `docs/lab/liquid.md`).
 
 Skin leaves the core gradually: the share s of a contact sample that is dry grows with the contact pressure c,
 

@@ -94,7 +94,7 @@ def load(
     """An environment: `load("finger", "press", task_kwargs={"random": 0})`.
 
     Args:
-      domain_name, task_name: see `tasks()`, docs/tasks.md.
+      domain_name, task_name: see `tasks()`, docs/lab/tasks.md.
       task_kwargs: random (seed), time_limit [s], observe ("tactile", "privileged", "none"), physics_timestep
         [s], biotac (dict, settings of `BioTac`).
       environment_kwargs: further arguments of `composer.Environment`.

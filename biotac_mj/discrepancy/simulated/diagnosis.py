@@ -23,7 +23,7 @@ _DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chose
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them
 _P = 0.05  # false discovery rate over the models tried
 _LEAST = 0.05  # of the squared error that a finding takes away: less is no reason for what is seen
-_MEMORY = 0.5, 5.0  # [s] of a grip's relaxation, as measured on holds (docs/memory.md)
+_MEMORY = 0.5, 5.0  # [s] of a grip's relaxation, as measured on holds (docs/lab/memory.md)
 _TIMES = 4000  # permutations of the electrodes
 
 

@@ -4,7 +4,7 @@
     sim.run(trajectories, effects=[(by_id("relax"), {"g": 0.3, "tau": 2.0})])  # the skin itself relaxes
 
 It takes the place of a Simulator wherever the skin is solved anew (`exact`); with `exact=False` it is one.
-`docs/discrepancy.md` says how much the reduced forms differ."""
+`docs/lab/discrepancy.md` says how much the reduced forms differ."""
 
 import dataclasses
 import typing

@@ -95,7 +95,7 @@ class Trajectory:
 
 
 def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
-    """Labelled interactions of a data set (docs/data.md); `parameters` may hold "clock" [s] of the session.
+    """Labelled interactions of a data set (docs/lab/data.md); `parameters` may hold their "clock" [s].
 
     Raises:
       FileNotFoundError, ValueError: the text names cause and remedy.
@@ -107,7 +107,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
     path = pathlib.Path(path)
     if not path.exists():
         raise FileNotFoundError(
-            f"no measured data at {path}: give an HDF5 file or folder of them as docs/data.md says"
+            f"no measured data at {path}: give an HDF5 file or folder of them as docs/lab/data.md says"
         )
     out, clock = [], 0.0
     with TactileSet(path) as data:

@@ -12,7 +12,7 @@ __all__ = ["Comparison", "REPEATABILITY"]
 
 # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
 REPEATABILITY = 0.05e-3
-# of a channel's largest change: the base model (mesh, tier, film) is not better than that (docs/condensed.md)
+# of a channel's largest change: the base model (mesh, tier, film) is no better (docs/lab/condensed.md)
 _RESOLUTION = 0.01
 
 

@@ -29,7 +29,7 @@ def evaluate_recording(
     network: bool = True,
     progress: bool = True,
 ) -> dict:
-    """Evaluates one recording; writes `out` (JSON, described in docs/learning.md) and a plot beside it.
+    """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot beside it.
 
     Args:
       recording: without force only the reconstruction is judged.

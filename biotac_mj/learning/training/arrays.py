@@ -85,7 +85,7 @@ class Arrays:
 def load_arrays(
     path: pathlib.Path | str, device: torch.device | str = "cpu", limit: int | None = None
 ) -> Arrays:
-    """Reads a set (docs/data.md).
+    """Reads a set (docs/lab/data.md).
 
     Args:
       path: folder or shard. device: of torch. limit: interactions to read, the first ones; None reads all.

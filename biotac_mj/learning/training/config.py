@@ -14,7 +14,7 @@ _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 @dataclasses.dataclass(frozen=True)
 class LearningConfig:
     """Choices of models and training. The numbers in brackets are those of the ambiguities in
-    docs/learning.md.
+    docs/lab/learning.md.
 
     Attributes:
       mesh_order: K of the Chebyshev convolutions: 6, as COMA and ACROSS take it [1].

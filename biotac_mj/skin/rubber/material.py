@@ -155,9 +155,9 @@ class Material:
 # elements that do not lock: nu 0.5 there, 0.499 here, with the force of 0.4999 to 0.1 % until the skin is
 # squeezed on the core; "rubber": nu 0.45, as the reference solutions). "paper" keeps to linear tetrahedra:
 # the stiffness of its mesh is in the fitted modulus.
-# "calibrated": FITTED to two real sensors pressed on a plate (docs/real_match.md): E 0.56 to 0.75 MPa with
-# all gains 1; the filling as a share of E, beside none and twice as much; the electrodes' radius, of which
-# 0.8 and 1.1 mm leave less than the film's own 0.5 mm. Neo-Hookean with nu 0.45 fits no better.
+# "calibrated": FITTED to two real sensors pressed on a plate (docs/lab/real_match.md): E 0.56 to 0.75 MPa
+# with all gains 1; the filling as a share of E, beside none and twice as much; the electrodes' radius, of
+# which 0.8 and 1.1 mm leave less than the film's own 0.5 mm. Neo-Hookean with nu 0.45 fits no better.
 PRESETS = {
     "default": Material(),
     "paper": Material(liquid=False, element="linear"),
@@ -168,7 +168,7 @@ PRESETS = {
 
 
 # [m^3] of liquid beyond what the unstressed skin holds, FITTED to two real sensors pressed on a plate: 6.7e-8
-# to 1.14e-7 by sensor and by half of the rows (docs/real_match.md, 'The tip'). For
+# to 1.14e-7 by sensor and by half of the rows (docs/lab/real_match.md, 'The tip'). For
 # `SkinOptions.fill_volume`; not the default, with which all else was fitted
 CALIBRATED_FILL = 8.0e-8
 

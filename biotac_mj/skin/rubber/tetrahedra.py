@@ -29,8 +29,8 @@ from .points import Mesh
 
 __all__ = ["CONTRACTION", "POINTWISE", "Tetrahedra", "incidence"]
 
-POINTWISE = 5.0  # of mu; docs/elements.md has the error of other values
-CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/elements.md has the error
+POINTWISE = 5.0  # of mu; docs/lab/elements.md has the error of other values
+CONTRACTION = 0.92  # of the distance from the centroid to Gauss's points; docs/lab/elements.md has the error
 _SQUEEZED = 0.2  # least stretch that `deformed` takes
 _NEAR, _FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20  # barycentric Gauss points, exact to degree 2
 _POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)

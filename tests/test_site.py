@@ -1,0 +1,127 @@
+"""The documentation: every page is in the menu, every link and picture is there, the site builds."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+_FENCE = re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def pages(repo):
+    return sorted(p for p in (repo / "docs").rglob("*.md") if "_build" not in p.parts)
+
+
+def in_menu(page):
+    """Pages that the toctrees of a page name."""
+    text = page.read_text()
+    for tree in re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        for name in tree.splitlines():
+            if name.strip() and not name.startswith(":"):
+                name = re.sub(r".*<(.*)>", r"\1", name.strip())
+                yield (page.parent / f"{name}.md").resolve()
+
+
+def links(text):
+    """Targets of links and pictures, code left out."""
+    return _LINK.findall(re.sub(r"`[^`\n]*`", "", _FENCE.sub("", text)))
+
+
+def anchors(text):
+    """What GitHub and MyST call the headings."""
+    heads = re.findall(r"^#+ (.*)$", _FENCE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+def broken(page):
+    """Targets of a page that lead nowhere."""
+    out = []
+    for target in links(page.read_text()):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        there = (page.parent / name).resolve() if name else page
+        if not there.exists() or (anchor and anchor not in anchors(there.read_text())):
+            out.append(target)
+    return out
+
+
+def test_broken_links_are_found(tmp_path):
+    (tmp_path / "b.md").write_text("# A title, it is\n")
+    (tmp_path / "a.md").write_text(
+        "[x](b.md#a-title-it-is) [y](c.md) ![z](z.png) [w](b.md#no)\n```\n[q](q.md)\n```\n`[r](r.md)`"
+    )
+    assert broken(tmp_path / "a.md") == ["c.md", "z.png", "b.md#no"]
+
+
+def test_every_page_is_in_the_menu(repo):
+    found, more = set(), {(repo / "docs" / "index.md").resolve()}
+    while more:
+        page = more.pop()
+        assert page.is_file(), f"a toctree names {page.relative_to(repo)}, which is not there"
+        found.add(page)
+        more |= set(in_menu(page)) - found
+    lost = {p.resolve() for p in pages(repo)} - found
+    assert not lost, f"in no toctree: {', '.join(str(p.relative_to(repo)) for p in sorted(lost))}"
+
+
+def test_no_link_is_broken(repo):
+    wrong = {str(p.relative_to(repo)): broken(p) for p in [repo / "README.md", *pages(repo)]}
+    assert not any(wrong.values()), "\n".join(f"{p}: {', '.join(t)}" for p, t in wrong.items() if t)
+
+
+def test_code_names_pages_that_are_there(repo):
+    """Docstrings, messages and comments that send a reader to docs/."""
+    lost = []
+    for folder in ("biotac_mj", "benchmarks", "examples", "scripts", "tests"):
+        for path in (repo / folder).rglob("*.py"):
+            for name in re.findall(r"\bdocs/[\w/]+\.md\b", path.read_text()):
+                if not (repo / name).is_file():
+                    lost.append(f"{path.relative_to(repo)}: {name}")
+    assert not lost, "\n".join(lost)
+
+
+def test_commands_that_are_shown_are_understood(repo):
+    """`biotac` lines of ```console blocks: verbs, options and choices are the command's own."""
+    from biotac_mj.cli import parser
+
+    shown = []
+    for page in [repo / "README.md", *pages(repo)]:
+        for block in re.findall(r"^```(?:\{code-block\} )?console\n(.*?)^```", page.read_text(), re.M | re.S):
+            shown += re.findall(r"^\$ (?:\.venv/bin/)?biotac (.*)$", block, re.M)
+    assert len(shown) > 10
+    for line in shown:
+        try:
+            parser().parse_args(shlex.split(line))
+        except (SystemExit, ValueError) as error:
+            pytest.fail(f"biotac {line}: {error}")
+
+
+@pytest.mark.slow
+def test_the_site_builds(repo, tmp_path):
+    """Without running the tutorials, which `make docs` does."""
+    for name in ("sphinx", "myst_nb", "furo", "sphinx_copybutton"):
+        pytest.importorskip(name, reason="the site needs the extra docs: make docs")
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
+    done = subprocess.run(
+        [
+            *command,
+            "-D",
+            "nb_execution_mode=off",
+            "-D",
+            "suppress_warnings=myst-nb.lexer",
+            "-d",
+            tmp_path / "trees",
+            repo / "docs",
+            tmp_path / "site",
+        ],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "biotac_mj.attach" in (tmp_path / "site" / "api.html").read_text()
