@@ -469,5 +469,7 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
         film = LearnedBatchFilm(geometry, nworld, device, weights)
     else:
         film = BatchFilm(FilmConduction(geometry, **film_of(config)), nworld, device)
+        if skin.data.rests is not None:  # fillings that differ: each rests at its own
+            film.calibrate(skin.data.rest_vert)
     settings = {k: v for k, v in settings.items() if k not in ("sensor", "randomise")}
     return Senses(skin, film, touching.group, rows, redraw, seed, float(mjm.opt.timestep), **settings)

@@ -115,7 +115,7 @@ class BatchSkin:
         self._launch(
             kernels.read_outputs,
             self.nworld,
-            [m.rest.pressure, int(m.has_liquid), d.worlds, self._wrench],
+            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench],
             [self.pressure, self.wrench],
         )
         if self._tangents and self.ngroup:
@@ -157,7 +157,7 @@ class BatchSkin:
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
-        m, d, n = self.model, self.data, self.nworld
+        d, n = self.data, self.nworld
         self._launch(
             kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity]
         )
@@ -183,7 +183,7 @@ class BatchSkin:
         self._launch(
             kernels.reset_worlds,
             n,
-            [mask, m.rest.pressure if m.has_liquid else 0.0],
+            [mask, d.rest_pressure],
             [d.worlds, self.pressure, self.fresh],
         )
         if d.memory:

@@ -27,7 +27,7 @@ vec6 = wp.spatial_vectord
 @wp.kernel
 def read_outputs(
     # In:
-    rest_pressure: real,
+    rest_pressure: wp.array(dtype=real),
     has_liquid: int,
     st: Worlds,
     wrench: wp.array3d(dtype=real),
@@ -37,7 +37,7 @@ def read_outputs(
 ):
     w = wp.tid()
     if has_liquid == 1:
-        pressure_out[w] = st.pressure[w] - rest_pressure
+        pressure_out[w] = st.pressure[w] - rest_pressure[w]
     for g in range(wrench_out.shape[0]):
         v = vec6()
         for i in range(6):
@@ -58,8 +58,9 @@ def reset_nodes(
 ):
     i, w = wp.tid()
     if mask[w]:
-        x_out[i, w] = rest[i, 0]
-        x_last_out[i, w] = rest[i, 0]
+        x0 = rest[i, w % rest.shape[1]]
+        x_out[i, w] = x0
+        x_last_out[i, w] = x0
         increment_out[i, w] = vec3()
         velocity_out[i, w] = vec3()
 
@@ -115,7 +116,7 @@ def reset_geoms(
 def reset_worlds(
     # In:
     mask: wp.array(dtype=bool),
-    rest_pressure: real,
+    rest_pressure: wp.array(dtype=real),
     # Out:
     st: Worlds,
     pressure_out: wp.array(dtype=real),
@@ -123,7 +124,7 @@ def reset_worlds(
 ):
     w = wp.tid()
     if mask[w]:
-        pressure = rest_pressure
+        pressure = rest_pressure[w]
         if st.kappa[w] == real(0.0):  # no liquid
             pressure = real(0.0)
         st.last_pressure[w] = pressure

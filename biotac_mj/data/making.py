@@ -306,6 +306,7 @@ class Maker:
                     noise[k],
                     senses[k],
                     fields.touch(k),
+                    None if fields.rest is None else fields.rest[k],
                 )
                 for k in range(len(motions))
             ]

@@ -134,18 +134,21 @@ def read_motion(
     seed: int,
     sense: Sense = Sense(),
     touch: Touch | None = None,
+    rest: np.ndarray | None = None,
 ) -> Readings:
     """Film, heat, vibration and acquisition along one interaction.
 
     Args:
       film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa].
       seed: of the noise. sense: the sensor and what it touches. touch: how; needed for heat and vibration.
+      rest: (nvert, 3) where the skin rests, if not as the film's [m]: there it reads what the film's does.
     """
+    scale = 1.0 if rest is None else film.rest / film.impedance(rest)
     impedance, failed = np.empty((len(time), NELECTRODE)), np.zeros(len(time), bool)
-    last = film.impedance(film.geometry.vert)
+    last = film.rest
     for i, x in enumerate(vert_xpos):
         try:
-            last = film.impedance(x)
+            last = scale * film.impedance(x)
         except ValueError:  # the skin has left an electrode or is folded
             failed[i] = True
         impedance[i] = last
@@ -190,10 +193,14 @@ def read_in_worker(
     seed: int,
     sense: Sense = Sense(),
     touch: Touch | None = None,
+    rest: np.ndarray | None = None,
 ) -> Readings:
-    """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store."""
-    vert = _here["vert"] + displacement * DISPLACEMENT_SCALE
-    return read_motion(_here["film"], vert, time, pressure, seed, sense, touch)
+    """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store, rest
+    (nvert, 3) that of the skin at rest [m]."""
+    vert = _here["vert"]
+    at_rest = None if rest is None else vert + rest
+    moved = vert + displacement * DISPLACEMENT_SCALE
+    return read_motion(_here["film"], moved, time, pressure, seed, sense, touch, at_rest)
 
 
 class _Now:

@@ -40,6 +40,8 @@ class Fields:
       area: (k, n) that the object touches [m^2].
       slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; nothing
         where no modes were given.
+      rest: (k, nvert, 3) displacements at which the skins rest, where each has a rest of its own [m]; else
+        None.
     """
 
     displacement: np.ndarray
@@ -51,6 +53,7 @@ class Fields:
     slip: np.ndarray
     drive: np.ndarray
     gain: np.ndarray
+    rest: np.ndarray | None = None
 
     def touch(self, i: int) -> Touch:
         """What the object does to the skin in interaction i."""
@@ -103,9 +106,8 @@ def simulate(
         own = {name: value[i : i + 1] for name, value in worlds.items()}
         one = slice(i, i + 1)
         ones.append(_simulate(model, names[one], motions[one], progress, times[one], mine, own, modes))
-    return Fields(
-        *(np.concatenate([getattr(one, field.name) for one in ones]) for field in dataclasses.fields(Fields))
-    )
+    parts = ([getattr(one, field.name) for one in ones] for field in dataclasses.fields(Fields))
+    return Fields(*(None if part[0] is None else np.concatenate(part) for part in parts))
 
 
 def _simulate(model, names, motions, progress, times=None, materials=None, worlds=None, modes=None):
@@ -116,6 +118,8 @@ def _simulate(model, names, motions, progress, times=None, materials=None, world
         scene.geoms.set_friction([[m.friction] * scene.geoms.count for m in materials])
     outer = nodes_of(model.geometry)
     fields = _empty(nworld, nstep, model.nvert, len(outer), 0 if modes is None else len(modes.rate))
+    if data.rests is not None:
+        fields.rest = (data.rests.vert - model.geometry.vert).astype(np.float32)
     touched = Touched(data, np.zeros(scene.geoms.count, int), 1, modes)
     reader = _Reader(model, outer)
     walks = [_walk(m.pos, m.mat) for m in motions]

@@ -352,7 +352,7 @@ class BatchFilm:
                 film.electrode_radius,
                 film._footprint,
                 film.conductivity,
-                wp.array(film.cell_constant, dtype=real),
+                wp.array(film.cell_constant[None], dtype=real),
             ]
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=real)
             self.valid = wp.ones(nworld, dtype=int)
@@ -371,6 +371,24 @@ class BatchFilm:
         )
         per_world = [self.middle, self.thickness, self.local, self._edge, self._quads, self._resistance]
         self.nbytes = sum(array.capacity for array in per_world)
+
+    def calibrate(self, x: wp.array) -> None:
+        """Gives each world the cell constants with which its skin at rest reads as the film's does.
+
+        Args:
+          x: (nvert, nworld) wp.array of vec3d, where the worlds rest [m].
+
+        Raises:
+          NoFilmError: one of them leaves an electrode without film.
+        """
+        self.solve_film(x, wp.ones(self.nworld, dtype=int, device=self.device))
+        if not self.valid.numpy().all():
+            world = int(self.valid.numpy().argmin())
+            raise NoFilmError(f"no liquid film over an electrode in world {world} at rest: take less filling")
+        own = self.film.cell_constant * self.rest / self.impedance.numpy()
+        with wp.ScopedDevice(self.device):
+            self._near[-1] = wp.array(own, dtype=real)
+            self.impedance.assign(np.tile(self.rest, (self.nworld, 1)))
 
     def lay(self, x: wp.array, due: wp.array) -> None:
         """Writes `middle` and `thickness`; arguments and errors as `solve_film`."""

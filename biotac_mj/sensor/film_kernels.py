@@ -261,7 +261,7 @@ def driving_point(
     radius: real,
     footprint: real,
     conductivity: real,
-    cell_constant: wp.array(dtype=real),
+    cell_constant: wp.array2d(dtype=real),
     # Out:
     impedance_out: wp.array2d(dtype=real),
     valid_out: wp.array(dtype=int),
@@ -295,7 +295,7 @@ def driving_point(
                 z -= current * wp.where(
                     i < NEXCITATION, resistance[w, NELECTRODE + wp.min(i, NEXCITATION - 1), e], real(1.0)
                 )
-            z = cell_constant[e] * z
+            z = cell_constant[w % cell_constant.shape[0], e] * z
             if sweep == 0:
                 if not (z > real(0.0) and z < real(1.0e12)):
                     valid_out[w] = 0

@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .contact.law import WorldLaws
-from .liquid import Liquid
+from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
@@ -82,7 +82,7 @@ class SkinData:
       reaction: (nworld, 3) force of core, nail and clamp on the fixed nodes [N].
       wrench: (nworld, ngroup, 6) of the skin ON each group of geoms, torque about the BioTac frame's origin
         [N, N m].
-      pressure: (nworld,) of the liquid above its rest value, which is `model.rest.pressure` [Pa].
+      pressure: (nworld,) of the liquid above its rest value [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
       reached: (nworld,) share of the geoms' way in the last step at which positions, wrench, pressure and
@@ -93,6 +93,7 @@ class SkinData:
 
     On the device, [item, world] in Warp arrays that may be overwritten between steps:
       worlds: `newton.worlds.Worlds`, scalars of every world. rubber: `rubber.points.Rubber`.
+      rest_vert: (nvert, 1), or (nvert, nworld) of worlds with rests of their own: `rests`, else None.
       laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
@@ -134,6 +135,7 @@ class SkinData:
             if model.has_core:
                 self.core = ContactState(model.core_surface, nsample, model.nvert, nworld)
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
+            self.rest_pressure = wp.full(nworld, float(model.rest.pressure), dtype=real)
             self.dt = wp.zeros(nworld, dtype=real)
             self.frame_pos, self.frame_pos_last = (wp.zeros(nworld, dtype=vec3) for _ in range(2))
             still = np.tile(np.eye(3), (nworld, 1, 1))
@@ -141,6 +143,7 @@ class SkinData:
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
+        self.rests = None
         self.worlds.wanted.fill_(1)
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
         self.worlds.density.assign([float(m.density) for m in materials])
@@ -212,9 +215,7 @@ class SkinData:
 
     def reset(self) -> None:
         """Puts every world back to rest: the skin on its filling, nothing touching."""
-        rest = np.ascontiguousarray(np.repeat(self.model.rest.vert[:, None], self.nworld, 1))
-        self.x.assign(rest)
-        self.x_last.assign(rest)
+        self._lie_at_rest()
         for array in (self.velocity, self.increment, self.force):
             array.zero_()
         for arrays in (*self._of_geoms.values(), self._of_groups.values()):
@@ -230,6 +231,22 @@ class SkinData:
         for name in ("reason", "nonconverged", "iterations", "error"):
             getattr(self.worlds, name).zero_()
         self.worlds.reached.fill_(1.0)
+
+    def rest_at(self, rests: Rests) -> None:
+        """Gives each world its own rest and puts it there; before anything is recorded that looks at it."""
+        self.rests = rests
+        with wp.ScopedDevice(self.model.device):
+            self.rest_vert = wp.array(np.ascontiguousarray(np.swapaxes(rests.vert, 0, 1)), dtype=vec3, ndim=2)
+        self.rest_pressure.assign(rests.pressure)
+        self.liquid.rest_at(rests.pressure, rests.volume, rests.natural_volume)
+        self.reset()
+
+    def _lie_at_rest(self):
+        rest = self.rest_vert.numpy()
+        if rest.shape[1] != self.nworld:
+            rest = np.repeat(rest, self.nworld, 1)
+        for array in (self.x, self.x_last):
+            array.assign(np.ascontiguousarray(rest))
 
     def set_external(self, force: ArrayLike | None) -> None:
         """Loads the nodes in every step from now on, until `reset`.
@@ -306,7 +323,7 @@ class SkinData:
     def pressure(self) -> np.ndarray:
         if not self.model.has_liquid:
             return np.zeros(self.nworld)
-        return self.liquid.gauge_pressure - self.model.rest.pressure
+        return self.liquid.gauge_pressure - self.liquid.rest_pressure
 
     @property
     def volume(self) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import math
 
 import numpy as np
 
@@ -10,10 +9,10 @@ from . import model as skin_model
 from .cache import kept
 from .data import SkinData
 from .geoms import GeomSet
-from .liquid import Rest
+from .liquid import Rest, Rests
 from .step import step
 
-__all__ = ["rest_state"]
+__all__ = ["rest_state", "rest_worlds"]
 
 # Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no
 # residual for later steps.
@@ -36,11 +35,11 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
         )
 
     def inflate():
-        rest = _inflated(model)
-        return {"vert": rest.vert, "numbers": np.array([rest.pressure, rest.volume, rest.natural_volume])}
+        return dataclasses.asdict(_inflated(model))
 
     found = kept("rest", _inputs(model), inflate)
-    return Rest(found["vert"], *found["numbers"].tolist())
+    numbers = (float(found[name][0]) for name in ("pressure", "volume", "natural_volume"))
+    return Rest(found["vert"][0], *numbers)
 
 
 def _inputs(model):
@@ -52,9 +51,47 @@ def _inputs(model):
     return [*mesh, core, *rubber, model.options, model.device.is_cuda]
 
 
-def _inflated(model):
+def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> None:
+    """Gives worlds that differ on a filled skin each its own rest, as a single skin of its material and fill
+    has it, and puts them there.
+
+    Args:
+      data: whose liquids are set. materials: of each world; modulus: as for `SkinData`, or None.
+
+    Raises:
+      ValueError: a skin does not hold that much liquid or pressure.
+    """
+    model, liquid = data.model, data.liquid
+    if not model.has_liquid:
+        return
+    options, bulk, extra = model.options, liquid.bulk_modulus, liquid.extra
+    same = all(m == model.material for m in materials) and modulus is None
+    filled = options.fill_volume or options.rest_pressure
+    if not extra.any() and (not filled or (same and (bulk == options.bulk_modulus).all())):
+        return
+    worlds = [
+        (m, float(k), float(v), b"" if modulus is None else modulus[w].tobytes())
+        for w, (m, k, v) in enumerate(zip(materials, bulk, extra, strict=True))
+    ]
+    number = {world: i for i, world in enumerate(dict.fromkeys(worlds))}
+    which = np.array([number[world] for world in worlds])
+    first = np.unique(which, return_index=True)[1]
+    chosen = [materials[w] for w in first]
+    factors = None if modulus is None else np.asarray(modulus)[first]
+
+    def inflate():
+        return dataclasses.asdict(_inflated(model, chosen, factors, bulk[first], extra[first]))
+
+    inputs = [*_inputs(model), *chosen, factors, bulk[first], extra[first]]
+    found = kept("rests", inputs, inflate)
+    data.rest_at(Rests(**{name: value[which] for name, value in found.items()}))
+
+
+def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
+    """`Rests` of worlds; by default of one, of the model's material."""
     options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     model.factor  # noqa: B018 - made here, the copy shares it
+    materials = [model.material] if materials is None else materials
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
         options,
@@ -65,40 +102,50 @@ def _inflated(model):
         stiffness_damping=0.0,
         tolerance=_UNDERWAY,
     )
-    # relaxed and virgin
-    bare.material = dataclasses.replace(model.material, prony=(), mullins=None, hysteresis=())
+    bare.material, *relaxed = (_relaxed(m) for m in (model.material, *materials))
     bare.rest = Rest(vert, 0.0, volume, volume)
-    data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
-    liquid = data.liquid
+    data = SkinData(bare, len(relaxed), relaxed, modulus)
+    nothing, liquid = GeomSet([], [], nworld=len(relaxed), device=model.device), data.liquid
+    if bulk is not None:
+        liquid.set(bulk)
+    K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
+    natural = np.full(len(relaxed), volume + more)
+    if target:
+        pump = lambda s: liquid.keep_pressure(s * target * (K > 0))  # noqa: E731
+        _go(bare, data, nothing, f"rest_pressure {target:g}", pump)
+        held = np.isfinite(K) & (K > 0)
+        natural = data.volume / np.where(held, 1 - liquid.gauge_pressure / np.where(held, K, 1.0), 1.0)
+    elif more:
+        _go(bare, data, nothing, f"fill_volume {more:g}", lambda s: liquid.fill(volume + s * more))
+    if np.any(extra):
+        _go(bare, data, nothing, f"fill_volume {np.max(extra):g}", lambda s: liquid.fill(natural + s * extra))
+    return Rests(data.vert_xpos.copy(), liquid.gauge_pressure, data.volume, natural)
+
+
+def _relaxed(material):
+    """Virgin and after any time."""
+    return dataclasses.replace(material, prony=(), mullins=None, hysteresis=())
+
+
+def _go(bare, data, nothing, what, put):
+    """Puts liquid in, put(share), step by step."""
     done, size = 0.0, 0.25
+    options = bare.options
     while done < 1:
         size = min(size, 1 - done)
-        if done + size == 1:
-            bare.options = dataclasses.replace(bare.options, tolerance=_ARRIVED)
-        if options.rest_pressure:  # liquid at constant pressure
-            liquid.keep_pressure((done + size) * options.rest_pressure)
-        else:
-            liquid.fill(volume + (done + size) * options.fill_volume)
+        tolerance = _ARRIVED if done + size == 1 else _UNDERWAY
+        bare.options = dataclasses.replace(options, tolerance=tolerance)
+        put(done + size)
         step(bare, data, nothing)
-        if data.converged[0]:
+        if data.converged.all():
             done += size
         else:
             size /= 2
-            bare.options = dataclasses.replace(bare.options, tolerance=_UNDERWAY)
             if size < 1e-3:
-                which = "rest_pressure" if options.rest_pressure else "fill_volume"
                 raise ValueError(
-                    f"no balance of skin and liquid beyond {done:.0%} of {which} "
-                    f"{getattr(options, which):g}: "
-                    "this rubber does not hold it; take less"
+                    f"no balance of skin and liquid beyond {done:.0%} of {what}: this rubber does not hold "
+                    "it; take less"
                 )
-    pressure, filled = float(liquid.gauge_pressure[0]), float(liquid.volume[0])
-    natural = float(liquid.natural_volume[0])
-    if options.rest_pressure:
-        natural = (
-            filled if math.isinf(options.bulk_modulus) else filled / (1 - pressure / options.bulk_modulus)
-        )
-    return Rest(data.vert_xpos[0].copy(), pressure, filled, natural)
 
 
 skin_model.solve_rest = rest_state

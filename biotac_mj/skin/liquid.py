@@ -241,6 +241,17 @@ class Rest:
     natural_volume: float
 
 
+@dataclasses.dataclass(frozen=True)
+class Rests:
+    """`Rest` of many worlds: vert (nworld, nvert, 3), the others (nworld,); natural_volume is without what
+    `Liquid.extra` adds."""
+
+    vert: np.ndarray
+    pressure: np.ndarray
+    volume: np.ndarray
+    natural_volume: np.ndarray
+
+
 class Liquid:
     """The liquid of one SkinData: how much of it there is in every world, and what it did in the last step.
 
@@ -251,13 +262,15 @@ class Liquid:
       bulk_modulus: K [Pa]. extra: liquid beyond the model's fill [m^3].
       natural_volume: without pressure [m^3]. stiffness: kappa = K / natural_volume, by which p falls with V
         [Pa/m^3].
-      last_pressure: above the surroundings, of the last step [Pa].
+      last_pressure: above the surroundings, of the last step [Pa]. rest_pressure: at rest.
       gauge_pressure: above the surroundings [Pa], volume: [m^3] at the last evaluation.
     """
 
     def __init__(self, model: Any, nworld: int, worlds: Worlds):
         self._model, self._worlds, self.nworld = model, worlds, nworld
         self.bulk_modulus, self.extra = np.full(nworld, model.options.bulk_modulus), np.zeros(nworld)
+        numbers = (model.rest.pressure, model.rest.volume, model.rest.natural_volume)
+        self.rest_at(*(np.full(nworld, x) for x in numbers))
         self.reset()
 
     @property
@@ -286,12 +299,15 @@ class Liquid:
 
     def reset(self) -> None:
         """Puts every world back to rest on its filling."""
-        rest = self._model.rest
-        self.fill(rest.natural_volume + self.extra)
-        pressure = np.where(self.bulk_modulus == 0, 0.0, rest.pressure)
+        self.fill(self._natural + self.extra)
+        pressure = np.where(self.bulk_modulus == 0, 0.0, self.rest_pressure)
         self._write("last_pressure", pressure)
         self._write("pressure", pressure)
-        self._write("volume", rest.volume)
+        self._write("volume", self._volume)
+
+    def rest_at(self, pressure: np.ndarray, volume: np.ndarray, natural_volume: np.ndarray) -> None:
+        """Sets what the worlds are at rest, (nworld,) each, from the next `reset` on, see `Rests`."""
+        self.rest_pressure, self._volume, self._natural = pressure, volume, natural_volume
 
     def fill(self, natural_volume: ArrayLike) -> None:
         """Takes as much liquid as has this volume without pressure [m^3]."""
@@ -313,7 +329,7 @@ class Liquid:
         """See `SkinData.set_liquid`."""
         if not self._model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
-        natural, n = self._model.rest.natural_volume, self.nworld
+        natural, n = self._natural, self.nworld
         bulk, extra = self.bulk_modulus, self.extra
         if bulk_modulus is not None:
             bulk = np.array(np.broadcast_to(np.asarray(bulk_modulus, float), n))

@@ -7,6 +7,7 @@ import numpy as np
 
 from .contact.law import ContactLaw
 from .data import SkinData
+from .fill import rest_worlds
 from .model import SkinModel, SkinOptions
 
 __all__ = ["NAMES", "make_room", "make_worlds"]
@@ -41,7 +42,7 @@ def make_room(
 def make_worlds(
     model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None
 ) -> SkinData:
-    """SkinData of worlds that differ.
+    """SkinData of worlds that differ; a filled one rests where a single skin of its material and fill does.
 
     Args:
       materials: one for each world, or None.
@@ -68,4 +69,5 @@ def make_worlds(
     liquid = {name: values[name] for name in _LIQUID if name in values}
     if liquid:
         data.set_liquid(**liquid)
+    rest_worlds(data, [model.material] * nworld if materials is None else list(materials), modulus)
     return data

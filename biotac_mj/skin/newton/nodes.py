@@ -290,7 +290,7 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
                 load += core[i, w]
             if external.shape[0] > 0:
                 load += external[i, w]
-            u = x[i, w] - rest[i, 0]
+            u = x[i, w] - rest[i, w % rest.shape[1]]
             work += wp.dot(load, u)
             if inertial.shape[0] > 0:
                 fly += wp.dot(raised(inertial[i, w]), u)
