@@ -26,6 +26,7 @@ class Coupled:
       off: [m] how far the bodies go from where the skin was last solved.
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
+      amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -42,7 +43,7 @@ class Coupled:
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.correction = np.zeros((len(self.wrench0), 6))
+        self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
         self.asked = self.result = None
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._iterations = 1.0, np.inf, True, 0
@@ -133,16 +134,17 @@ class Coupled:
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
-        damper = (self.tangent @ self.drift[:, :, None])[:, :, 0]
-        return self.push * wrench - (1.0 - self.push) * damper
+        return self.push * wrench - (1.0 - self.push) * self._held_by(self.drift)
 
     def _acting(self):
         """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
-        return self._push() - (self.tangent @ self.moved[:, :, None])[:, :, 0]
+        return self._push() - self._held_by(self.moved) + self.amiss
+
+    def _held_by(self, motion):
+        return (self.tangent @ motion[:, :, None])[:, :, 0]
 
     def _model(self, pose):
-        motion = displacement(*pose, *self.pose0)
-        return self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
+        return self.wrench0 - self._held_by(displacement(*pose, *self.pose0))
 
     def let_go(self) -> None:
         """Takes the rows' stiffness away."""
@@ -160,20 +162,20 @@ class Coupled:
     def _store(self):
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
-        wrench = self._acting()
-        most = self.instance.most_energy(wrench)
-        if ends is None:
-            return most
-        jump = displacement(*self.here, *ends)
-        if _size(jump) > max(TELEPORT, _size(self.drift)):
-            return most
+        jump = None if ends is None else displacement(*self.here, *ends)
+        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+            return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
-        return min(store - min((w * jump).sum() for w in (wrench, last)), most)
+        return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())
+
+    def _most(self):
+        """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
+        there before it, and what is withheld is in the skin all the same."""
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._model(self.target))))
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
-        store = self._store() - self._given()
-        store = min(store, self.instance.most_energy(self._acting()))
+        store = min(self._store() - self._given(), self._most())
         self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
 
 

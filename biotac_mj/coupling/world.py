@@ -162,6 +162,8 @@ class World:
         if not self._damped:
             return found
         if not any(s.tangent.any() for s in skins):
+            for skin in skins:
+                skin.amiss = np.zeros_like(skin.correction)
             return self.integrator.integrated(found)
         jacobian, tangent, wrench0, correction = (
             np.concatenate([getattr(s, name) for s in skins])
@@ -175,6 +177,8 @@ class World:
             wrong = excess - correction
             poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
             if not (poor and last):  # also where the simulation has blown up: nothing is greater than nan
+                for skin, part in zip(skins, np.split(-wrong, ends)):
+                    skin.amiss = part
                 return moved
             if search is None:
                 search, slope = FixedPoint(), self.integrator.slope(jacobian, stiffness)
