@@ -13,7 +13,7 @@ __all__ = ["DEEPER", "TELEPORT", "Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
-_MOST_ITERATIONS = 40  # of the skin's solver in a step, after which the model that came closest must do
+_MOST_ITERATIONS = 30  # of the skin's solver in a step, after which the model that came closest must do
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 
@@ -103,6 +103,11 @@ class Coupled:
             depth = (1.0 - clear) * _size(way)
             return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
         way = displacement(*pose, *start)
+        if _size(way) <= room:
+            return pose
+        share = self.instance.share_down(*start, way, room)
+        if share is not None:
+            return pose if share == 1.0 else displace(*start, share * way)
         force = (
             np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
         )

@@ -131,6 +131,12 @@ class Touching:
         geom_mat = owner @ self._geom_mat
         return geom_pos, geom_mat
 
+    def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
+        """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
+        first = np.unique(self.group, return_index=True)[1]
+        mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
+        return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
+
     def _check(self, pos, mat):
         if math.isfinite(pos.sum() + mat.sum()):
             return

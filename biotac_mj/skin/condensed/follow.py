@@ -14,7 +14,6 @@ __all__ = ["follow"]
 _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
-_FAR = 1.0  # geoms are moved out of the skin by no more [m]
 _EFFORT = 1.5e5  # of a step, for each outer node: about 0.25 s on the coarse skin
 _SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
 _SHARE, _SHORT = 0.125, 1e-4  # of a short motion that failed at once, and [m]: the first part at least
@@ -92,26 +91,6 @@ def _go(skin, memory, pos, mat, effort, first=1.0):
 
 
 def _outside(skin, pos, mat):
-    """Memory of the resting skin with the geoms moved out of it, each along the mean normal of what it
-    touches."""
-    out = pos.copy()
-    for g in range(len(pos)):
-        alone = np.full_like(pos, 2 * _FAR)
-
-        def touches(distance, g=g, alone=alone, normal=0.0):
-            alone[g] = pos[g] + distance * normal
-            skin.pose(Memory.rest(len(pos)), alone, mat)
-            return not skin.untouched(alone, mat)
-
-        if not touches(0.0):
-            continue
-        normal = skin.outward(pos[g], skin.search.faces(0.0, 0.0, alone, mat))
-        high = _LEAST
-        while high < _FAR and touches(high, normal=normal):
-            high *= 2
-        low = high / 2
-        while high - low > _PART:
-            middle = (low + high) / 2
-            low, high = (middle, high) if touches(middle, normal=normal) else (low, middle)
-        out[g] = pos[g] + high * normal
+    """Memory of the resting skin with the geoms moved out of it."""
+    out = skin.search.outside(pos, mat)
     return skin.at_rest(out, mat, np.zeros_like(out)).memory
