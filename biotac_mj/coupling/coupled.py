@@ -77,6 +77,11 @@ class Coupled:
         self.may_go = result.converged and self._iterations < _MOST_ITERATIONS
         self.use(pose, result)
 
+    @property
+    def balanced(self) -> bool:
+        """Whether its model is that of a balance found in this step."""
+        return self.result is not None and self.result.converged
+
     def model(self) -> tuple:
         """What `use` takes to come back to the present model."""
         return self.asked, self.result
@@ -168,7 +173,8 @@ class Coupled:
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
-        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+        self._placed = jump is None or _size(jump) > max(TELEPORT, _size(self.drift))
+        if self._placed:
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
         return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())
@@ -181,6 +187,8 @@ class Coupled:
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
         store = min(self._store() - self._given(), self._most())
+        if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
+            store = np.inf  # what was put in is not known before a balance is found
         self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
 
 

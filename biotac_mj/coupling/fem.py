@@ -20,7 +20,7 @@ from .stepper import Geom, SkinResult
 
 __all__ = ["FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
-_WORK = 180  # of two-way skins, see SkinOptions.max_work
+_WORK = 160  # of two-way skins, see SkinOptions.max_work
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]

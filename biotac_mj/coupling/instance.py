@@ -29,9 +29,9 @@ __all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "sk
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 
-# head of the plugin state: steps that did not converge; whether the last committed step did, or less the steps
-# in which the skin has stayed where it was; whether a step was made since the reset; and the energy that is in
-# the skin at most [J]
+# head of the plugin state: steps that did not converge; whether the last committed step did, or less the
+# steps in which the skin has stayed where it was; whether a step was made since the reset; and the energy
+# that is in the skin at most [J], infinite where that is not known
 _HEAD = 4
 _FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
 _PATIENCE = 3  # steps in which the skin may stay where it was, after which it begins anew

@@ -110,8 +110,9 @@ class World:
             off = max([skin.aim(acceleration) for skin in skins])
             if off < TOLERANCE:
                 return acceleration, rounds
-            if best is None or not off >= best[0]:
-                best = off, [skin.model() for skin in skins]
+            rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
+            if best is None or not rank >= best[0]:
+                best = rank, [skin.model() for skin in skins]
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break

@@ -72,8 +72,8 @@ class Material:
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
         if not (_SOFTEST <= self.youngs_modulus <= _HARDEST and self.density > 0):
             raise ValueError(
-                f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} (give it "
-                f"in Pa: 0.65 MPa is 650000) and density {self.density:g} kg/m^3 positive"
+                f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} (give "
+                f"it in Pa: 0.65 MPa is 650000) and density {self.density:g} kg/m^3 positive"
             )
         if not -1 < self.poissons_ratio < 0.5:
             raise ValueError(
