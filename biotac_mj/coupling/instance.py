@@ -8,6 +8,7 @@ import ctypes
 import dataclasses
 import functools
 import gc
+import math
 import threading
 
 import mujoco
@@ -220,8 +221,27 @@ class Instance:
             else self.model.opt.timestep
         )
 
+    def refuse_foreign_state(self, cause: Exception | None = None) -> None:
+        """Raises ValueError for a plugin state that is none of this model: one with NaN, or, where a `cause`
+        is known that it may have led to, one without the rotations that each has."""
+        bad = not math.isfinite(self.state.sum())
+        if bad:
+            known = np.isfinite(self.state)
+            known[_ENERGY] |= self.state[_ENERGY] == np.inf
+            bad = not known.all()
+        if cause is not None and not bad:
+            turned = self.setup.parts(self.state)[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
+            bad = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) > 1e-6
+        if bad:
+            raise ValueError(
+                "the BioTac's part of plugin_state is no state of this model: call mj_resetData, or "
+                "mj_setState with a state that mj_getState gave"
+            ) from cause
+
     def forget_last_solve(self) -> None:
-        """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
+        """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way or the state is
+        none."""
+        self.refuse_foreign_state()
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(

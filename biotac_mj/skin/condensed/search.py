@@ -26,6 +26,7 @@ wp.set_module_options({"enable_backward": False})
 _REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
 _REGIONS = 16
 _NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
+_EVEN = 1e-9  # of a way: finer it is not divided
 _FAR = 1.0  # [m] geoms are moved out of the skin by no more
 
 
@@ -195,7 +196,8 @@ class NearSearch:
         """Poses (ngeom, 3) [m], (ngeom, 3, 3), about the last on the way from the first ones, which are
         `clear`, to the others."""
         way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
-        while (high - low) * np.abs(way).max(initial=0.0) > _NARROW:
+        far = np.abs(way).max(initial=0.0)
+        while (high - low) * far > _NARROW and high - low > _EVEN:
             middle = 0.5 * (low + high)
             clear = self.clear(*displace(pos0, mat0, middle * way), margin)
             low, high = (middle, high) if clear else (low, middle)
