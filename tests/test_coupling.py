@@ -10,7 +10,8 @@ import spring_skin
 from scipy.optimize import brentq
 
 import biotac_mj
-from biotac_mj.coupling import attach
+from biotac_mj.coupling import attach, coupled
+from biotac_mj.coupling import world as coupled_world
 from biotac_mj.coupling.integrator import FixedPoint
 from biotac_mj.geometry.rigid import displace, displacement, rotation
 
@@ -148,6 +149,28 @@ def test_a_damped_ball_moves_as_backward_euler_says(damping, integrator, timeste
         )  # solved within 2 um
         most = max(most, push(height))
     assert most > 0.5 * weight  # it has met the springs
+
+
+def test_what_a_correction_lacks_is_in_the_account_of_energy(monkeypatch):
+    """The integrator's accelerations are met by a fixed point: what it has not reached acts on the bodies
+    too."""
+    seen, conclude = [], coupled.Coupled.conclude
+
+    def watch(self, rounds):
+        seen.append(self._acting().ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
+        conclude(self, rounds)
+
+    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
+    monkeypatch.setattr(coupled_world, "MAX_CORRECTIONS", 0)
+    model, data, _ = scene(
+        ball(0.001, '<joint type="slide" axis="0 0 1" damping="0.5"/>', "0 0 .0178"), 0.004, "0 0 0", "Euler"
+    )
+    data.qvel[0] = -0.05
+    mujoco.mj_step(model, data, 3)
+    mujoco.mj_forward(model, data)
+    found = data.qfrc_passive - data.qfrc_damper + data.qfrc_constraint
+    assert abs(found[0]) > 1e-3
+    np.testing.assert_allclose(seen[-1], found, rtol=1e-6)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit"])
