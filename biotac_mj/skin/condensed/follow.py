@@ -37,7 +37,7 @@ def follow(
         found = skin.attempt(memory, None, pos, mat, effort, near=near)
         if found:
             return found
-        first = max(_SHARE, min(1.0, _SHORT / max(far, _SHORT)))
+        first = min(1.0, max(_SHARE, _SHORT / max(far, 1e-12)))
     deep = skin.search.deep(pos, mat)
     if skin.untouched(pos, mat):  # the skin lets go
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
