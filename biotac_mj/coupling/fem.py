@@ -28,6 +28,7 @@ _CLEAR = 1e-3
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
+_SHORT = 5e-4  # [m] a way to the skin of which friction may know all, as it does in batches
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
@@ -259,6 +260,8 @@ class FemStepper:
         is none of its friction's."""
         last = self.came_to(state)
         if self._part(state, "started")[0] and self._search.clear(*last, self._reach):
+            if np.abs(geom_pos - last[0]).max() < _SHORT:
+                return last
             return self._search.last_clear(*last, geom_pos, geom_mat, self._reach)
         return self._search.outside(geom_pos, geom_mat, self._reach), geom_mat
 
