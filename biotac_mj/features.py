@@ -246,6 +246,12 @@ _READINGS = (
      "attach, condensed, batch; `converged` in generate"),
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
+    ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
+     "the core; one that cannot move on begins anew; what was stored by bodies that are put into it is open "
+     "until a balance is found", "yes",
+     "attach (on the CPU), condensed; batch and CUDA: by the force along the way"),
+    ("contact's exact stiffness near balance (curvature of geoms, turn of the slip)", "yes",
+     "condensed alone: conjugate gradients of the full tier take a symmetric one, on all its paths"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
      "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
      "materials, contact laws and fill"),

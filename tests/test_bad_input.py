@@ -486,8 +486,8 @@ def settings():
         ('{"friction":NaN}', "friction is nan: pass a finite number"),
         ('{"friction":Infinity}', "friction is inf: pass a finite number"),
         ('{"friction":-1}', "friction -1 is negative"),
-        ('{"youngs_modulus":0}', "must be from 0.001 to"),
-        ('{"youngs_modulus":1e-300}', "must be from 0.001 to"),
+        ('{"youngs_modulus":0}', "must be from 100 to"),
+        ('{"youngs_modulus":1e-300}', "must be from 100 to"),
         ('{"poissons_ratio":0.5}', "Poisson's ratio 0.5 is outside"),
         ('{"law":"jelly"}', "unknown material law 'jelly'"),
         ('{"element":"cubic"}', "unknown element 'cubic'"),
@@ -721,6 +721,10 @@ def numbers():
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
     for timestep in ("1001", "1e30"):
         yield Row(f"press --timestep {timestep}", "1 s at most")
+    for speed in ("10001", "1e99"):
+        yield Row(f"press --speed {speed}", "10 m/s at most")
+    for verb in ("import --out out", "show --out out", "evaluate --electrodes", "resimulate --out out"):
+        yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
     yield Row("press --location 1 2 3 4", "location")
     yield Row("press --skin coarse --location 40", "no skin at x = 40 mm")
     yield Row("press --skin coarse --direction 0 -1 0", "leaves the skin")

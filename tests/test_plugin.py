@@ -324,10 +324,38 @@ def test_nan_pose_names_the_geom():
     with pytest.warns(RuntimeWarning):
         mujoco.mj_forward(model, data)
     with pytest.raises(
-        ValueError, match="NaN in the pose of the BioTac or of geom tip: check mocap_pos, qpos and qvel"
+        ValueError, match="NaN or a huge number in the pose of the BioTac or of geom tip: check mocap_pos"
     ):
         biotac_mj.plugin.check()
     biotac_mj.plugin.clear_errors()
+
+
+@pytest.mark.parametrize("part, entry, value, text", [
+    ("mocap_pos", 1, np.inf, "huge number in the pose of .* geom tip: check mocap_pos"),
+    ("mocap_pos", 0, 1e30, "huge number in the pose of .* geom tip: check mocap_pos"),
+    ("qpos", 0, np.inf, "huge number in qpos, so MuJoCo has reset the simulation: check"),
+    ("qvel", 0, 1e30, "huge number in qvel, so MuJoCo has reset the simulation: check"),
+    ("plugin_state", slice(None), np.nan, "no state of this model: call mj_resetData"),
+    ("plugin_state", 3, np.nan, "no state of this model: call mj_resetData"),
+    ("plugin_state", slice(4, None), 1e30, "no state of this model: call mj_resetData"),
+])  # fmt: skip
+def test_numbers_that_are_none_give_one_error(part, entry, value, text):
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><site name='tip'/><body name='probe' mocap='true' pos='0 0 .1'>"
+        "<geom name='tip' size='.005'/></body><body pos='-.01 -.012 0'><freejoint/>"
+        "<geom size='.005' mass='.01'/></body></worldbody></mujoco>"
+    )
+    biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", readings="none", on_error="raise")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 3)
+    getattr(data, part).flat[entry] = value
+    with pytest.raises(ValueError, match=text):
+        mujoco.mj_step(model, data)
+    mujoco.mj_resetData(model, data)
+    data.mocap_pos[0] = 0.1
+    mujoco.mj_step(model, data)
+    assert np.isfinite(data.qpos).all()
 
 
 def test_discrete_integrator_is_refused_two_way(model):

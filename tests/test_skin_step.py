@@ -259,14 +259,14 @@ def test_a_step_in_parts_is_the_step(model, monkeypatch):
         np.testing.assert_allclose(other[0], found[0][0], rtol=0, atol=1e-9)
         np.testing.assert_allclose(other[1], found[0][1], rtol=0, atol=1e-5 * abs(found[0][1]).max())
         assert (other[2] == found[0][2]).all()
-    halfway, touching = press(exact, [0], [0.6e-3])
+    partway, touching = press(exact, [0], [0.6e-3])
     failing[:] = [1] * 20 + [0, 1]
     touching.set_pose(pose(1.2e-3), turn)
-    step(exact, halfway, touching)
-    assert halfway.reached[0] == 0.5 and not halfway.converged[0]
-    cos, sin = np.cos(0.15), np.sin(0.15)
-    half = touching.struct.mat_last.numpy()[1, 0]
-    np.testing.assert_allclose(half, [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]], atol=1e-12)
+    step(exact, partway, touching)
+    assert partway.reached[0] == 0.25 and not partway.converged[0]
+    cos, sin = np.cos(0.075), np.sin(0.075)
+    turned = touching.struct.mat_last.numpy()[1, 0]
+    np.testing.assert_allclose(turned, [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]], atol=1e-12)
 
 
 def test_numbers_of_worlds(model):
@@ -320,7 +320,7 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
             tries.clear()
             geoms.set_pose([[-0.012, -0.00825 + depth - 3.5e-3, 0.0]])
             step(model, data, geoms)
-            assert data.converged.all() and len(tries) in ((1,), (2, 3))[fail]
+            assert data.converged.all() and len(tries) in ((1,), (3, 4))[fail]
             assert tries[0] is model.factor
         monkeypatch.setattr(SkinStep, "_newton", newton)
         return data, model, tries

@@ -474,6 +474,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     st.active.fill_(1)
     st.touched.fill_(1)
     st.limit.fill_(30)
+    st.allowed.fill_(750)
     part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
     part[0], worth[0], worth[1] = rz, 1e-4, 1.0  # residual squared [N^2], work of the load [J]
     arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
@@ -481,7 +482,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     wp.launch_tiled(
         judge_balance,
         dim=[1],
-        inputs=[1e-4, 1500, 0, *arrays, st],
+        inputs=[1e-4, 0, *arrays, st],
         outputs=[go_on],
         block_dim=1,
         device="cpu",

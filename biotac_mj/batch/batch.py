@@ -72,7 +72,9 @@ class Batch(Skins):
             for name in ("spent", "far", "trial", "placed", "inside", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
             r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
-            r.off, r.share, r.store, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(4))
+            r.off, r.share, r.store, r.most, r.without = (
+                wp.zeros(self.nworld, dtype=wp.float64) for _ in range(5)
+            )
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
@@ -205,7 +207,7 @@ class Batch(Skins):
 
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
-        self._settle(rounds.conclude, solid=[self._solid])
+        self._settle(rounds.conclude)
 
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""

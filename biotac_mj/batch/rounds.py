@@ -88,6 +88,7 @@ class Rounds:
     full_wrench: wp.array2d(dtype=vec6)
     full_motion: wp.array2d(dtype=vec6)
     store: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
+    most: wp.array(dtype=real)  # [J] that the skin can hold
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
 
 
@@ -371,15 +372,13 @@ def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
 
 
 @wp.func
-def most_energy(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), solid: Solid, w: int):
-    """The most that a skin with these wrenches can hold: its force over the whole way to the core [J]."""
+def most_energy(r: Rounds, force: real, solid: Solid, w: int):
+    """The most that a skin which pushes with so much force can hold: over the whole way to the core [J]."""
     if solid.inertial == 1:
         return real(wp.inf)
-    most = real(0.0)
+    most = solid.thickness * force
     if r.surface.shape[0] > 0:
-        most = r.surface[w] * solid.area
-    for g in range(r.pos.shape[0]):
-        most += solid.thickness * force_of(acting(r, model, wrench, g, w))
+        most += r.surface[w] * solid.area
     return most
 
 
@@ -406,24 +405,29 @@ def restrain(
     last step, and what those have put in who have moved bodies since.
     """
     w = wp.tid()
-    most = most_energy(r, model, wrench, solid, w)
     before = real(0.0)
     now = real(0.0)
+    pushed = real(0.0)
+    pushes = real(0.0)
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         acts = acting(r, model, wrench, g, w)
         before += wp.dot(last.wrench0[g, w], jump)
         now += wp.dot(acts, jump)
+        pushed += force_of(last.wrench0[g, w])
+        pushes += force_of(acts)
         r.full_wrench[g, w] = acts
         r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
     store = r.store[w] - wp.min(before, now)
     if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with
         store = real(0.0)
         if r.inside[w] == 1 or solid.inertial == 1:
-            store = most
+            store = most_energy(r, pushes, solid, w)
         elif r.surface.shape[0] > 0:
             store = r.surface[w] * solid.area
-    r.store[w] = wp.min(store, most)
+    # a solve that lost its way knows little of the force that was there before it
+    r.most[w] = most_energy(r, wp.max(pushed, pushes), solid, w)
+    r.store[w] = wp.min(store, r.most[w])
     if overdraws(r, model, wrench, w):
         r.push[w] = real(0.0)
         again[0] = 1
@@ -490,14 +494,13 @@ def conclude(
     # In:
     model: Model,
     wrench: wp.array2d(dtype=vec6),
-    solid: Solid,
     # In and out:
     r: Rounds,
 ):
     """Keeps the energy that is left, and where the bodies go."""
     w = wp.tid()
-    left = r.store[w] - given(r, model, wrench, w)
-    r.store[w] = wp.min(left, most_energy(r, model, wrench, solid, w))
+    # what is withheld is in the skin all the same
+    r.store[w] = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
     for g in range(r.pos.shape[0]):
         r.end_pos[g, w] = r.pos[g, w]
         r.end_mat[g, w] = r.mat[g, w]

@@ -13,7 +13,7 @@ __all__ = ["DEEPER", "TELEPORT", "Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
-_MOST_ITERATIONS = 40  # of the skin's solver in a step, after which the model that came closest must do
+_MOST_ITERATIONS = 30  # of the skin's solver in a step, after which the model that came closest must do
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 
@@ -26,6 +26,7 @@ class Coupled:
       off: [m] how far the bodies go from where the skin was last solved.
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
+      amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -42,7 +43,7 @@ class Coupled:
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.correction = np.zeros((len(self.wrench0), 6))
+        self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
         self.asked = self.result = None
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._iterations = 1.0, np.inf, True, 0
@@ -76,6 +77,11 @@ class Coupled:
         self.may_go = result.converged and self._iterations < _MOST_ITERATIONS
         self.use(pose, result)
 
+    @property
+    def balanced(self) -> bool:
+        """Whether its model is that of a balance found in this step."""
+        return self.result is not None and self.result.converged
+
     def model(self) -> tuple:
         """What `use` takes to come back to the present model."""
         return self.asked, self.result
@@ -102,6 +108,11 @@ class Coupled:
             depth = (1.0 - clear) * _size(way)
             return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
         way = displacement(*pose, *start)
+        if _size(way) <= room:
+            return pose
+        share = self.instance.share_down(*start, way, room)
+        if share is not None:
+            return pose if share == 1.0 else displace(*start, share * way)
         force = (
             np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
         )
@@ -133,16 +144,17 @@ class Coupled:
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
-        damper = (self.tangent @ self.drift[:, :, None])[:, :, 0]
-        return self.push * wrench - (1.0 - self.push) * damper
+        return self.push * wrench - (1.0 - self.push) * self._held_by(self.drift)
 
     def _acting(self):
         """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
-        return self._push() - (self.tangent @ self.moved[:, :, None])[:, :, 0]
+        return self._push() - self._held_by(self.moved) + self.amiss
+
+    def _held_by(self, motion):
+        return (self.tangent @ motion[:, :, None])[:, :, 0]
 
     def _model(self, pose):
-        motion = displacement(*pose, *self.pose0)
-        return self.wrench0 - (self.tangent @ motion[:, :, None])[:, :, 0]
+        return self.wrench0 - self._held_by(displacement(*pose, *self.pose0))
 
     def let_go(self) -> None:
         """Takes the rows' stiffness away."""
@@ -160,20 +172,23 @@ class Coupled:
     def _store(self):
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
-        wrench = self._acting()
-        most = self.instance.most_energy(wrench)
-        if ends is None:
-            return most
-        jump = displacement(*self.here, *ends)
-        if _size(jump) > max(TELEPORT, _size(self.drift)):
-            return most
+        jump = None if ends is None else displacement(*self.here, *ends)
+        self._placed = jump is None or _size(jump) > max(TELEPORT, _size(self.drift))
+        if self._placed:
+            return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
-        return min(store - min((w * jump).sum() for w in (wrench, last)), most)
+        return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())
+
+    def _most(self):
+        """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
+        there before it, and what is withheld is in the skin all the same."""
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._model(self.target))))
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
-        store = self._store() - self._given()
-        store = min(store, self.instance.most_energy(self._acting()))
+        store = min(self._store() - self._given(), self._most())
+        if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
+            store = np.inf  # what was put in is not known before a balance is found
         self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
 
 

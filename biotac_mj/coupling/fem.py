@@ -20,7 +20,7 @@ from .stepper import Geom, SkinResult
 
 __all__ = ["CLEAR", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
-_WORK = 200  # of two-way skins, see SkinOptions.max_work
+_WORK = 160  # of two-way skins, see SkinOptions.max_work
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
@@ -28,6 +28,7 @@ CLEAR = 1e-3
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
+_SHORT = 5e-4  # [m] a way to the skin of which friction may know all, as it does in batches
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
@@ -128,6 +129,10 @@ class FemStepper:
         nsample = len(self._model.sample)
         return self._model.outer.area.numpy() / nsample, nsample
 
+    def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds."""
+        return self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
+
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
         contacts = self.contact_rows(state)
@@ -157,9 +162,12 @@ class FemStepper:
             return self._still(state, geom_pos, geom_mat)
         d, geoms = self._data, self._geom_set
         self._unpack(state, None if near is None else (self._part(near.state, "x"), np.ravel(geom_pos)))
-        geoms.set_pose(geom_pos, geom_mat)
         started = self._part(state, "started")[0]
-        if not started:
+        if self.resting(state) and not self._model.device.is_cuda:
+            geoms.set_pose(*self._met_at(state, geom_pos, geom_mat))
+            geoms.advance()
+        geoms.set_pose(geom_pos, geom_mat)
+        if not started and not self.resting(state):
             geoms.advance()
         if self.inertial:
             x = self._part(state, "x").reshape(-1, 3)
@@ -214,6 +222,14 @@ class FemStepper:
         """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone."""
         return self._model.device.is_cuda or self._search.clear(geom_pos, geom_mat, self._reach)
 
+    def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
+        """(ngeom,) of geoms at (ngeom, 3), (ngeom, 3, 3) from where they are too deep inside the core for any
+        skin to fit between [m]; None where it is not known."""
+        if self._model.device.is_cuda:
+            return None
+        clearance = self._search.clearance(geom_pos, geom_mat)
+        return None if clearance is None else clearance + self._options.max_core_depth
+
     @property
     def surface_energy(self) -> float:
         """The most [J] that adhesion gives to bodies that come near: its energy over the whole skin."""
@@ -229,14 +245,25 @@ class FemStepper:
 
     def _untouched(self, state, geom_pos, geom_mat):
         if (
-            not self.resting(state)
+            self.inertial
+            or self._material.remembers
             or self._model.device.is_cuda
             or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all())
         ):
             return False
-        return self._search.clear(geom_pos, geom_mat, self._reach) and not self._search.deep(
-            geom_pos, geom_mat
-        )
+        # one that is deformed and let go comes to rest: nearer than this it may bulge to the geoms
+        margin = 0.0 if self.resting(state) else _CLEAR
+        return self._search.clear(geom_pos, geom_mat, max(margin, self._reach))
+
+    def _met_at(self, state, geom_pos, geom_mat):
+        """Poses about where geoms on their way to these begin to touch the skin at rest: what they did before
+        is none of its friction's."""
+        last = self.came_to(state)
+        if self._part(state, "started")[0] and self._search.clear(*last, self._reach):
+            if np.abs(geom_pos - last[0]).max() < _SHORT:
+                return last
+            return self._search.last_clear(*last, geom_pos, geom_mat, self._reach)
+        return self._search.outside(geom_pos, geom_mat, self._reach), geom_mat
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:
@@ -281,9 +308,7 @@ class FemStepper:
             d.geom_memory(geoms.count, geoms.ngroup)[1].fill_(1)  # whose motion counts
         if self._material.remembers:
             d.memory.load(self._part(state, "memory"), d.x)
-        geoms.set_pose(
-            self._part(state, "geom_pos").reshape(-1, 3), self._part(state, "geom_mat").reshape(-1, 3, 3)
-        )
+        geoms.set_pose(*self.came_to(state))
         geoms.advance()
 
     def _pack(self, state):

@@ -8,6 +8,7 @@ import ctypes
 import dataclasses
 import functools
 import gc
+import math
 import threading
 
 import mujoco
@@ -29,14 +30,17 @@ __all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "sk
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 
-# head of the plugin state: steps that did not converge, whether the last committed step did, whether a step
-# was made since the reset, and the energy that is in the skin at most [J]
+# head of the plugin state: steps that did not converge; whether the last committed step did, or less the
+# steps in which the skin has stayed where it was; whether a step was made since the reset; and the energy
+# that is in the skin at most [J], infinite where that is not known
 _HEAD = 4
 _FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
+_PATIENCE = 3  # steps in which the skin may stay where it was, after which it begins anew
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9
 _ALONE = 1, True, 0.0, 0.0, None  # how a step went in which bodies and skin do not meet: see `concluded`
-_BISECTIONS = 6
+_FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
+_BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 
 
@@ -217,8 +221,27 @@ class Instance:
             else self.model.opt.timestep
         )
 
+    def refuse_foreign_state(self, cause: Exception | None = None) -> None:
+        """Raises ValueError for a plugin state that is none of this model: one with NaN, or, where a `cause`
+        is known that it may have led to, one without the rotations that each has."""
+        bad = not math.isfinite(self.state.sum())
+        if bad:
+            known = np.isfinite(self.state)
+            known[_ENERGY] |= self.state[_ENERGY] == np.inf
+            bad = not known.all()
+        if cause is not None and not bad:
+            turned = self.setup.parts(self.state)[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
+            bad = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) > 1e-6
+        if bad:
+            raise ValueError(
+                "the BioTac's part of plugin_state is no state of this model: call mj_resetData, or "
+                "mj_setState with a state that mj_getState gave"
+            ) from cause
+
     def forget_last_solve(self) -> None:
-        """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way."""
+        """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way or the state is
+        none."""
+        self.refuse_foreign_state()
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
@@ -270,6 +293,29 @@ class Instance:
                 else:
                     high = middle
         return low
+
+    def share_down(self, pos0: np.ndarray, mat0: np.ndarray, way: np.ndarray, room: float) -> float | None:
+        """Share of a way (ngroup, 6) of the bodies from poses at which the skin is known, on which none goes
+        deeper by more than a room [m], nor to where no skin fits; None where that is not known."""
+        stepper, least = self.setup.skin.stepper, self.setup.thickness
+        if not hasattr(stepper, "clearance"):
+            return None
+
+        def clearance(share):
+            return stepper.clearance(*self.touching.geom_pose(*displace(pos0, mat0, share * way)))
+
+        with self.setup.skin.lock:
+            known = clearance(0.0)
+            if known is None:
+                return None
+            allowed, low = np.minimum(np.maximum(np.minimum(known, least) - room, _FITS), known), 0.0
+            near = (known - allowed).min()
+            for share in np.linspace(0.0, 1.0, _LOOKS + 1)[1:]:
+                deep = (allowed - clearance(share)).max()
+                if deep > 0.0:
+                    return float(low + (share - low) * near / (near + deep))
+                low, near = share, -deep
+        return 1.0
 
     @property
     def inertial(self) -> bool:
@@ -332,20 +378,25 @@ class Instance:
 
     def _as_far_as_known(self, result, before):
         """Of a solve that found no balance: where the way to it ended, or the last step's model."""
-        if self.last_energy()[1] is None:  # the first step: its way came from outside
+        stepper = self.setup.skin.stepper
+        if result.reached > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
+            pose = self.touching.body_pose(*stepper.came_to(result.state))
+            return dataclasses.replace(result, pose=pose)
+        if self.last_energy()[1] is None:  # the first step
             return result
         wrench, tangent, *last = self.last_model()
-        if 0.0 < result.reached < 1.0:
-            way = displacement(*result.pose, *last)
-            return dataclasses.replace(result, pose=displace(*last, result.reached * way))
         state = before.copy()
+        if self.setup.parts(self.state)[0][_CONVERGED] <= -_PATIENCE:
+            stepper.reset(state)
+            if not (hasattr(stepper, "resting") and stepper.resting(state)):  # it has more to lose
+                state[:] = before
         return dataclasses.replace(
             result,
             state=state,
             wrench=wrench.copy(),
             tangent=tangent.copy(),
             pose=tuple(p.copy() for p in last),
-            vert_xpos=self.setup.skin.stepper.vert_xpos(state),
+            vert_xpos=stepper.vert_xpos(state),
         )
 
     def concluded(self, rounds: int, settled: bool, withheld: float, energy: float, ends: tuple) -> None:
@@ -447,7 +498,8 @@ class Instance:
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends = self._outcome
         good = result.converged and settled
-        head[:] = head[_FAILED] + (not good), good, 1.0, energy
+        stayed = 0.0 if result.reached else min(head[_CONVERGED], 0.0) - 1.0
+        head[:] = head[_FAILED] + (not good), good + stayed, 1.0, energy
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)

@@ -106,7 +106,16 @@ class SkinStepper(Protocol):
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2]; asked where heat counts."""
 
-    # A stepper may have the three methods below; a skin that rests then costs next to nothing.
+    def came_to(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed of a stepper whose
+        results may be short of the poses asked for."""
+
+    # A stepper may have the methods below; a skin that rests then costs next to nothing, and none is solved
+    # deeper than is known.
+
+    def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
+        """(ngeom,) of geoms at these poses from where no skin fits between them and the core [m]; None where
+        not known."""
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""

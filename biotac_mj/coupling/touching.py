@@ -28,6 +28,7 @@ _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_SDF): "mesh",  # that MuJoCo has made of it
 }
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+_HUGE = mujoco.mjMAXVAL  # [m] what MuJoCo takes in no qpos
 _noted = {}  # address of a model -> what was said of it
 
 
@@ -95,7 +96,7 @@ class Touching:
           (ngroup, 3) positions [m], (ngroup, 3, 3) rotations.
 
         Raises:
-          ValueError: a pose or a velocity is not finite.
+          ValueError: a pose or a velocity is not finite, or huge.
         """
         pos, mat = self._ahead(data, self._body, self._root, horizon)
         frame = mat[0]
@@ -123,7 +124,7 @@ class Touching:
         """Poses (ngeom, 3), (ngeom, 3, 3) of the geoms on bodies at (ngroup, 3), (ngroup, 3, 3).
 
         Raises:
-          ValueError: a pose is not finite.
+          ValueError: a pose is not finite, or huge.
         """
         self._check(pos, mat)
         owner = mat[self.group]
@@ -131,13 +132,20 @@ class Touching:
         geom_mat = owner @ self._geom_mat
         return geom_pos, geom_mat
 
+    def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
+        """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
+        first = np.unique(self.group, return_index=True)[1]
+        mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
+        return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
+
     def _check(self, pos, mat):
-        if math.isfinite(pos.sum() + mat.sum()):
+        if np.abs(pos).max(initial=0.0) < _HUGE and math.isfinite(mat.sum()):
             return
-        bad = ~np.isfinite(pos.sum(axis=1) + mat.sum(axis=(1, 2)))
+        bad = ~((np.abs(pos) < _HUGE).all(axis=1) & np.isfinite(mat.sum(axis=(1, 2))))
         names = [g.name or f"#{i}" for g, i in zip(self.geoms, self.geom) if bad[g.group]]
         raise ValueError(
-            f"NaN in the pose of the BioTac or of geom {', '.join(names)}: check mocap_pos, qpos and qvel"
+            f"NaN or a huge number in the pose of the BioTac or of geom {', '.join(names)}: "
+            "check mocap_pos, mocap_quat, qpos and qvel"
         )
 
 

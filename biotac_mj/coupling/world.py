@@ -30,6 +30,9 @@ _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
 CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
 LEAST_STEP = 0.125
+_RESETS = {
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name.upper()}")): name for name in ("qpos", "qvel", "qacc")
+}
 _TRIALS = 4  # to find how much of a skin's push it can pay for
 
 
@@ -51,12 +54,32 @@ class World:
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
-        instance = self.instances[index]
+        try:
+            self._solve(self.instances[index])
+        except Exception as error:
+            for instance in self.instances.values():
+                instance.refuse_foreign_state(error)
+            raise
+
+    def _refuse_reset(self):
+        """Raises ValueError where MuJoCo found numbers with which it does not go on, and began anew by
+        itself."""
+        now = self.data.struct
+        for warning, name in _RESETS.items() if now.time == 0.0 else ():
+            if now.warning[warning].number:
+                raise ValueError(
+                    f"NaN or a huge number in {name}, so MuJoCo has reset the simulation: check what was "
+                    "written to it, or take a smaller timestep"
+                )
+
+    def _solve(self, instance):
+        if instance.index == min(self.instances):
+            self._refuse_reset()
         if not instance.two_way:
             instance.forget_last_solve()
             core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
             instance.solve_for_pose(*instance.touching.predict(self.data, instance.horizon), core)
-        elif index == self.first:
+        elif instance.index == self.first:
             for other in self.coupled:
                 other.forget_last_solve()
             self._step()
@@ -110,8 +133,9 @@ class World:
             off = max([skin.aim(acceleration) for skin in skins])
             if off < TOLERANCE:
                 return acceleration, rounds
-            if best is None or not off >= best[0]:
-                best = off, [skin.model() for skin in skins]
+            rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
+            if best is None or not rank >= best[0]:
+                best = rank, [skin.model() for skin in skins]
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break
@@ -162,6 +186,8 @@ class World:
         if not self._damped:
             return found
         if not any(s.tangent.any() for s in skins):
+            for skin in skins:
+                skin.amiss = np.zeros_like(skin.correction)
             return self.integrator.integrated(found)
         jacobian, tangent, wrench0, correction = (
             np.concatenate([getattr(s, name) for s in skins])
@@ -175,6 +201,8 @@ class World:
             wrong = excess - correction
             poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
             if not (poor and last):  # also where the simulation has blown up: nothing is greater than nan
+                for skin, part in zip(skins, np.split(-wrong, ends)):
+                    skin.amiss = part
                 return moved
             if search is None:
                 search, slope = FixedPoint(), self.integrator.slope(jacobian, stiffness)

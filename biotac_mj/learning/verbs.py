@@ -175,9 +175,9 @@ def _evaluate(args):
         return _evaluate_set(args)
     if args.ship and not args.folder:
         raise ValueError("--ship copies what `biotac train` wrote: give its DIR, or leave it out")
-    if args.json is None and not args.folder:
+    if args.json is None:
         name = "recording" if args.electrodes else "new_sensor"
-        args.json = f"out/evaluate/{name}.json"
+        args.json = f"{args.folder}/evaluation.json" if args.folder else f"out/evaluate/{name}.json"
         check_output_file(args.json)
     if args.electrodes:
         _evaluate_recording(args)

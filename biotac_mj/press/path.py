@@ -15,6 +15,7 @@ __all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
 _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _LONGEST_STEP = 1.0  # [s]
+_FASTEST = 10.0  # [m/s]
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
 _PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
@@ -88,6 +89,10 @@ class PressOptions:
         if self.timestep > _LONGEST_STEP:
             raise ValueError(
                 f"timestep is {self.timestep:g} s: {_LONGEST_STEP:g} s at most, a longer one is no press"
+            )
+        if self.speed > _FASTEST:
+            raise ValueError(
+                f"speed is {self.speed:g} m/s: {_FASTEST:g} m/s at most, what is faster is no press"
             )
         steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
         if steps > _MOST_STEPS:

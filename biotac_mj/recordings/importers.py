@@ -117,6 +117,14 @@ def load_one(
 
 
 def _read(path, role, rate, objects) -> list[Part] | list[Recording]:
+    try:
+        return _read_any(path, role, rate, objects)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a read that fails does not say of what
+        raise
+
+
+def _read_any(path, role, rate, objects):
     if is_bag(path):
         return _named(path, read_bag(path))
     if path.is_dir():

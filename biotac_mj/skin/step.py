@@ -295,7 +295,8 @@ class SkinStep:
         n, w = m.nvert, d.nworld
         motion, touched_by, wrench = self._of_geoms
         self.M.begin_step(program)
-        given = [m.law, m.material.youngs_modulus, m.options.max_newton, g.struct, motion, st]
+        bounds = [m.options.max_newton, m.options.max_work]
+        given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
         self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._way, k.flags])
         if d.memory:
             d.memory.begin_step(program, d.dt, st.softness)
@@ -325,7 +326,7 @@ class SkinStep:
     def _go_on(self):
         """The next part of the way of the worlds that are not there."""
         d, k, st, m = self.d, self.k, self.st, self.m
-        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, st, self._again])
+        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, self._again])
         self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
@@ -374,7 +375,7 @@ class SkinStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, m.options.max_work, int(m.has_liquid)]
+        bounds = [m.options.tolerance, int(m.has_liquid)]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
 
     def _precondition(self):

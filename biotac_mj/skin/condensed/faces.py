@@ -27,22 +27,29 @@ _SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a 
 _BY = wp.constant(1e-9)  # of a difference [m]
 
 
+@wp.struct
+class Contact:
+    """What the law of contact takes of the candidate faces and of the skin."""
+
+    area: wp.array(dtype=real)
+    sample: wp.array(dtype=vec3)
+    stiffness: real
+    stick_ratio: real
+    laws: Laws
+    x: wp.array2d(dtype=vec3)
+    x_last: wp.array2d(dtype=vec3)
+    anchor_geom: wp.array2d(dtype=int)
+    anchor: wp.array2d(dtype=vec3)
+
+
 @wp.kernel
 def _touch(
     # In:
     count: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
     slot: wp.array(dtype=int),
-    area: wp.array(dtype=real),
-    sample: wp.array(dtype=vec3),
-    stiffness: real,
-    stick_ratio: real,
     geoms: Geoms,
-    laws: Laws,
-    x: wp.array2d(dtype=vec3),
-    x_last: wp.array2d(dtype=vec3),
-    anchor_geom: wp.array2d(dtype=int),
-    anchor: wp.array2d(dtype=vec3),
+    contact: Contact,
     # Out:
     corner_out: wp.array2d(dtype=vec3),
     block_out: wp.array2d(dtype=mat33),
@@ -56,6 +63,8 @@ def _touch(
 ):
     """Forces, lumped stiffness (rows summed) and whether it is touched of the count[1] nodes of the first
     count[0] faces."""
+    c = contact
+    nsample = c.sample.shape[0]
     for i in range(count[1]):
         force_out[i] = vec3()
         lumped_out[i] = mat33()
@@ -63,12 +72,13 @@ def _touch(
     for f in range(count[0]):
         t = face[f]
         touching_out[f, 0] = 0
-        for s in range(sample.shape[0]):
-            geom_out[f * sample.shape[0] + s, 0] = -1
-        if distance_from_afar(x[t[0], 0], x[t[1], 0], x[t[2], 0], 0, geoms) < real(0.0):
+        for s in range(nsample):
+            geom_out[f * nsample + s, 0] = -1
+        if distance_from_afar(c.x[t[0], 0], c.x[t[1], 0], c.x[t[2], 0], 0, geoms) < real(0.0):
             touch_face(
-                f, 0, face, area, sample, stiffness, stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
-                corner_out, block_out, touching_out, geom_out, geom_out, anchor_out, sample_force_out,
+                f, 0, face, c.area, c.sample, c.stiffness, c.stick_ratio, geoms, c.laws, c.x, c.x_last,
+                c.anchor_geom, c.anchor, corner_out, block_out, touching_out, geom_out, geom_out, anchor_out,
+                sample_force_out,
             )  # fmt: skip
         if touching_out[f, 0] == 1:
             b01 = block_out[6 * f + 1, 0]
@@ -91,21 +101,26 @@ def _touch(
                 touched_out[i] = 1
 
 
+@wp.func
+def _force(
+    s: int, t: wp.vec3i, b: vec3, by: vec3, stiffness: real, share: real, geoms: Geoms, contact: Contact
+):
+    """On sample s, with weights b in the face t, moved by a vector."""
+    c = contact
+    _t, _b, _c, force, _K, _a = touch_sample(
+        s, 0, b, t, c.x[t[0], 0] + by, c.x[t[1], 0] + by, c.x[t[2], 0] + by, stiffness,
+        stiffness * c.stick_ratio, share, c.laws, geoms, c.x_last, c.anchor_geom, c.anchor,
+    )  # fmt: skip
+    return force
+
+
 @wp.kernel
 def _differ(
     # In:
     count: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
-    area: wp.array(dtype=real),
-    sample: wp.array(dtype=vec3),
-    stiffness: real,
-    stick_ratio: real,
     geoms: Geoms,
-    laws: Laws,
-    x: wp.array2d(dtype=vec3),
-    x_last: wp.array2d(dtype=vec3),
-    anchor_geom: wp.array2d(dtype=int),
-    anchor: wp.array2d(dtype=vec3),
+    contact: Contact,
     touching: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
     # Out:
@@ -113,29 +128,23 @@ def _differ(
 ):
     """Stiffness of the faces that touch as it is, by differences of the contact itself: with what friction
     takes from the normal force and with the curvature of the geoms. It is not symmetric."""
-    nsample = sample.shape[0]
+    nsample = contact.sample.shape[0]
     for f in range(count[0]):
         if touching[f, 0] == 1:
             t = face[f]
-            share = area[f] / real(nsample)
-            k = stiffness * share
+            share = contact.area[f] / real(nsample)
+            k = contact.stiffness * share
             for c in range(6):
                 block_out[6 * f + c, 0] = mat33()
             for s in range(nsample):
                 if geom[f * nsample + s, 0] >= 0:
-                    b = sample[s]
+                    b = contact.sample[s]
                     K = mat33()
                     for axis in range(3):
                         by = vec3()
                         by[axis] = real(_BY)
-                        _t, _b, _c, ahead, _K, _a = touch_sample(
-                            f * nsample + s, 0, b, t, x[t[0], 0] + by, x[t[1], 0] + by, x[t[2], 0] + by, k,
-                            k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
-                        )  # fmt: skip
-                        _t, _b, _c, behind, _K, _a = touch_sample(
-                            f * nsample + s, 0, b, t, x[t[0], 0] - by, x[t[1], 0] - by, x[t[2], 0] - by, k,
-                            k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
-                        )  # fmt: skip
+                        ahead = _force(f * nsample + s, t, b, by, k, share, geoms, contact)
+                        behind = _force(f * nsample + s, t, b, -by, k, share, geoms, contact)
                         change = (behind - ahead) / (real(2.0) * real(_BY))
                         for row in range(3):
                             K[row, axis] = change[row]
@@ -354,18 +363,15 @@ class CandidateFaces:
         load, self._load = zeros((geoms.ngroup, 6), real)
         share, self._share = zeros((geoms.ngroup, nnode), real)
         faces, springs = [count, face, self._slot_wp], [touching, block]
-        contact = [
-            area,
-            m.sample,
-            m.contact_stiffness,
-            m.options.stick_ratio,
-            geoms.struct,
-            empty_laws("cpu"),
-        ]
-        contact += [self._x, self._last, anchor_geom, anchor]
+        contact = Contact()
+        contact.area, contact.sample, contact.laws = area, m.sample, empty_laws("cpu")
+        contact.stiffness, contact.stick_ratio = m.contact_stiffness, m.options.stick_ratio
+        contact.x, contact.x_last = self._x, self._last
+        contact.anchor_geom, contact.anchor = anchor_geom, anchor
+        law = [geoms.struct, contact]
         self.evaluate = self._record(
             _touch,
-            [*faces, *contact],
+            [*faces, *law],
             [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
         )
         self.couple = self._record(
@@ -373,7 +379,7 @@ class CandidateFaces:
             [count, face, m.sample, geoms.struct, self._x, touching, geom, sample_force],
             [block],
         )
-        self.differ = self._record(_differ, [count, face, *contact, touching, geom], [block])
+        self.differ = self._record(_differ, [count, face, *law, touching, geom], [block])
         self._multiply = self._record(_product, [*faces, *springs, p], [product])
         self._loads = self._record(
             _loads,

@@ -14,10 +14,11 @@ __all__ = ["follow"]
 _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
-_FAR = 1.0  # geoms are moved out of the skin by no more [m]
 _EFFORT = 1.5e5  # of a step, for each outer node: about 0.25 s on the coarse skin
 _SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
+_SHARE, _SHORT = 0.125, 1e-4  # of a short motion that failed at once, and [m]: the first part at least
 _FIRST = 0.4  # of the effort, that the step at once may take
+_ONE = 0.6  # of what is left, that a part may take: a shorter one takes less
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
 
@@ -28,32 +29,40 @@ def follow(
     once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
-    motion = skin.pose(memory, pos, mat)
+    motion, first = skin.pose(memory, pos, mat), 1.0
     turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
-    if np.abs(motion).max(initial=0.0) + _LEVER * turned <= _PART:
+    far = np.abs(motion).max(initial=0.0) + _LEVER * turned
+    if far <= _PART:
         effort.allow(_FIRST)
         found = skin.attempt(memory, None, pos, mat, effort, near=near)
         if found:
             return found
+        first = min(1.0, max(_SHARE, _SHORT / max(far, 1e-12)))
     deep = skin.search.deep(pos, mat)
     if skin.untouched(pos, mat):  # the skin lets go
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
+    known = None
     if memory.started:
-        out, u, blocked = _go(skin, memory, pos, mat, effort)
+        out, u, blocked = _go(skin, memory, pos, mat, effort, first)
         if deep or not blocked and out.reached > 0:
             return out, u
+        if far <= _PART and len(memory.force):
+            known = out, u
+            if effort.left < _SPENT * most:
+                return known
         effort = Effort(most / 2)
     # the way there, if there is one, leads through the core or does not begin; or nobody knows it
     out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
-    return out, u
+    # a skin that presses is not given up for one that hardly touches yet
+    return (out, u) if known is None or out.converged else known
 
 
-def _go(skin, memory, pos, mat, effort):
+def _go(skin, memory, pos, mat, effort, first=1.0):
     """From a memory to poses in parts: outcome, displacements, whether the core is in the way."""
     turn = Rotation.from_matrix(mat @ memory.geom_mat.transpose(0, 2, 1)).as_rotvec()
     move = pos - memory.geom_pos
     length = max(float((np.linalg.norm(move, axis=1) + _LEVER * np.linalg.norm(turn, axis=1)).max()), 1e-12)
-    at, part, found, blocked, iterations = 0.0, min(1.0, _PART / length), None, False, 0
+    at, part, found, blocked, iterations = 0.0, min(first, _PART / length), None, False, 0
     spent, from_pos, from_mat = _SPENT * effort.left, memory.geom_pos, memory.geom_mat
     u = None
     while at < 1:
@@ -61,7 +70,7 @@ def _go(skin, memory, pos, mat, effort):
         pose = from_pos + to * move, Rotation.from_rotvec(to * turn).as_matrix() @ from_mat
         if to > 1 - 1e-9:
             to, pose = 1.0, (pos, mat)
-        effort.allow(1.0)
+        effort.allow(_ONE)
         moved = (to - at) * length
         # symmetric stiffness comes from further away, the exact one out of where that goes round in circles
         new = skin.attempt(memory, u, *pose, effort, moved) or (
@@ -82,26 +91,6 @@ def _go(skin, memory, pos, mat, effort):
 
 
 def _outside(skin, pos, mat):
-    """Memory of the resting skin with the geoms moved out of it, each along the mean normal of what it
-    touches."""
-    out = pos.copy()
-    for g in range(len(pos)):
-        alone = np.full_like(pos, 2 * _FAR)
-
-        def touches(distance, g=g, alone=alone, normal=0.0):
-            alone[g] = pos[g] + distance * normal
-            skin.pose(Memory.rest(len(pos)), alone, mat)
-            return not skin.untouched(alone, mat)
-
-        if not touches(0.0):
-            continue
-        normal = skin.outward(pos[g], skin.search.faces(0.0, 0.0, alone, mat))
-        high = _LEAST
-        while high < _FAR and touches(high, normal=normal):
-            high *= 2
-        low = high / 2
-        while high - low > _PART:
-            middle = (low + high) / 2
-            low, high = (middle, high) if touches(middle, normal=normal) else (low, middle)
-        out[g] = pos[g] + high * normal
+    """Memory of the resting skin with the geoms moved out of it."""
+    out = skin.search.outside(pos, mat)
     return skin.at_rest(out, mat, np.zeros_like(out)).memory

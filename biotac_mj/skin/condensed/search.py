@@ -10,6 +10,7 @@ import typing
 import numpy as np
 import warp as wp
 
+from ...geometry.rigid import displace, displacement
 from ..contact.faces import Geoms
 from ..contact.shapes import distance_bound
 from ..geoms import GeomSet
@@ -24,6 +25,9 @@ wp.set_module_options({"enable_backward": False})
 
 _REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
 _REGIONS = 16
+_NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
+_EVEN = 1e-9  # of a way: finer it is not divided
+_FAR = 1.0  # [m] geoms are moved out of the skin by no more
 
 
 @wp.kernel
@@ -186,6 +190,54 @@ class NearSearch:
         self._x[:, 0] = self._rest
         return not len(self.faces(margin, 0.0, pos, mat)) and not self.deep(pos, mat)
 
+    def last_clear(
+        self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray, margin: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (ngeom, 3) [m], (ngeom, 3, 3), about the last on the way from the first ones, which are
+        `clear`, to the others."""
+        way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
+        far = np.abs(way).max(initial=0.0)
+        while (high - low) * far > _NARROW and high - low > _EVEN:
+            middle = 0.5 * (low + high)
+            clear = self.clear(*displace(pos0, mat0, middle * way), margin)
+            low, high = (middle, high) if clear else (low, middle)
+        return displace(pos0, mat0, low * way)
+
+    def outside(self, pos: np.ndarray, mat: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Positions (ngeom, 3) [m] where geoms that are in the resting skin have just left it, each along the
+        mean normal of what it touches."""
+        out = pos.copy()
+        for g in range(len(pos)):
+            alone = np.full_like(pos, 2 * _FAR)
+
+            def clear(distance, g=g, alone=alone, normal=0.0):
+                alone[g] = pos[g] + distance * normal
+                return self.clear(alone, mat, margin)
+
+            if clear(0.0):
+                continue
+            normal = self._outward(pos[g], self.faces(margin, 0.0, alone, mat))
+            high = _NARROW
+            while high < _FAR and not clear(high, normal=normal):
+                high *= 2
+            low = high / 2
+            while high - low > _NARROW:
+                middle = (low + high) / 2
+                low, high = (low, middle) if clear(middle, normal=normal) else (middle, high)
+            out[g] = pos[g] + high * normal
+        return out
+
+    def _outward(self, point, faces):
+        """Mean outward normal (3,) of outer faces (n,) at rest; without any, of the one next to
+        a point (3,)."""
+        corner = self._rest[self._model.outer.face.numpy()]
+        if not len(faces):
+            away = corner.mean(1) - point
+            faces = np.array([np.einsum("ij,ij->i", away, away).argmin()])
+        a, b, c = corner[faces].transpose(1, 0, 2)
+        total = np.cross(b - a, c - a).sum(0)
+        return total / max(np.linalg.norm(total), 1e-30)
+
     def deep(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether a geom, posed so, is deeper inside the core than `max_core_depth`."""
         if not (self._model.has_core and self._geoms.count):
@@ -196,6 +248,15 @@ class NearSearch:
             return False
         self._clearances()
         return bool(-self._clearance.min() > limit)
+
+    def clearance(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray | None:
+        """(ngeom,) of geoms at these poses from the core, negative inside it [m]; None without a core."""
+        if not (self._model.has_core and self._geoms.count):
+            return None
+        struct = self._geoms.struct
+        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+        self._clearances()
+        return self._clearance.copy()
 
     def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Raises ValueError for a geom deep inside the core."""

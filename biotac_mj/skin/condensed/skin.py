@@ -312,16 +312,6 @@ class CondensedSkin:
         self._x[:, 0] = self.rest
         return not len(self.search.faces(0.0, 0.0, pos, mat)) and not self.search.deep(pos, mat)
 
-    def outward(self, point: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Mean outward normal (3,) of outer faces (n,) at rest; without any, of the one next to
-        a point (3,)."""
-        if not len(faces):
-            away = self.rest[self._face].mean(1) - point
-            faces = np.array([np.einsum("ij,ij->i", away, away).argmin()])
-        a, b, c = (self.rest[self._face[faces, i]] for i in range(3))
-        total = np.cross(b - a, c - a).sum(0)
-        return total / max(np.linalg.norm(total), 1e-30)
-
     def pose(self, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Hands poses to the kernels; how far the geoms move there from the memory's (ngeom, 3) [m]."""
         struct = self.geoms.struct

@@ -37,6 +37,7 @@ BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
+_FIRST_PART = wp.constant(wp.float64(0.25))  # of a way that could not be gone at once
 _FAR = wp.constant(wp.float64(1e3))  # [m]
 
 
@@ -71,6 +72,7 @@ class Worlds:
     nonconverged: wp.array(dtype=int)  # steps since reset
     iterations: wp.array(dtype=int)
     limit: wp.array(dtype=int)  # of iterations, at which the present try ends
+    allowed: wp.array(dtype=int)  # work, at which it ends
     error: wp.array(dtype=real)
     best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
     since: wp.array(dtype=int)
@@ -128,8 +130,10 @@ def clear_line(st: Worlds, w: int):
 
 
 @wp.func
-def begin_try(st: Worlds, w: int, limit: int):
+def begin_try(st: Worlds, w: int, limit: int, max_work: int):
+    """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
     st.limit[w] = st.iterations[w] + limit
+    st.allowed[w] = st.work[w] + (max_work - st.work[w]) / 2
     st.since[w] = st.iterations[w]
     st.best[w] = real(1.0e300)
 
@@ -140,6 +144,7 @@ def begin_worlds(
     law: int,
     youngs_modulus: real,
     limit: int,
+    max_work: int,
     geoms: Geoms,
     motion: wp.array2d(dtype=vec3),
     st: Worlds,
@@ -206,7 +211,7 @@ def begin_worlds(
     st.inverted[w] = 0
     st.iterations[w] = 0
     st.work[w] = 0
-    begin_try(st, w, limit)
+    begin_try(st, w, limit, max_work)
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
@@ -220,7 +225,6 @@ def begin_worlds(
 def judge_balance(
     # In:
     tolerance: real,
-    max_work: int,
     has_liquid: int,
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
@@ -253,9 +257,6 @@ def judge_balance(
     if wp.abs(rz) < real(0.25) * st.best[w]:
         st.best[w] = wp.abs(rz)
         st.since[w] = st.iterations[w]
-    allowed = max_work
-    if st.stride[w] == real(0.0):  # what the first try leaves is for the way in parts
-        allowed = max_work / 3
     settled = int(1)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
@@ -264,7 +265,7 @@ def judge_balance(
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
     elif (  # what has not halved the error in so many iterations will hardly do so in the fewer left
-        st.iterations[w] - st.since[w] >= st.limit[w] - st.iterations[w] or st.work[w] >= allowed
+        st.iterations[w] - st.since[w] >= st.limit[w] - st.iterations[w] or st.work[w] >= st.allowed[w]
     ):
         st.active[w] = 0
         st.failed[w] = 1
@@ -279,8 +280,8 @@ def judge_balance(
 def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
-    The first try is the whole way from a guess, the second the whole way from where the step began, if the
-    guess was not that.
+    The first try is the whole way from a guess. Parts cost together hardly more than the whole, and what they
+    come to is not lost: so they begin short.
     """
     w = wp.tid()
     st.active[w] = 0
@@ -296,13 +297,12 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
         stride = real(2.0) * stride
     elif stride == real(0.0):
         st.reason[w] = NOT_CONVERGED
-        stride = wp.where(st.repeat[w] > real(0.0), real(1.0), real(0.5))
+        stride = _FIRST_PART
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
-            stride = real(0.5)
     else:
         stride = real(0.5) * stride
-    if stride < shortest or st.work[w] >= max_work:
+    if stride < shortest or max_work - st.work[w] < max_work / 10:
         st.asked[w] = 0
         return
     st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
@@ -311,7 +311,7 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
 
 
 @wp.kernel
-def start_part(limit: int, st: Worlds, again: wp.array(dtype=int)):
+def start_part(limit: int, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """Worlds that are asked try the next part of their way."""
     w = wp.tid()
     if w == 0:
@@ -321,7 +321,7 @@ def start_part(limit: int, st: Worlds, again: wp.array(dtype=int)):
         st.failed[w] = 0
         st.deep[w] = 0
         st.inverted[w] = 0
-        begin_try(st, w, limit)
+        begin_try(st, w, limit, max_work)
 
 
 @wp.kernel

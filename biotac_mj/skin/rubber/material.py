@@ -10,7 +10,7 @@ __all__ = ["CALIBRATED_FILL", "ELEMENTS", "PRESETS", "Material", "material"]
 
 ELEMENTS = ("linear", "quadratic")
 
-_SOFTEST, _HARDEST = 1e-3, 1e15  # [Pa]: far softer than any gel, harder than any solid
+_SOFTEST, _HARDEST = 100.0, 1e15  # [Pa]: softer than any gel, harder than any solid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Material:
 
     Attributes:
       law: "corotational", "svk", "neo_hookean" or "linear".
-      youngs_modulus: E [Pa], from 0.001 to 1e15.
+      youngs_modulus: E [Pa], from 100 to 1e15.
       poissons_ratio: nu, inside (-1, 0.5).
       friction: Coulomb coefficient against the touching geoms.
       density: [kg/m^3]; used by implicit dynamics only.
@@ -72,8 +72,8 @@ class Material:
                 raise ValueError(f"material {name} is {getattr(self, name)}: pass a finite number")
         if not (_SOFTEST <= self.youngs_modulus <= _HARDEST and self.density > 0):
             raise ValueError(
-                f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} and "
-                f"density {self.density:g} kg/m^3 positive"
+                f"Young's modulus {self.youngs_modulus:g} Pa must be from {_SOFTEST:g} to {_HARDEST:g} (give "
+                f"it in Pa: 0.65 MPa is 650000) and density {self.density:g} kg/m^3 positive"
             )
         if not -1 < self.poissons_ratio < 0.5:
             raise ValueError(
