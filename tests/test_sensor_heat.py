@@ -142,6 +142,42 @@ def test_error_halves_with_the_step():
     assert abs(run(2e-3) - exact)[0] < 1e-4
 
 
+@pytest.mark.parametrize("body", [STEEL, material_of("copper"), FOAM], ids=lambda m: m.name)
+def test_a_contact_that_trembles_is_nearly_a_still_one(body):
+    """An area that jumps by percents at every step meets the skin and the body that it left: it gives what
+    the area that is reached would give, and the same for every step's length."""
+    given = {}
+    for size in (0.0, 0.02, 0.1):
+        for dt in (4e-3, 1e-3):
+            heat, rng = Heat([body]), np.random.default_rng(0)
+            heat.force.fill_(8.0)
+            for _ in range(round(3 / dt)):
+                heat.area.fill_(4e-5 * (1 + size * rng.uniform(-1, 1)))
+                heat.advance(dt)
+            given[size, dt] = heat.state.numpy()[0, GIVEN]
+    still = given[0.0, 1e-3]
+    for size in (0.02, 0.1):
+        assert 1 < given[size, 1e-3] / still < 1 + 2 * size
+        assert given[size, 4e-3] == pytest.approx(given[size, 1e-3], rel=0.01)
+
+
+def test_a_contact_that_bounces_converges_and_is_forgotten_in_time():
+    """Let go and touched again 25 times a second, a body takes the same for every step's length; after a
+    minute without contact skin and body are as they were."""
+    given = []
+    for dt in (2e-3, 5e-4):
+        heat = Heat([STEEL])
+        for k in range(round(2 / dt)):
+            on = int(k * dt / 0.02 + 1e-6) % 2 == 0
+            state = touch(heat, 4e-5 * on, 8.0 * on, dt, 1)[0]
+        given.append(state[GIVEN])
+    assert given[0] == pytest.approx(given[1], rel=0.02)
+    parted = state[BODIES]
+    assert parted > 3e-5
+    fresh = touch(heat, 0.0, 0.0, 0.1, 600)[0]
+    assert fresh[BODIES] < 1e-9 * parted and fresh[BODIES + BODY - 1] < 1e-9 * parted
+
+
 def test_rest_is_a_fixed_point_and_warm_up_leads_to_it():
     sensor = HeatParameters()
     heat = Heat([STEEL], sensor)
