@@ -262,7 +262,7 @@ def _check(config, geometry):
     if config.stepper == "fem":
         from ..skin.condensed.refusals import refuse
         from ..skin.model import check_modulus
-        from .fem import skin_settings
+        from .fem import rest_geometry, skin_settings
 
         material, options, modulus = skin_settings(config)
         liquid = config.liquid if options.liquid is None else options.liquid
@@ -273,6 +273,8 @@ def _check(config, geometry):
             check_modulus(modulus, len(geometry.elem), f"{len(geometry.elem)} elements of {geometry.name!r}")
     if config.device != "cpu":
         _check_device(config.device)
+    if config.stepper == "fem":
+        rest_geometry(config, geometry)  # a filling that the skin has not, or does not hold
 
 
 def _check_device(name):

@@ -18,6 +18,10 @@ __all__ = ["rest_state"]
 # Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no
 # residual for later steps.
 _UNDERWAY, _ARRIVED = 1e-2, 1e-5
+# Times the unstressed cavity: all lengths are then 1.26 times theirs, no fingertip any more, and a skin at a
+# given pressure is about to balloon without bound. CHOSEN; real fillings are below 1.1.
+_MOST = 2.0
+_GENTLE = 0.02  # of Young's modulus: a rise of the pressure that skins follow in one step
 
 
 def rest_state(model: skin_model.SkinModel) -> Rest:
@@ -34,6 +38,12 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
         raise ValueError(
             f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
         )
+    most = _most_liquid(model)
+    if volume + options.fill_volume > most:
+        raise ValueError(
+            f"fill_volume {options.fill_volume:g} m^3 is more than this skin holds, which is {most - volume:g} "
+            "m^3 where the cavity is twice what it was: take less"
+        )
 
     def inflate():
         rest = _inflated(model)
@@ -41,6 +51,10 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
 
     found = kept("rest", _inputs(model), inflate)
     return Rest(found["vert"], *found["numbers"].tolist())
+
+
+def _most_liquid(model):
+    return model.liquid_volume + (_MOST - 1) * model.rest_volume
 
 
 def _inputs(model):
@@ -71,6 +85,9 @@ def _inflated(model):
     data, nothing = SkinData(bare), GeomSet([], [], device=model.device)
     liquid = data.liquid
     done, size = 0.0, 0.25
+    if options.rest_pressure:
+        size = min(size, _GENTLE * model.material.youngs_modulus / abs(options.rest_pressure))
+    least = size / 250
     while done < 1:
         size = min(size, 1 - done)
         if done + size == 1:
@@ -80,18 +97,17 @@ def _inflated(model):
         else:
             liquid.fill(volume + (done + size) * options.fill_volume)
         step(bare, data, nothing)
-        if data.converged[0]:
+        if data.converged[0] and liquid.volume[0] <= _most_liquid(model):
             done += size
+        elif data.converged[0] or size < 2 * least:
+            which = "rest_pressure" if options.rest_pressure else "fill_volume"
+            raise ValueError(
+                f"no balance of skin and liquid beyond {done:.1%} of {which} {getattr(options, which):g}: "
+                "this rubber does not hold it; take less"
+            )
         else:
             size /= 2
             bare.options = dataclasses.replace(bare.options, tolerance=_UNDERWAY)
-            if size < 1e-3:
-                which = "rest_pressure" if options.rest_pressure else "fill_volume"
-                raise ValueError(
-                    f"no balance of skin and liquid beyond {done:.0%} of {which} "
-                    f"{getattr(options, which):g}: "
-                    "this rubber does not hold it; take less"
-                )
     pressure, filled = float(liquid.gauge_pressure[0]), float(liquid.volume[0])
     natural = float(liquid.natural_volume[0])
     if options.rest_pressure:
