@@ -41,8 +41,8 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     most = _most_liquid(model)
     if volume + options.fill_volume > most:
         raise ValueError(
-            f"fill_volume {options.fill_volume:g} m^3 is more than this skin holds, which is {most - volume:g} "
-            "m^3 where the cavity is twice what it was: take less"
+            f"fill_volume {options.fill_volume:g} m^3 is more than this skin holds: take less than "
+            f"{most - volume:g} m^3, by which its cavity is {_MOST:g} times what it was"
         )
 
     def inflate():
