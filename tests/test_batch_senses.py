@@ -189,6 +189,8 @@ def test_what_cannot_be_is_refused():
         ({"readings": {"cold": True}}, "cold is of a sensor with heat"),
         ({"readings": False, "thermal": {}}, "readings is False: leave sensor"),
         ({"randomise": ["gremlins"]}, "cannot randomise 'gremlins'"),
+        ({"sensor": "phac_f0", "readings": {"sensor": "1"}}, "readings has '1': give one of them"),
+        ({"liquid": False, "options": {"skin": {"liquid": True}}}, "has True: give one of them"),
     ):
         with pytest.raises(ValueError, match=text):
             make(press_spec(), 2, coupling="one-way", **settings)

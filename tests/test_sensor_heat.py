@@ -280,7 +280,9 @@ def test_table_of_materials():
 
 def test_thermal_of_a_geom():
     assert read_thermal("steel") == STEEL and read_thermal(STEEL) is STEEL
-    assert read_thermal("steel at 40").temperature == 40.0
+    for text in ("steel at 40", "Steel AT 40", "acrylic_211 at 40", {"material": "wood at 40"}):
+        assert read_thermal(text).temperature == 40.0
+    assert read_thermal("acrylic_211") == material_of("acrylic")
     given = read_thermal({"effusivity": 570, "temperature": 5})
     assert given.effusivity == pytest.approx(570) and given.temperature == 5
     # a conductivity that materials of this effusivity have
@@ -291,6 +293,16 @@ def test_thermal_of_a_geom():
         ({"effusivity": "hot"}, "not a number"),
         ({"temperature": 20}, "give material or effusivity"),
         ({"material": "steel", "hue": 1}, "give material or effusivity"),
+        ("steel at", "give words alone"),
+        ("steel 40", "give words alone"),
+        ("steel@60", "give words alone"),
+        ("steel_at_40", "give words alone"),
+        ("steel at 40C", "not a number"),
+        ({"material": "steel at 40", "temperature": 50}, "two temperatures"),
+        ({"material": "steel", "temperature": True}, "not a number"),
+        ("steel at 1e5", "up to 4000 .no solid is hotter"),
+        ({"effusivity": 1e30}, "effusivity of a body is 1e.30: give 1 to 100000"),
+        (dataclasses.replace(STEEL, temperature=1e5), "no solid is hotter"),
     ):
         with pytest.raises(ValueError, match=why):
             read_thermal(wrong)
