@@ -152,6 +152,13 @@ FEATURES = (
             without={"skin": {"contact_law": {"adhesion": 0.1, "adhesion_range": 8e-5}}}, cells=_COULOMB),
     Feature("friction that depends on pressure", _LAW,
             skin={"contact_law": {"friction_exponent": 0.6, "friction_pressure": 3e4}}, cells=_COULOMB),
+    Feature("how well a step is solved", "`options.skin.tolerance, .max_newton, .max_cg, .max_work`",
+            skin={"tolerance": 0.1},
+            cells={"condensed": Absent("a step of the condensed tier ends at 1e-3 of the residual and has "
+                                       "limits of its own; these four are of the full tier and of the rest "
+                                       "on a filling"),
+                   "calibrate": Absent("a fit's derivatives need steps at least as good as "
+                                       "`calibration.fit.TOLERANCE`: it takes the stricter")}),
     Feature("worlds differ in material", "a Material for each world; `vary`",
             base_material={"prony": ((0.4, 0.02),)},
             worlds={"material": ({"youngs_modulus": 1.2e6}, {"youngs_modulus": 1.8e6})}, cells=_of_worlds()),
@@ -218,7 +225,7 @@ SENSES = (
     Sense("constants of the film: electrodes' radius, residual film, place of X1 to X4", "`options.film`",
           {"options": {"film": {"residual_film": 3e-4, "electrode_radius": 9e-4}}}, "electrodes", 5),
     Sense("heat: TDC, TAC and electrodes by what is touched", "`thermal=`",
-          {"thermal": {"touched": "steel at 20000"}}, "tac", 3),
+          {"thermal": {"touched": "steel at 3900"}}, "tac", 3),
     Sense("vibration: PAC by texture, slip and taps", "`textures=` (press, generate: `texture`)",
           {"textures": {"touched": {"roughness": 5e-5}}}, "pac", 10,
           cells=_NO_MODES),

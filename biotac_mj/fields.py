@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-__all__ = ["check_entries", "check_types", "refuse_unknown"]
+__all__ = ["check_entries", "check_types", "either", "refuse_unknown"]
 
 _CALLED = {
     bool: "true or false",
@@ -45,6 +45,23 @@ def check_types(settings: object, names: Iterable[str] | None = None, nan: bool 
         value = getattr(settings, field.name)
         if (names is None or field.name in names) and not (nan and isinstance(value, float)):
             _check(field.name, value, field.type)
+
+
+def either(name: str, value: object, given: object, where: str) -> object:
+    """A setting that has two places: `value` of its own argument, or what a dict `given` says of it; None is
+    nothing said.
+
+    Raises:
+      ValueError: both say something, and not the same.
+    """
+    other = given.get(name) if isinstance(given, Mapping) else None
+    if value is None or other is None:
+        return other if value is None else value
+    if repr(value) != repr(other):  # arrays have no one truth
+        raise ValueError(
+            f"{name} is {reprlib.repr(value)} and {where} has {reprlib.repr(other)}: give one of them"
+        )
+    return value
 
 
 def check_entries(what: str, given: object, wanted: Mapping[str, type], optional: Iterable = ()) -> dict:

@@ -244,6 +244,48 @@ def test_room_for_more_bodies_must_be_there():
         ),
         (FEM | dict(material={"youngs_modulus": np.nan}), r"youngs_modulus is nan"),
         (FEM | dict(tier="condensed", options={"skin": {"dynamics": "implicit"}}), r"has no inertia"),
+        (
+            FEM | dict(liquid=False, options={"skin": {"fill_volume": 1e-8}}),
+            r"fill_volume .* of the liquid, and this skin has none: turn it on",
+        ),
+        (FEM | dict(options={"skin": {"fill_volume": 1e-3}}), r"fill_volume 0.001 .*: take less than 1.75"),
+        (
+            FEM | dict(skin="coarse", options={"skin": {"rest_pressure": 1e7}}),
+            r"no balance .* of rest_pressure 1e\+07: .*; take less",
+        ),
+        (
+            FEM | dict(liquid=True, options={"skin": {"liquid": False}}),
+            r"liquid is True and options\['skin'\] has False: give one of them",
+        ),
+        (
+            FEM | dict(sensor="epfl_f1", options={"readings": {"sensor": "phac_f0"}}),
+            r"sensor is 'epfl_f1' and options\['readings'\] has 'phac_f0': give one of them",
+        ),
+        (FEM | dict(sensor={"pdc_rest": 5000}), r"pdc_rest of a sensor is 5000.0: rest counts .* 0 and 4095"),
+        (FEM | dict(sensor={"pac_rest": -5}), r"pac_rest of a sensor is -5.0: rest counts"),
+        (FEM | dict(options={"readings": {"temperature": 5e3}}), r"up to 73.96 \(TDC shows no more\)"),
+        (
+            FEM | dict(options={"film": {"electrode_radius": 1.0}}),
+            r"electrode_radius is 1.0: the electrodes would touch; pass less than 0.0014 m",
+        ),
+        (FEM | dict(options={"film": {"electrode_radius": 2e-3}}), r"the electrodes would touch"),
+        (
+            FEM | dict(options={"film": {"residual_film": 1.0}}),
+            r"residual_film is 1.0: the film at rest is nowhere thicker than 0.0024 m",
+        ),
+        (FEM | dict(thermal={"cup": []}), r"thermal is \[\]: give a material's name"),
+        (
+            FEM | dict(thermal={"cup": ["steel", "steel at"]}),
+            r"material's name is 'steel at': give words alone",
+        ),
+        (FEM | dict(textures={"cup": []}), r"texture is \[\]: give a material's name"),
+        (FEM | dict(textures={"cup": "cork at 40"}), r"material's name is 'cork at 40': give words alone"),
+        (
+            FEM | dict(textures={"cup": {"pitch": 1e-3, "height": 1.0}}),
+            r"height of a texture is 1.0: .* what is larger is shape",
+        ),
+        (FEM | dict(textures={"cup": {"pitch": 1e-9, "height": 1e-5}}), r"pitch of a texture is 1e-09"),
+        (FEM | dict(textures={"cup": {"roughness": True}}), r"roughness of a texture is True"),
     ],
 )
 def test_bad_settings_are_refused_at_once(settings, text):
@@ -253,6 +295,19 @@ def test_bad_settings_are_refused_at_once(settings, text):
     with pytest.raises((ValueError, FileNotFoundError), match=text):
         springs(spec, **settings)
     assert spec.to_xml() == before
+
+
+def test_every_seed_that_is_allowed_draws_a_sensor():
+    """Up to 2^64 - 1, each its own."""
+    seeds = (2**63, 2**63 + 1, 2**64 - 1)
+    drawn = [springs(spec_of(), **FEM | dict(sensor="random", seed=seed)).numbers for seed in seeds]
+    assert len({sensor.rest for sensor in drawn}) == 3
+
+
+def test_what_both_places_say_alike_is_taken():
+    given = {"skin": {"liquid": False}, "readings": {"sensor": "phac_f0"}}
+    handle = springs(spec_of(), **FEM | dict(liquid=False, sensor="phac_f0", options=given))
+    assert handle.numbers.pdc_rest == 1075
 
 
 def test_what_is_no_spec_is_refused():

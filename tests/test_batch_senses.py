@@ -97,7 +97,7 @@ def single(steps, **settings):
 
 # the contact with this shell is small: a hotter body than there is makes up for it
 FELT = {
-    "thermal": {"pin": {"material": "steel", "temperature": 2e4}},
+    "thermal": {"pin": {"material": "steel", "temperature": 3.9e3}},
     "textures": {"pin": {"roughness": 3e-5}},
 }
 
@@ -189,6 +189,8 @@ def test_what_cannot_be_is_refused():
         ({"readings": {"cold": True}}, "cold is of a sensor with heat"),
         ({"readings": False, "thermal": {}}, "readings is False: leave sensor"),
         ({"randomise": ["gremlins"]}, "cannot randomise 'gremlins'"),
+        ({"sensor": "phac_f0", "readings": {"sensor": "1"}}, "readings has '1': give one of them"),
+        ({"liquid": False, "options": {"skin": {"liquid": True}}}, "has True: give one of them"),
     ):
         with pytest.raises(ValueError, match=text):
             make(press_spec(), 2, coupling="one-way", **settings)

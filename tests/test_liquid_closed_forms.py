@@ -14,7 +14,7 @@ from biotac_mj.coupling.fem import FemStepper
 from biotac_mj.coupling.readings import SensorReadings
 from biotac_mj.geometry import load_skin
 from biotac_mj.press import approach
-from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, prepare_step, step
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, fill, prepare_step, step
 
 INNER, OUTER = 6e-3, 10e-3
 
@@ -323,6 +323,24 @@ def test_bulging():
 def test_bad_options(options, text):
     with pytest.raises(ValueError, match=text):
         SkinOptions(**options)
+
+
+@pytest.mark.parametrize(
+    "options, most",
+    [(dict(fill_volume=1e-3), 0), (dict(rest_pressure=1e7), 8), (dict(rest_pressure=1e12), 8)],
+)
+def test_a_filling_that_is_too_much_is_refused_soon(coarse, monkeypatch, options, most):
+    """Before the skin balloons: a volume at once, a pressure after a few steps."""
+    steps = []
+
+    def counted(*args):
+        steps.append(step(*args))
+        assert len(steps) <= most
+
+    monkeypatch.setattr(fill, "step", counted)
+    model = SkinModel(coarse, "default", SkinOptions(**options))
+    with pytest.raises(ValueError, match="take less"):
+        _ = model.rest
 
 
 def test_bad_fillings():

@@ -142,6 +142,42 @@ def test_error_halves_with_the_step():
     assert abs(run(2e-3) - exact)[0] < 1e-4
 
 
+@pytest.mark.parametrize("body", [STEEL, material_of("copper"), FOAM], ids=lambda m: m.name)
+def test_a_contact_that_trembles_is_nearly_a_still_one(body):
+    """An area that jumps by percents at every step meets the skin and the body that it left: it gives what
+    the area that is reached would give, and the same for every step's length."""
+    given = {}
+    for size in (0.0, 0.02, 0.1):
+        for dt in (4e-3, 1e-3):
+            heat, rng = Heat([body]), np.random.default_rng(0)
+            heat.force.fill_(8.0)
+            for _ in range(round(3 / dt)):
+                heat.area.fill_(4e-5 * (1 + size * rng.uniform(-1, 1)))
+                heat.advance(dt)
+            given[size, dt] = heat.state.numpy()[0, GIVEN]
+    still = given[0.0, 1e-3]
+    for size in (0.02, 0.1):
+        assert 1 < given[size, 1e-3] / still < 1 + 2 * size
+        assert given[size, 4e-3] == pytest.approx(given[size, 1e-3], rel=0.01)
+
+
+def test_a_contact_that_bounces_converges_and_is_forgotten_in_time():
+    """Let go and touched again 25 times a second, a body takes the same for every step's length; after a
+    minute without contact skin and body are as they were."""
+    given = []
+    for dt in (2e-3, 5e-4):
+        heat = Heat([STEEL])
+        for k in range(round(2 / dt)):
+            on = int(k * dt / 0.02 + 1e-6) % 2 == 0
+            state = touch(heat, 4e-5 * on, 8.0 * on, dt, 1)[0]
+        given.append(state[GIVEN])
+    assert given[0] == pytest.approx(given[1], rel=0.02)
+    parted = state[BODIES]
+    assert parted > 3e-5
+    fresh = touch(heat, 0.0, 0.0, 0.1, 600)[0]
+    assert fresh[BODIES] < 1e-9 * parted and fresh[BODIES + BODY - 1] < 1e-9 * parted
+
+
 def test_rest_is_a_fixed_point_and_warm_up_leads_to_it():
     sensor = HeatParameters()
     heat = Heat([STEEL], sensor)
@@ -244,7 +280,9 @@ def test_table_of_materials():
 
 def test_thermal_of_a_geom():
     assert read_thermal("steel") == STEEL and read_thermal(STEEL) is STEEL
-    assert read_thermal("steel at 40").temperature == 40.0
+    for text in ("steel at 40", "Steel AT 40", "acrylic_211 at 40", {"material": "wood at 40"}):
+        assert read_thermal(text).temperature == 40.0
+    assert read_thermal("acrylic_211") == material_of("acrylic")
     given = read_thermal({"effusivity": 570, "temperature": 5})
     assert given.effusivity == pytest.approx(570) and given.temperature == 5
     # a conductivity that materials of this effusivity have
@@ -255,6 +293,16 @@ def test_thermal_of_a_geom():
         ({"effusivity": "hot"}, "not a number"),
         ({"temperature": 20}, "give material or effusivity"),
         ({"material": "steel", "hue": 1}, "give material or effusivity"),
+        ("steel at", "give words alone"),
+        ("steel 40", "give words alone"),
+        ("steel@60", "give words alone"),
+        ("steel_at_40", "give words alone"),
+        ("steel at 40C", "not a number"),
+        ({"material": "steel at 40", "temperature": 50}, "two temperatures"),
+        ({"material": "steel", "temperature": True}, "not a number"),
+        ("steel at 1e5", "up to 4000 .no solid is hotter"),
+        ({"effusivity": 1e30}, "effusivity of a body is 1e.30: give 1 to 100000"),
+        (dataclasses.replace(STEEL, temperature=1e5), "no solid is hotter"),
     ):
         with pytest.raises(ValueError, match=why):
             read_thermal(wrong)

@@ -22,7 +22,7 @@ LAYERS = {
     "effects": "skin sensor geometry fields files reading",
     "coupling": "skin sensor effects geometry fields learning.serve",
     "plugin": "coupling",
-    "batch": "coupling skin sensor effects geometry learning.serve",
+    "batch": "coupling skin sensor effects geometry fields learning.serve",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",

@@ -19,6 +19,7 @@ from ..coupling.sensor_biotac import read_signal
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
+from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.materials import check_geoms, read_thermal
@@ -171,6 +172,7 @@ def attach(
         raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
+    sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects
     )
@@ -237,6 +239,7 @@ def make(
       ValueError: see `attach`.
     """
     device = str(wp.get_device(device))
+    sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects
     )
@@ -276,6 +279,8 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     chosen = materials[0] if materials else read_material(material)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     geometry = skin_reference(skin)[1]
+    options = dict(settings["options"] or {})
+    either("liquid", settings["liquid"], plain(options.get("skin")), "options['skin']")
     config = Config(
         name=prefix,
         skin=skin_reference(skin)[0],
@@ -286,7 +291,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         friction=float(mu[0]),
         priority=priority,
         device=device,
-        options=dict(settings["options"] or {}),
+        options=options,
     )
     if "readings" in config.options:
         raise ValueError("options has 'readings': pass a batch its readings=")
@@ -440,6 +445,7 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     seeds = np.atleast_1d(seed)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
         raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
+    randomise = either("randomise", randomise, choice, "readings")
     own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
     if choice is False:
         if own or thermal is not None or textures is not None:

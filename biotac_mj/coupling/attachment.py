@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from ..effects.sensors import take_sensor
+from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.channels import ELECTRODES, WIDTHS
@@ -185,6 +186,11 @@ def attach(
     _check_place(spec, site, body, prefix, pos, quat)
     from ..skin.settings import plain
 
+    told = options.get("readings") if isinstance(options, dict) else None
+    sensor, randomise = (
+        either(name, value, told, "options['readings']")
+        for name, value in (("sensor", sensor), ("randomise", randomise))
+    )
     if effects is not None:
         from ..effects.amended import Model, amend
 
@@ -202,6 +208,7 @@ def attach(
     if own and isinstance(options.get("readings", {}), dict):
         options = {**options, "readings": {**options.get("readings", {}), **own}}
     if stepper == "fem":
+        either("liquid", liquid, options.get("skin"), "options['skin']")
         liquid, friction = _material_choices(material, liquid, friction)
     config = Config(
         skin=text,
@@ -223,9 +230,9 @@ def attach(
         on_error=on_error,
         **({} if friction is None else {"friction": friction}),
     )
-    _check(config, geometry)
     check_geoms("thermal", config.thermal, read_thermal)
     check_geoms("textures", config.textures, read_texture)
+    _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
     if slots is not None:
@@ -262,7 +269,7 @@ def _check(config, geometry):
     if config.stepper == "fem":
         from ..skin.condensed.refusals import refuse
         from ..skin.model import check_modulus
-        from .fem import skin_settings
+        from .fem import rest_geometry, skin_settings
 
         material, options, modulus = skin_settings(config)
         liquid = config.liquid if options.liquid is None else options.liquid
@@ -273,6 +280,8 @@ def _check(config, geometry):
             check_modulus(modulus, len(geometry.elem), f"{len(geometry.elem)} elements of {geometry.name!r}")
     if config.device != "cpu":
         _check_device(config.device)
+    if config.stepper == "fem":
+        rest_geometry(config, geometry)  # a filling that the skin has not, or does not hold
 
 
 def _check_device(name):

@@ -11,7 +11,7 @@ from ..sensor.acquisition import Acquisition
 from ..sensor.film import FilmConduction, read_film
 from ..sensor.heat import state_size
 from ..sensor.materials import Material, read_thermal
-from ..sensor.presets import Sensor
+from ..sensor.presets import Sensor, generator
 from ..sensor.readings import PhysicsReadings, check_settings
 from ..sensor.vibration import Texture, Vibration, read_texture
 from ..sensor.vibration import state_size as vibration_size
@@ -37,7 +37,7 @@ class SensorReadings:
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
         settings = check_settings(config.options.get("readings", {}), {"cold": bool})
-        self._film = film_of(config)
+        self._film = film_of(config, geometry)
         self.sensor, self._options, _ = take_sensor(settings, config.own_seed())
         self._bodies: list[Material] | None = None
         self._textures: list[Texture] | None = None
@@ -104,24 +104,20 @@ class SensorReadings:
         return self._physics.readings(state)
 
 
-def film_of(config: Config) -> dict:
-    """Settings of the film of a BioTac, for `FilmConduction`."""
+def film_of(config: Config, geometry: SkinGeometry | None = None) -> dict:
+    """Settings of the film of a BioTac, for `FilmConduction`; see `sensor.film.read_film`."""
     radius = read_material(config.material).electrode_radius if config.stepper == "fem" else None
-    return read_film(config.options.get("film"), radius)
+    return read_film(config.options.get("film"), radius, geometry)
 
 
 def materials_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Material]:
     """Of each body, of names as `Config.thermal` has them; of a list one is drawn by the seed."""
-    return _by_body(geoms, wanted, read_thermal, "plastic", _rng(seed, 0x4EA7))
+    return _by_body(geoms, wanted, read_thermal, "plastic", generator(seed, 0x4EA7))
 
 
 def textures_of(geoms: list[Geom], wanted: dict, seed: ArrayLike = 0) -> list[Texture]:
     """Likewise, of names as `Config.textures` has them."""
-    return _by_body(geoms, wanted, read_texture, "smooth", _rng(seed, 0x7E47))
-
-
-def _rng(seed, what):
-    return np.random.default_rng([*np.atleast_1d(seed).tolist(), what])
+    return _by_body(geoms, wanted, read_texture, "smooth", generator(seed, 0x7E47))
 
 
 def _by_body(geoms, wanted, read, else_, rng):

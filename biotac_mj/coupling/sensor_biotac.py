@@ -74,7 +74,9 @@ class SensorBioTac:
 
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
-        out = {"sensor": self.sensor, "noise": self.noise, "film_every_step": self.film_every_step}
+        out = {"noise": self.noise, "film_every_step": self.film_every_step}
+        if self.sensor != "1":  # which leaves it to attach's own argument
+            out["sensor"] = self.sensor
         if self.randomise:
             out["randomise"] = self.randomise
         return out if self.weights is None else out | {"weights": str(self.weights)}

@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from ..effects.sensors import take_sensor
-from ..fields import check_types
+from ..fields import check_types, either
 from ..files import replacing
 from ..geometry import load_skin
 from ..geometry.indenters import INDENTERS
@@ -235,6 +235,8 @@ def generate(
     out = pathlib.Path(out)
     read_settings(options.material, options.options, ("film",))  # these refuse what is wrong or not there
     read_film((options.options or {}).get("film"))
+    for name in ("element", "liquid"):
+        either(name, getattr(options, name), (options.options or {}).get("skin"), "options['skin']")
     for skin in (
         {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
     ):

@@ -195,7 +195,7 @@ class Maker:
         self.geometry = load_skin(options.skin)
         chosen = {name: getattr(options, name) for name in ("element", "liquid")}
         rubber, skin, modulus = read_settings(options.material, options.options, ("film",), **chosen)
-        self.film = read_film((options.options or {}).get("film"), rubber.electrode_radius)
+        self.film = read_film((options.options or {}).get("film"), rubber.electrode_radius, self.geometry)
         self.vary = options.vary or {}
         refuse_impossible(self.vary, rubber)
         between = {name: self.vary[name] for name in NAMES if name in self.vary}

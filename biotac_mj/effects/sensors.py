@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..sensor.channels import NELECTRODE, PDC_REST
-from ..sensor.presets import Sensor, read_sensor
+from ..sensor.presets import Sensor, generator, read_sensor
 from .effect import Effect, Run
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
 from .skin_and_setup import Relaxation
@@ -156,7 +156,7 @@ def take_sensor(settings: dict, seed: ArrayLike = 0) -> tuple[Sensor, dict, bool
     """
     rest = {name: value for name, value in settings.items() if name not in ("sensor", "randomise")}
     choice, randomise = settings.get("sensor", "1"), settings.get("randomise", {})
-    rng = np.random.default_rng([*np.atleast_1d(seed).tolist(), 0xEF])
-    sensor = with_effects(read_sensor(choice, seed), draw_effects(randomise, rng))
+    effects = draw_effects(randomise, generator(seed, 0xEF))
+    sensor = with_effects(read_sensor(choice, seed), effects)
     drawn = choice == "random" or (isinstance(choice, Mapping) and choice.get("like") == "random")
     return sensor, rest, bool(drawn or randomise)

@@ -236,7 +236,9 @@ def check_force(force: np.ndarray, where: str) -> None:
         )
 
 
-def check_temperature(what: str, value: float) -> None:
-    """Raises ValueError for a temperature [C] that nothing can have."""
-    if not -_ZERO_CELSIUS < value < np.inf:
-        raise ValueError(f"{what} is {value} C: give a finite number above {-_ZERO_CELSIUS}")
+def check_temperature(what: str, value: float, most: float, why: str) -> None:
+    """Raises ValueError for a temperature [C] that nothing can have, or more than `most`: say `why`."""
+    if not -_ZERO_CELSIUS < value <= most:
+        raise ValueError(
+            f"{what} is {value} C: give a finite number above {-_ZERO_CELSIUS}, up to {most:.4g} ({why})"
+        )

@@ -26,9 +26,12 @@ import warp as wp
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from scipy.special import j1
 
 from biotac_mj.fields import check_entries, refuse_unknown
+from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor import film_kernels as kernels
@@ -101,7 +104,7 @@ class FilmConduction:
         sensor: str | None = "1",
     ):
         settings = {"residual_film": residual_film, "electrode_radius": electrode_radius}
-        _check_numbers({"conductivity": conductivity, **settings})
+        _check_numbers({"conductivity": conductivity, **settings}, geometry)
         if sensor is not None and sensor not in REST_COUNTS:
             raise ValueError(
                 f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
@@ -254,12 +257,15 @@ class FilmConduction:
         self._pair = np.nonzero((tangential < reach) & (np.abs(height) < _SLACK))
 
 
-def read_film(given: object, electrode_radius: float | None = None) -> dict:
+def read_film(
+    given: object, electrode_radius: float | None = None, geometry: SkinGeometry | None = None
+) -> dict:
     """What `options["film"]` says of the film, as settings of `FilmConduction`.
 
     Args:
       given: dict of residual_film, electrode_radius [m], excitation; None is empty.
       electrode_radius: taken where it has none [m]; None: the film's own.
+      geometry: of the skin on which the film must be possible; None leaves that to `FilmConduction`.
 
     Raises:
       ValueError: no dict, another name, or a value that cannot be.
@@ -269,15 +275,30 @@ def read_film(given: object, electrode_radius: float | None = None) -> dict:
     refuse_unknown(out, kinds, "options['film']")
     if electrode_radius is not None:
         out = {"electrode_radius": electrode_radius, **out}
-    _check_numbers({name: value for name, value in out.items() if name != "excitation"})
+    _check_numbers({name: value for name, value in out.items() if name != "excitation"}, geometry)
     _read_excitation(out.get("excitation", EXCITATION))
     return out
 
 
-def _check_numbers(given):
+def _check_numbers(given, geometry):
     for name, value in given.items():
         if not 0 < value < np.inf:
             raise ValueError(f"{name} is {value}: pass a positive number in SI units")
+    apart = 1e-3 * pdist(electrode_positions()).min() / 2
+    if given.get("electrode_radius", 0.0) >= apart:
+        raise ValueError(
+            f"electrode_radius is {given['electrode_radius']}: the electrodes would touch; pass less than "
+            f"{apart:.2g} m, half of what the nearest two are apart"
+        )
+    if geometry is None:
+        return
+    inner = geometry.vert[np.unique(geometry.inner_face)]
+    thickest = cKDTree(geometry.core_vert).query(inner)[0].max()
+    if given.get("residual_film", 0.0) >= thickest:
+        raise ValueError(
+            f"residual_film is {given['residual_film']}: the film at rest is nowhere thicker than "
+            f"{thickest:.2g} m; pass less (asperities have 2e-5 to 1e-4)"
+        )
 
 
 def _read_excitation(given):

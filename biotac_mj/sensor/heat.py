@@ -12,8 +12,10 @@ here it is a sum of `NBRANCH` relaxing stores (`half_space`), so the state is sh
 (backward Euler: stable for every time step, first order).
 
 When a contact grows, skin goes from the free column to the body's with the heat that is in it, and the body's
-new part is at the body's own temperature; when it shrinks the skin goes back and what the body had taken
-stays with the body. A body that is left altogether is forgotten: the finger comes back to a fresh place.
+new part is at the body's own temperature. When it shrinks, skin and body that have parted stay in their
+columns, insulated, and are the first to touch again: a contact that trembles meets what it left and not fresh
+skin and a fresh body at every step. Parted skin goes back to the free column in the time in which the liquid
+warms it, what a parted body had taken spreads sideways in the body's own time and is forgotten.
 
 `Heat` steps one sensor or the sensors of all worlds with the same kernel."""
 
@@ -51,14 +53,16 @@ NBRANCH = 10  # stores of a half-space
 # The state: temperatures [C] of the thermistor (and of the core about it), the core, the liquid; heat lost to
 # the air and the mount and heat given to bodies since the reset [J]; the heater's power [W]; the liquid's
 # temperature at which the electrodes show their rest, and how much warmer it is [C]; cells of the free skin,
-# inside first; then for each body the area [m^2], cells, its surface, its stores, and what it is of:
-# effusivity [W s^0.5 / (m^2 K)], temperature [C], conductivity [W/(m K)], so that a reset may change it.
+# inside first; then for each body the area [m^2] of skin that touches or parted lately, its cells, the body's
+# surface, its stores, what it is of: effusivity [W s^0.5 / (m^2 K)], temperature [C], conductivity
+# [W/(m K)], so that a reset may change it; and the area [m^2] of the body that is touched or was lately.
 THERMISTOR, CORE, LIQUID, LOST, GIVEN, POWER, REFERENCE, ABOVE, FREE = range(9)
 BODIES = FREE + NCELL
 _SURFACE, _STORE = 1 + NCELL, 2 + NCELL
 MADE = _STORE + NBRANCH
 _EFFUSIVITY, _BODY_TEMPERATURE, _BODY_CONDUCTIVITY = MADE, MADE + 1, MADE + 2
-BODY = MADE + 3
+_TAKEN = MADE + 3
+BODY = MADE + 4
 
 _LN_RATIO = 2.0  # of neighbouring rates: 1.4 % of the impedance at the worst frequency, see `half_space`
 _SLOWEST = 1e-5  # [1/s]
@@ -206,6 +210,14 @@ def contact_conductance(coefficient: real, pressure: real, rubber: real, body: r
 
 
 @wp.func
+def _touch(q: Parameters, area: real, force: real, body: real):
+    """From the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
+    pressure = force / wp.max(area, real(1.0e-12))
+    h = contact_conductance(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
+    return real(1.0) / (real(0.5 * _CELL) * q[_THICKNESS] / q[_CONDUCTIVITY] + real(1.0) / h)
+
+
+@wp.func
 def _mix(old: real, area: real, new: real, added: real):
     return (old * area + new * added) / (area + added)
 
@@ -237,29 +249,50 @@ def step_heat(
     # nothing comes round to the nail's side
     fit = wp.min(one, half * q[_AREA] / wp.max(wanted, real(1.0e-12)))
 
-    # skin changes hands: what bodies leave, then what they take
+    # what parted stays for a while, as far as the pad has room for it
+    warming = q[_CAPACITY] * q[_THICKNESS] * (one / q[_GAP] + half * q[_THICKNESS] / q[_CONDUCTIVITY])
+    late = warming / (warming + dt)
+    parted = real(0.0)
+    for g in range(ngroup):
+        parted += late * wp.max(state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0))
+    room = wp.max(half * q[_AREA] - fit * wanted, real(0.0))
+    late *= wp.min(one, room / wp.max(parted, real(1.0e-12)))
+
+    # skin and bodies change hands: what columns leave, then what they take
     free = q[_AREA]
     for g in range(ngroup):
         free -= state[w, BODIES + BODY * g]
     for g in range(ngroup):
         b = BODIES + BODY * g
-        left = state[w, b] - fit * wp.max(area[w, g], real(0.0))
+        touched = fit * wp.max(area[w, g], real(0.0))
+        left = (one - late) * (state[w, b] - touched)
         if left > real(0.0):
             for i in range(NCELL):
                 state[w, FREE + i] = _mix(state[w, FREE + i], free, state[w, b + 1 + i], left)
             free += left
             state[w, b] -= left
+        # a spot of radius r spreads over a disc twice as large in r^2 / 4 D, D = (k / e)^2
+        taken = state[w, b + _TAKEN]
+        ratio = state[w, b + _EFFUSIVITY] / state[w, b + _BODY_CONDUCTIVITY]
+        if taken > touched:
+            time = taken * ratio * ratio / real(4.0 * math.pi)
+            state[w, b + _TAKEN] = touched + (taken - touched) * time / (time + dt)
     for g in range(ngroup):
         b = BODIES + BODY * g
+        touched = fit * wp.max(area[w, g], real(0.0))
         had = state[w, b]
-        added = fit * wp.max(area[w, g], real(0.0)) - had
+        added = touched - had
         if added > real(0.0):
             for i in range(NCELL):
                 state[w, b + 1 + i] = _mix(state[w, b + 1 + i], had, state[w, FREE + i], added)
+            free -= added
+            state[w, b] = touched
+        had = state[w, b + _TAKEN]
+        added = touched - had
+        if added > real(0.0):
             for i in range(_SURFACE, MADE):
                 state[w, b + i] = _mix(state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added)
-            free -= added
-            state[w, b] += added
+            state[w, b + _TAKEN] = touched
 
     # free skin, from the air inwards
     outside = one / (half / layer + one / q[_AIR])
@@ -277,7 +310,7 @@ def step_heat(
     liquid_known = free * known
     liquid_pull = free * pull
 
-    # skin on bodies
+    # skin on bodies: what flows through the touching area is shared by all of a column
     near_known = real(0.0)
     near_pull = real(0.0)
     press = one / (half / layer + one / q[_FILM])
@@ -286,9 +319,10 @@ def step_heat(
         patch = state[w, b]
         if patch > real(0.0):
             effusivity = state[w, b + _EFFUSIVITY]
-            k_body = state[w, b + _BODY_CONDUCTIVITY]
-            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], k_body)
-            touch = one / (half / layer + one / h)
+            touched = fit * wp.max(area[w, g], real(0.0))
+            share = wp.min(touched / patch, one)
+            touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
+            onto = touch * touched / wp.max(state[w, b + _TAKEN], real(1.0e-30))
             known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
             pull = effusivity * real(_SLOW)
             for i in range(NBRANCH):
@@ -297,14 +331,14 @@ def step_heat(
                 pull += c
             at = b + _SURFACE
             hold = effusivity * real(_FAST) / dt
-            total = hold + pull + touch
+            total = hold + pull + onto
             state[w, at] = (hold * state[w, at] + known) / total
-            scratch[w, at] = touch / total
-            known = touch * state[w, at]
-            pull = touch - touch * scratch[w, at]
+            scratch[w, at] = onto / total
+            known = share * touch * state[w, at]
+            pull = share * touch * (one - scratch[w, at])
             for k in range(NCELL):
                 i = b + NCELL - k
-                inner = wp.where(k == NCELL - 1, press, layer)
+                inner = wp.where(k == NCELL - 1, share * press, layer)
                 total = store + pull + inner
                 state[w, i] = (store * state[w, i] + known) / total
                 scratch[w, i] = inner / total
@@ -355,9 +389,9 @@ def step_heat(
                 a = dt * _rates[i]
                 at = b + _STORE + i
                 state[w, at] = (state[w, at] + a * t) / (one + a)
-            k_body = state[w, b + _BODY_CONDUCTIVITY]
-            h = contact_conductance(q[_CONTACT], force[w, g] / patch, q[_CONDUCTIVITY], k_body)
-            given += patch * (inside - t) / (half / layer + one / h)
+            touched = fit * wp.max(area[w, g], real(0.0))
+            touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
+            given += touched * touch * (inside - t)
     state[w, LOST] += dt * lost
     state[w, GIVEN] += dt * given
 
@@ -421,7 +455,7 @@ class Heat:
         state = self.state.numpy()
         made = [[(b.effusivity, b.temperature, b.conductivity) for b in row] for row in bodies]
         patches = state[:, BODIES:].reshape(self.nworld, self.ngroup, BODY)
-        patches[:, :, MADE:] = np.array(made, float).reshape(self.nworld, self.ngroup, 3)
+        patches[:, :, MADE:_TAKEN] = np.array(made, float).reshape(self.nworld, self.ngroup, 3)
         self.state.assign(state)
 
     def advance(self, dt: float) -> None:

@@ -19,11 +19,15 @@ __all__ = [
     "Material",
     "check_choices",
     "check_geoms",
+    "material_named",
     "material_of",
     "read_thermal",
 ]
 
 ROOM, SKIN = 23.0, 33.0  # [C] of things that lie about, of a living hand
+# What `read_thermal` takes: from below gases (air has 5.5 and 0.026) to above diamond (6e4 and 2300)
+_EFFUSIVITY, _CONDUCTIVITY_RANGE = (1.0, 1e5), (1e-3, 1e4)
+_HOTTEST = 4000.0  # [C] above every solid: hafnium carbonitride melts last, at about that
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,6 +209,19 @@ def material_of(name: str) -> Material:
     )
 
 
+def material_named(name: str) -> Material:
+    """`material_of` what a user wrote: of a temperature in it nothing would be heard.
+
+    Raises:
+      ValueError: no word is known, or the name has a number or an "at" ("acrylic_211" is a file's name).
+    """
+    if re.search(r"[\d@°]|(?<![a-z])at(?![a-z])", re.sub(r"_\d+", "", name.lower())):
+        raise ValueError(
+            f"a material's name is {name!r}: give words alone, to thermal also 'steel at 40' [C]"
+        )
+    return material_of(name)
+
+
 def check_choices(value: object, read: Callable) -> None:
     """Raises ValueError for what of a value, or of one of a list of choices, `read` cannot read."""
     for one in value if isinstance(value, (list, tuple)) and value else [value]:
@@ -224,17 +241,17 @@ def read_thermal(value: str | Material | Mapping) -> Material:
 
     Args:
       value: a name for `material_of`, "name at 40" for another temperature [C], a `Material`, or a dict with
-        any of: material (a name), effusivity [W s^0.5 / (m^2 K)], conductivity [W/(m K)], temperature [C].
+        any of: material (such a name), effusivity [W s^0.5 / (m^2 K)], conductivity [W/(m K)], temperature
+        [C].
         An effusivity without a conductivity takes the one that materials of the table tend to have with it.
 
     Raises:
       ValueError: an unknown name or key, or a number that cannot be.
     """
     if isinstance(value, Material):
-        return value
+        return _checked(value)
     if isinstance(value, str):
-        name, _, temperature = value.partition(" at ")
-        value = {"material": name} | ({"temperature": temperature} if temperature else {})
+        value = {"material": value}
     if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
         raise ValueError(f"thermal is {reprlib.repr(value)}: give a material's name, or a dict of numbers")
     unknown = set(value) - {"material", "effusivity", "conductivity", "temperature"}
@@ -243,8 +260,15 @@ def read_thermal(value: str | Material | Mapping) -> Material:
             f"thermal has {', '.join(map(repr, value)) or 'nothing'}: give material or effusivity, and "
             "conductivity and temperature if need be"
         )
+    if "material" in value:
+        name, *at = re.split(r"\s+at\s+", value["material"], maxsplit=1, flags=re.IGNORECASE)
+        if at and "temperature" in value:
+            raise ValueError(f"thermal {dict(value)!r} has two temperatures: leave one of them out")
+        value = {**value, "material": name} | ({"temperature": at[0]} if at else {})
     try:
         numbers = {key: float(value[key]) for key in value if key != "material"}
+        if any(isinstance(value[key], bool) for key in numbers):
+            raise TypeError
     except (TypeError, ValueError):
         raise ValueError(f"thermal {dict(value)!r} holds something that is not a number") from None
     if not all(math.isfinite(x) for x in numbers.values()) or any(
@@ -253,15 +277,26 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         raise ValueError(
             f"thermal {dict(value)!r}: effusivity and conductivity must be positive, temperature finite"
         )
-    check_temperature("temperature of a body", numbers.get("temperature", ROOM))
-    material = material_of(value["material"]) if "material" in value else None
+    material = material_named(value["material"]) if "material" in value else None
     temperature = numbers.get("temperature", material.temperature if material else ROOM)
     if not {"effusivity", "conductivity"} & set(numbers):
-        return dataclasses.replace(material, temperature=temperature)
+        return _checked(dataclasses.replace(material, temperature=temperature))
     e = numbers.get("effusivity") or material.effusivity
     slope, intercept = _CONDUCTIVITY
     k = numbers.get("conductivity") or max(
         math.exp(slope * math.log(e) + intercept), MATERIALS["air"].conductivity
     )
     # heat meets density and specific heat only as their product
-    return Material("as given", k, 1000.0, e * e / k / 1000.0, "as given", temperature)
+    return _checked(Material("as given", k, 1000.0, e * e / k / 1000.0, "as given", temperature))
+
+
+def _checked(material):
+    """The material; refuses one that there is not."""
+    check_temperature("temperature of a body", material.temperature, _HOTTEST, "no solid is hotter")
+    for name, (least, most) in (("effusivity", _EFFUSIVITY), ("conductivity", _CONDUCTIVITY_RANGE)):
+        value = getattr(material, name)
+        if not least <= value <= most:
+            raise ValueError(
+                f"{name} of a body is {value:g}: give {least:g} to {most:g} in SI units (air to diamond)"
+            )
+    return material

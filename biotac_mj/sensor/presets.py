@@ -6,6 +6,7 @@ channel leaves that channel's default. Whoever names a sensor says `sensor=` a n
 dict of fields of `Sensor` ("like": the name of another one); `read_sensor` reads it."""
 
 import dataclasses
+import reprlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -39,6 +40,7 @@ __all__ = [
     "SENSORS",
     "Sensor",
     "draw_sensor",
+    "generator",
     "read_sensor",
 ]
 
@@ -122,7 +124,13 @@ class Sensor:
             plain = number.tolist()
             plain = tuple(map(tuple, plain)) if number.ndim == 2 else tuple(plain) if wanted else plain
             object.__setattr__(self, field.name, plain)
-        rests = np.array([*self.rest, self.tdc_rest])
+        for name in ("rest", "pdc_rest", "pac_rest", "tdc_rest", "tac_rest"):
+            counts = np.array(getattr(self, name))
+            if not ((counts > 0) & (counts < FULL_SCALE)).all():
+                raise ValueError(
+                    f"{name} of a sensor is {reprlib.repr(getattr(self, name))}: rest counts of 12 bits lie "
+                    f"between 0 and {FULL_SCALE:g}"
+                )
         least = [
             *(self.noise or ()),
             self.pdc_noise,
@@ -131,8 +139,8 @@ class Sensor:
             self.tac_noise,
             self.loss,
         ]
-        if not ((rests > 0) & (rests < FULL_SCALE)).all() or not 0 <= self.pac_colour < 1:
-            raise ValueError("rest counts of a sensor lie between 0 and 4095, pac_colour between 0 and 1")
+        if not 0 <= self.pac_colour < 1:
+            raise ValueError(f"pac_colour of a sensor is {self.pac_colour}: give 0 or more, less than 1")
         if min(least) < 0 or min(self.warm_time, self.relaxation[1]) <= 0:
             raise ValueError("noise and loss of a sensor are not negative, and its times are positive [s]")
         share, knee = self.saturation
@@ -266,6 +274,11 @@ def draw_sensor(rng: np.random.Generator) -> Sensor:
     return Sensor(**out)
 
 
+def generator(seed: ArrayLike, what: int) -> np.random.Generator:
+    """Draws `what` of a sensor: whole numbers up to 2^64 - 1, one or several, are its seed."""
+    return np.random.default_rng([*map(int, np.ravel(np.asarray(seed, object))), what])
+
+
 def read_sensor(value: str | Sensor | Mapping, seed: ArrayLike = 0) -> Sensor:
     """A sensor of what a user says.
 
@@ -291,5 +304,5 @@ def read_sensor(value: str | Sensor | Mapping, seed: ArrayLike = 0) -> Sensor:
             f"sensor is {value!r}: pass one of {', '.join(map(repr, NAMES))}, or a dict of numbers"
         )
     if value == "random":
-        return draw_sensor(np.random.default_rng([*np.atleast_1d(seed).tolist(), 0x5E]))
+        return draw_sensor(generator(seed, 0x5E))
     return SENSORS[value]

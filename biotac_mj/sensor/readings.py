@@ -8,7 +8,7 @@ import numpy as np
 from biotac_mj.fields import check_entries, refuse_unknown
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
-from biotac_mj.sensor.channels import check_temperature
+from biotac_mj.sensor.channels import FULL_SCALE, check_temperature, temperature_from_counts
 from biotac_mj.sensor.film import FilmConduction, NoFilmError
 from biotac_mj.sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
 from biotac_mj.sensor.materials import Material
@@ -200,7 +200,8 @@ def check_settings(given: dict, more: dict | None = None, what: str = "options['
     check_entries(what, given, known, known)
     refuse_unknown(given, known, what)
     read_sensor(given.get("sensor", "1"))
-    check_temperature("temperature", given.get("temperature", 0.0))
+    hottest = float(temperature_from_counts(FULL_SCALE))
+    check_temperature("temperature", given.get("temperature", 0.0), hottest, "TDC shows no more")
     return given
 
 

@@ -26,7 +26,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.acquisition import SLOT_RATE, draw_normal, slots_until
-from biotac_mj.sensor.materials import material_of
+from biotac_mj.sensor.materials import material_named
 
 __all__ = [
     "LOSS_FACTOR",
@@ -62,6 +62,8 @@ _FILTER = 4  # numbers of the band-pass, behind the modes in the state
 # of a body: phase; what makes the waves, waves and grain, over their RMS; speed; its texture: pitch, height,
 # roughness [m], so that a reset may change it; then the gains
 _BODY, _SPEED, _TEXTURE = 8, 4, 5
+# [m] what the contact's tangent bears: what is higher or longer is shape, shorter pitches average out
+_RANGE = {"pitch": (1e-6, 0.1), "height": (0.0, 1e-3), "roughness": (0.0, 1e-3)}
 _KEY = 0x1E3779B97F4A7C15  # by which the seeds of the roughness differ from the noise's
 
 
@@ -102,16 +104,20 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
     out = {}
     name = value.pop("material", "smooth")
     if name != "smooth":
-        found = material_of(name).name
+        found = material_named(name).name
         if found not in ROUGHNESS:
             raise ValueError(
                 f"no roughness is known of {name!r}: choose smooth, {', '.join(ROUGHNESS)}, or give roughness"
             )
         out["roughness"] = ROUGHNESS[found]
     for key, number in value.items():
-        good = isinstance(number, (int, float)) and math.isfinite(number) and number >= 0
-        if not good or (key == "pitch" and number == 0):
-            raise ValueError(f"{key} of a texture is {number!r}: give a positive number of metres")
+        least, most = _RANGE[key]
+        good = isinstance(number, (int, float)) and not isinstance(number, bool)
+        if not (good and least <= number <= most):
+            raise ValueError(
+                f"{key} of a texture is {number!r}: give a positive number of metres, {least:g} to {most:g}; "
+                "what is larger is shape, of the geom"
+            )
         out[key] = float(number)
     return Texture(**out)
 

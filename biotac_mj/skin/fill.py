@@ -17,6 +17,10 @@ __all__ = ["rest_state", "rest_worlds"]
 # Nothing touches, so these are fractions of the smallest load there is, 1e-12 J. The last is what leaves no
 # residual for later steps.
 _UNDERWAY, _ARRIVED = 1e-2, 1e-5
+# Times the unstressed cavity: all lengths are then 1.26 times theirs, no fingertip any more, and a skin at a
+# given pressure is about to balloon without bound. CHOSEN; real fillings are below 1.1.
+_MOST = 2.0
+_GENTLE = 0.02  # of Young's modulus: a rise of the pressure that skins follow in one step
 
 
 def rest_state(model: skin_model.SkinModel) -> Rest:
@@ -33,6 +37,7 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
         raise ValueError(
             f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
         )
+    _refuse_too_much(model, options.fill_volume)
 
     def inflate():
         return dataclasses.asdict(_inflated(model))
@@ -40,6 +45,19 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     found = kept("rest", _inputs(model), inflate)
     numbers = (float(found[name][0]) for name in ("pressure", "volume", "natural_volume"))
     return Rest(found["vert"][0], *numbers)
+
+
+def _refuse_too_much(model, fill):
+    room = _most_liquid(model) - model.liquid_volume
+    if fill > room:
+        raise ValueError(
+            f"fill_volume {fill:g} m^3 is more than this skin holds: take less than {room:g} m^3, by which "
+            f"its cavity is {_MOST:g} times what it was"
+        )
+
+
+def _most_liquid(model):
+    return model.liquid_volume + (_MOST - 1) * model.rest_volume
 
 
 def _inputs(model):
@@ -69,6 +87,7 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
     filled = options.fill_volume or options.rest_pressure
     if not extra.any() and (not filled or (same and (bulk == options.bulk_modulus).all())):
         return
+    _refuse_too_much(model, options.fill_volume + extra.max())
     worlds = [
         (m, float(k), float(v), b"" if modulus is None else modulus[w].tobytes())
         for w, (m, k, v) in enumerate(zip(materials, bulk, extra, strict=True))
@@ -112,7 +131,8 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     natural = np.full(len(relaxed), volume + more)
     if target:
         pump = lambda s: liquid.keep_pressure(s * target * (K > 0))  # noqa: E731
-        _go(bare, data, nothing, f"rest_pressure {target:g}", pump)
+        gentle = _GENTLE * min(m.youngs_modulus for m in materials) / abs(target)
+        _go(bare, data, nothing, f"rest_pressure {target:g}", pump, min(0.25, gentle))
         held = np.isfinite(K) & (K > 0)
         natural = data.volume / np.where(held, 1 - liquid.gauge_pressure / np.where(held, K, 1.0), 1.0)
     elif more:
@@ -127,25 +147,25 @@ def _relaxed(material):
     return dataclasses.replace(material, prony=(), mullins=None, hysteresis=())
 
 
-def _go(bare, data, nothing, what, put):
-    """Puts liquid in, put(share), step by step."""
-    done, size = 0.0, 0.25
-    options = bare.options
+def _go(bare, data, nothing, what, put, size=0.25):
+    """Puts liquid in, put(share), in steps of `size` or less."""
+    options, done, least = bare.options, 0.0, size / 250
     while done < 1:
         size = min(size, 1 - done)
         tolerance = _ARRIVED if done + size == 1 else _UNDERWAY
         bare.options = dataclasses.replace(options, tolerance=tolerance)
         put(done + size)
         step(bare, data, nothing)
-        if data.converged.all():
+        converged = data.converged.all()
+        if converged and (data.volume <= _most_liquid(bare)).all():
             done += size
+        elif converged or size < 2 * least:
+            raise ValueError(
+                f"no balance of skin and liquid beyond {done:.1%} of {what}: this rubber does not hold it; "
+                "take less"
+            )
         else:
             size /= 2
-            if size < 1e-3:
-                raise ValueError(
-                    f"no balance of skin and liquid beyond {done:.0%} of {what}: this rubber does not hold "
-                    "it; take less"
-                )
 
 
 skin_model.solve_rest = rest_state

@@ -65,7 +65,8 @@ class SkinOptions:
         law. On the full tier.
       mass_damping, stiffness_damping: Rayleigh damping of implicit dynamics [1/s], [s].
       tolerance: a step has converged when the energy norm of its error, estimated with the tangent, is below
-        this fraction of the energy norm of the load.
+        this fraction of the energy norm of the load. This and the next three are of the full tier: steps of
+        the condensed one end at 1e-3, with limits of their own.
       max_newton, max_cg: iteration limits of a try and of each linear solve.
       max_work: evaluations of all forces and products with their tangent in a step, some 80 in a contact;
         then the step goes no further than it has come.
