@@ -337,15 +337,16 @@ def test_all_objects_take_turns():
 def test_readings_follow_a_ramp():
     time = np.arange(6) * 0.05
     impedance, pressure = np.outer(5e3 * (1 + 20 * time), np.ones(19)), 2e4 * time
-    counts = sample(time, impedance, pressure, seed=3)
+    counts, pac = sample(time, impedance, pressure, seed=3)
+    assert pac.shape == (len(time), 22) and (pac[:, -1] == counts[:, 20]).all()
     # what stands there was sampled within the last frame of 10 ms; five standard deviations of noise
     earliest = counts_from_impedance(np.outer(5e3 * (1 + 20 * (time - 0.0101)), np.ones(19)))
     assert (counts[1:, :19] < earliest[1:] + 33).all() and (
         counts[1:, :19] > counts_from_impedance(impedance)[1:] - 33
     ).all()
     assert np.abs(counts[1:, 19] - counts_from_pressure(pressure - 100)[1:]).max() < 3 + 5
-    np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3), counts)
-    assert (sample(time, impedance, pressure, seed=4) != counts).any()
+    np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3)[0], counts)
+    assert (sample(time, impedance, pressure, seed=4)[0] != counts).any()
 
 
 @pytest.mark.slow

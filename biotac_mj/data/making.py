@@ -314,8 +314,10 @@ class Maker:
                 }
                 columns["converged"] &= fields.converged[k] & ~read.failed
             if batch.measured:
+                counts, pac = running.labels[k].result()
                 columns |= {
-                    "measured_counts": running.labels[k].result(),
+                    "measured_counts": counts,
+                    "measured_pac": pac,
                     "measured_wrench": running.answer.wrench[k],
                 }
                 columns["converged"] &= running.answer.converged[k]
