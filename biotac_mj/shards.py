@@ -183,7 +183,7 @@ def _on_ray(work, tasks, folder, say, address, cpus, gpus):
             try:
                 error, results, files, lines = ray.get(ref)
             except ray.exceptions.RayError as failed:
-                cause = str(failed).splitlines()[0]
+                cause = str(failed).strip().splitlines()[-1].strip()
                 raise RuntimeError(f"a task on {address} was lost ({cause}): {_AGAIN}") from None
             if error:
                 raise error[0](error[1])

@@ -181,6 +181,9 @@ def test_a_small_set_is_physics(small, skin):
             assert np.abs(one.counts[:, 19] - counts_from_pressure(one.pressure)).max() < 8
             assert (one.counts == np.rint(one.counts)).all()
             assert (one.measured_counts is not None) == one.labelled == bool(data.labelled[i])
+            if one.labelled:
+                assert one.measured_pac.shape == (8, 22) and np.ptp(one.measured_pac) > 0
+                assert (one.measured_pac[1:, -1] == one.measured_counts[1:, 20]).all()
 
 
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
