@@ -8,22 +8,27 @@ mildly wrong base model.
 Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed (a hash of the truth stands in
 its record); run again, it goes on where it stopped. Beside the verdicts stand the answers of rivals
 (`discrepancy_rivals`).
+`--jobs N` shares the cases among N processes, `--ray ADDRESS` among the machines of a Ray cluster
+(docs/cluster.md).
 Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the
-catalogue, for calibration. Counts are for each effect with single and left-out, else for the kind. Kernels
-are compiled and fields of the plans solved before the work is shared out."""
+catalogue, for calibration. Counts are for each effect with single and left-out, else for the kind. Fields
+of the plans are solved before the cases are shared out."""
 
 import argparse
 import functools
 import hashlib
 import json
-import multiprocessing
 import pathlib
 import time
 
 import numpy as np
+import tqdm
 from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator, plan
 from discrepancy_rivals import cells, f1, rivals
 from discrepancy_table import confusion, table
+
+from biotac_mj.arguments import add_ray
+from biotac_mj.shards import Task, run_tasks
 
 SEEDS = {"development": 0, "practice": 10_000, "blind": 1_400_000}
 KINDS = ("none", "single", "outside", "pair", "wrong-base", "left-out")
@@ -116,15 +121,33 @@ def comparable(name, size) -> dict:
 
 
 class Worker:
-    """One process: its simulator, generators, and the fields of the plans."""
+    """Work of `shards.run_tasks`, its simulator, generators, and the fields of the plans. A task is the
+    number of a plan, whose result is it and its fields, or a case, whose result is its record."""
 
-    def __init__(self, args):
+    def __init__(self, args, fields=None):
+        self.args, self.generators, self.fields = args, {}, fields or {}
+
+    def __call__(self, values, folder, say):
+        if not hasattr(self, "sim"):
+            self._begin()
+        for value in values:
+            if isinstance(value, int):
+                yield value, self.fields_of(value)
+                say(1)
+                continue
+            try:
+                yield self.run(value)
+            except Exception as error:  # one bad case must not end the run: it is tried again next time
+                yield {"case": value["case"], "error": f"{type(error).__name__}: {error}"}
+            say(1)
+
+    def _begin(self):
         import warp as wp
 
         wp.config.quiet = True
         from biotac_mj.discrepancy import Simulator
 
-        self.args, self.generators, self.fields = args, {}, {}
+        args = self.args
         self.plans = [plan(SEEDS[args.seeds] + 5 + k, args.trajectories) for k in range(args.plans)]
         self.sim = Simulator(cache=args.cache, tier=args.tier, device=args.device)
 
@@ -245,25 +268,6 @@ class Worker:
         return out
 
 
-_worker = None
-
-
-def _begin(args):
-    global _worker
-    _worker = Worker(args)
-
-
-def _solve(k):
-    _worker.fields_of(k)
-
-
-def _one(case):
-    try:
-        return _worker.run(case)
-    except Exception as error:  # one bad case must not end the run: it is reported and tried again next time
-        return {"case": case["case"], "error": f"{type(error).__name__}: {error}"}
-
-
 def _write(path, rows):
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
@@ -280,6 +284,7 @@ def main(argv=None):
     args.add_argument("--counts", type=_counts, default=dict.fromkeys(KINDS[:5], 1), metavar="KIND=N,...")
     args.add_argument("--seeds", choices=SEEDS, default="development")
     args.add_argument("--jobs", type=int, default=1, help="processes")
+    add_ray(args)
     args.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th on")
     args.add_argument("--plans", type=int, default=4, help="sets of trajectories, taken in turn")
     args.add_argument("--trajectories", type=int, default=16)
@@ -313,17 +318,15 @@ def main(argv=None):
     print(f"code {code_hash()}, {len(todo)} cases to do", flush=True)
     if todo:
         began = time.time()
-        _begin(args)  # compiles kernels and fills the first plan's cache before anybody else needs them
-        _solve(0)
-        for skin in sorted({c["settings"]["skin"] for c in todo}):
-            _worker.generator(skin)
+        where = dict(ray=args.ray, gpus=int(args.device != "cpu"))
         if args.jobs > 1:
-            with multiprocessing.get_context("spawn").Pool(args.jobs, _begin, (args,)) as pool:
-                pool.map(_solve, range(args.plans), chunksize=1)
-                print(f"fields there after {time.time() - began:.0f} s", flush=True)
-                _collect(pool.imap_unordered(_one, todo, chunksize=1), rows, path)
-        else:
-            _collect(map(_one, todo), rows, path)
+            where["processes"] = {f"process {k}": {} for k in range(args.jobs)}
+        args.cache = str(pathlib.Path(args.cache).resolve())
+        plans = sorted({case["plan"] for case in todo})
+        # each plan's skin is solved once, before the cases that all need it are shared out
+        fields = dict(run_tasks(Worker(args), map(Task, plans), ".", "fields", "plan", **where))
+        print(f"fields there after {time.time() - began:.0f} s", flush=True)
+        _collect(run_tasks(Worker(args, fields), map(Task, todo), ".", "cases", "case", **where), rows, path)
     rows = [r for r in rows if (r["seeds"], r["tier"], r["code"]) == (args.seeds, args.tier, code_hash())]
     print(table(rows))
     if args.figure:
@@ -333,16 +336,17 @@ def main(argv=None):
 def _collect(results, rows, path):
     for row in results:
         if "error" in row:
-            print(f"FAILED {row['case']}: {row['error']}", flush=True)
+            tqdm.tqdm.write(f"FAILED {row['case']}: {row['error']}")
             continue
         rows.append(row)
         _write(path, rows)
-        print(
+        tqdm.tqdm.write(
             f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:110]} | "
-            + ", ".join(f"{k}: {' '.join(a['named'][:3])}" for k, a in row["answers"].items() if k != "ours"),
-            flush=True,
+            + ", ".join(f"{k}: {' '.join(a['named'][:3])}" for k, a in row["answers"].items() if k != "ours")
         )
 
 
 if __name__ == "__main__":
-    main()
+    import discrepancy
+
+    discrepancy.main()  # so that other processes find what they are sent by its module's name

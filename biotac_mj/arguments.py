@@ -7,7 +7,17 @@ from collections.abc import Callable
 
 from .files import check_output, check_output_file
 
-__all__ = ["SEED", "Parser", "check_device", "device", "output_file", "output_folder", "real", "whole"]
+__all__ = [
+    "SEED",
+    "Parser",
+    "add_ray",
+    "check_device",
+    "device",
+    "output_file",
+    "output_folder",
+    "real",
+    "whole",
+]
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,6 +61,15 @@ def device(text: str) -> str:
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?(,cuda:\d{1,3})*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no device: give cpu, or cuda:0")
     return text
+
+
+def add_ray(parser: argparse.ArgumentParser) -> None:
+    """Adds --ray."""
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="of a Ray cluster that shares the work (docs/cluster.md); local: several processes here",
+    )
 
 
 def check_device(names: str) -> None:

@@ -7,7 +7,7 @@ import os
 import sys
 import traceback
 
-from .arguments import SEED, Parser, check_device, device, output_file, output_folder, real, whole
+from .arguments import SEED, Parser, add_ray, check_device, device, output_file, output_folder, real, whole
 from .files import check_output_file
 
 __all__ = ["main", "parser"]
@@ -614,13 +614,15 @@ def _add_generate(verbs):
         metavar="DIR",
         help="folder of the set",
     )
+    add_ray(verb)
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _generate(args):
     from .data import verbs
 
-    check_device(args.device)
+    if args.ray is None:  # a cluster has its own devices
+        check_device(args.device)
     verbs.generate_verb(args)
 
 

@@ -237,8 +237,7 @@ _READINGS = (
      "`--effects`. Effects of the set-up are left out by name"),
     ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
-     "and the LeRobot export of all three; `readings.csv` of a press has the latest, of the synthetic "
-     "measured sensor too"),
+     "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "learned", or a file that `biotac evaluate --save` wrote',
      "attach, condensed, batch (`readings={\"signal\": ...}`), tasks (`SensorBioTac`); press, generate and "
      "diagnose: by physics alone"),

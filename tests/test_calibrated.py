@@ -64,7 +64,7 @@ def by_batch(material, options):
 
 
 def by_generate(material, options):
-    maker = Maker("", GenerateOptions(count=1, labelled=0, skin=SKIN, material=material, options=options), {})
+    maker = Maker(GenerateOptions(count=1, labelled=0, skin=SKIN, material=material, options=options), {})
     return FilmConduction(maker.geometry, **maker.film), maker.model.material
 
 

@@ -25,6 +25,7 @@ from biotac_mj.press import approach
 from biotac_mj.press.indenter import add_indenter, make_indenter
 from biotac_mj.sensor.channels import counts_from_impedance, counts_from_pressure
 from biotac_mj.sensor.film import FilmConduction
+from biotac_mj.shards import Task, one_per_gpu, run_tasks
 from biotac_mj.skin import SkinModel, SkinOptions
 
 SMALL = GenerateOptions(
@@ -180,6 +181,9 @@ def test_a_small_set_is_physics(small, skin):
             assert np.abs(one.counts[:, 19] - counts_from_pressure(one.pressure)).max() < 8
             assert (one.counts == np.rint(one.counts)).all()
             assert (one.measured_counts is not None) == one.labelled == bool(data.labelled[i])
+            if one.labelled:
+                assert one.measured_pac.shape == (8, 22) and np.ptp(one.measured_pac) > 0
+                assert (one.measured_pac[1:, -1] == one.measured_counts[1:, 20]).all()
 
 
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
@@ -251,20 +255,19 @@ def test_processes_of_several_devices_make_the_same_set(small, tmp_path, monkeyp
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     with TactileSet(out) as data:
         settings = data.attributes["settings"]
-    two = dataclasses.replace(SMALL, device="cuda:0,cuda:1")
-    done, told = [], []
-    seconds = making._make_on_all(
-        tmp_path, two, settings, batches(two), 0, done.append, told.append, seen="cpu"
-    )
-    assert sum(done) == 8 * 4 and seconds["skin"] > 0 and os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
-    assert len(told) == 3 and "shard-00000.h5: 1 worlds" in "".join(told)
+    processes = one_per_gpu(["cuda:0", "cuda:1"])
+    assert processes == {f"cuda:{k}": {"CUDA_VISIBLE_DEVICES": name} for k, name in enumerate("35")}
+
+    def make(options, folder):
+        work = making.MakeShards(options, settings, "cpu", 0)
+        return list(run_tasks(work, map(Task, batches(options)), folder, processes=processes, progress=False))
+
+    spent = make(SMALL, tmp_path)
+    assert sum(one["skin"] for one in spent) > 0 and os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
     for path in out.glob("shard-*.h5"):
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
     with pytest.raises(ValueError, match=r"cuda:\d: unknown material"):
-        bad = dataclasses.replace(two, material="jelly")
-        making._make_on_all(
-            tmp_path / "bad", bad, settings, batches(bad), 0, done.append, told.append, seen="cpu"
-        )
+        make(dataclasses.replace(SMALL, material="jelly"), tmp_path / "bad")
 
 
 @pytest.mark.slow
@@ -337,15 +340,16 @@ def test_all_objects_take_turns():
 def test_readings_follow_a_ramp():
     time = np.arange(6) * 0.05
     impedance, pressure = np.outer(5e3 * (1 + 20 * time), np.ones(19)), 2e4 * time
-    counts = sample(time, impedance, pressure, seed=3)
+    counts, pac = sample(time, impedance, pressure, seed=3)
+    assert pac.shape == (len(time), 22) and (pac[:, -1] == counts[:, 20]).all()
     # what stands there was sampled within the last frame of 10 ms; five standard deviations of noise
     earliest = counts_from_impedance(np.outer(5e3 * (1 + 20 * (time - 0.0101)), np.ones(19)))
     assert (counts[1:, :19] < earliest[1:] + 33).all() and (
         counts[1:, :19] > counts_from_impedance(impedance)[1:] - 33
     ).all()
     assert np.abs(counts[1:, 19] - counts_from_pressure(pressure - 100)[1:]).max() < 3 + 5
-    np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3), counts)
-    assert (sample(time, impedance, pressure, seed=4) != counts).any()
+    np.testing.assert_array_equal(sample(time, impedance, pressure, seed=3)[0], counts)
+    assert (sample(time, impedance, pressure, seed=4)[0] != counts).any()
 
 
 @pytest.mark.slow
@@ -452,9 +456,9 @@ def test_what_cannot_vary_is_refused():
         ({"poissons_ratio": [0.3, 0.6]}, "Poisson's ratio 0.6 is outside"),
     ):
         with pytest.raises(ValueError, match=match):
-            making.Maker("", GenerateOptions(skin="coarse", labelled=0, vary=vary), {})
+            making.Maker(GenerateOptions(skin="coarse", labelled=0, vary=vary), {})
     options = GenerateOptions(skin="coarse", material={"prony": [[0.3, 0.1]]}, tier="condensed", labelled=0)
     with pytest.raises(
         ValueError, match="the condensed tier is elastic, the same everywhere: leave prony out"
     ):
-        making.Maker("", options, {})
+        making.Maker(options, {})

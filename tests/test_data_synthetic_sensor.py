@@ -1,6 +1,7 @@
 """The synthetic measured sensor: conduction in three dimensions, drift, relaxation, noise, and that the
 simulator leaves it alone."""
 
+import dataclasses
 import pathlib
 
 import numpy as np
@@ -9,12 +10,10 @@ from scipy.integrate import solve_ivp
 
 import biotac_mj
 from biotac_mj.data.liquid_conduction import LiquidConduction, column_tetrahedra
-from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, relax
+from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, Waves, relax
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.channels import (
-    REST_COUNTS,
     counts_from_impedance,
-    electrode_noise,
     impedance_from_counts,
 )
 from biotac_mj.sensor.film import EXCITATION, FilmConduction
@@ -34,7 +33,9 @@ def liquid(skin):
 
 @pytest.fixture(scope="module")
 def meter(skin):
-    return Meter(SensorVariation.draw(0), skin, skin.vert, 0)
+    drawn = SensorVariation.draw(0)
+    warming = dataclasses.replace(drawn.sensor, warm_up=5.0)
+    return Meter(dataclasses.replace(drawn, sensor=warming), skin, skin.vert, 0)
 
 
 def dent(skin, depth, x=-9.5e-3, width=2.5e-3):
@@ -158,7 +159,7 @@ def test_drift_is_one_gain_for_all_electrodes(meter, skin):
     start = np.array([0.0, 60.0, 300.0, 2000.0])
     log_z = np.array(
         [
-            np.log(impedance_from_counts(meter.measure(still, time, np.zeros(8), s, seed=1)[0, :19]))
+            np.log(impedance_from_counts(meter.measure(still, time, np.zeros(8), s, seed=1)[0][0, :19]))
             for s in start
         ]
     )
@@ -167,37 +168,59 @@ def test_drift_is_one_gain_for_all_electrodes(meter, skin):
     assert np.abs(each).max() < 0.004  # noise of a mean of 50 frames
     v = meter.variation
     temperature = meter.temperature(start)
-    np.testing.assert_allclose(change.mean(1), -0.07 * (temperature - temperature[0]), atol=0.003)
-    assert -0.5 < change.mean(1)[-1] < -0.15
+    np.testing.assert_allclose(change.mean(1), -0.071 * (temperature - temperature[0]), atol=0.003)
     # what the warm-up alone does
-    assert abs((temperature[-1] - temperature[0]) * -0.07 - v.drift) < 0.07 * 4 * v.ambient
+    assert abs(temperature[-1] - temperature[0] - 5.0) < 4 * v.ambient
 
 
 def test_noise_is_that_of_a_real_sensor(meter, skin):
     time = 0.011 * np.arange(400)
-    counts = meter.measure(np.repeat(skin.vert[None], 400, 0), time, np.zeros(400), 5000.0, seed=7)[1:, :19]
+    still = np.repeat(skin.vert[None], 400, 0)
+    counts, pac = meter.measure(still, time, np.zeros(400), 5000.0, seed=7)
+    assert pac.shape == (400, 22) and (pac[1:, -1] == counts[1:, 20]).all()
+    counts = counts[1:, :19]
     spread = np.diff(counts, axis=0).std(0) / np.sqrt(2)  # differences: slow drift leaves them alone
-    np.testing.assert_allclose(spread, electrode_noise(counts.mean(0)), rtol=0.25)
+    expected = np.hypot(meter.variation.sensor.electrode_noise(counts.mean(0)), 0.29)  # and rounding
+    np.testing.assert_allclose(spread, expected, rtol=0.25)
     assert (counts == np.rint(counts)).all()
 
 
-def test_sensors_differ_as_published_ones_do():
-    patterns = np.log([impedance_from_counts(SensorVariation.draw(k).rest_counts) for k in range(40)])
-    published = np.log([impedance_from_counts(c) for c in REST_COUNTS.values()])
-    assert np.abs(patterns.mean(0) - published.mean(0)).max() < 0.2
-    assert 0.5 < patterns.mean(1).std() / published.mean(1).std(ddof=1) < 1.5
-    assert (
-        SensorVariation.draw(3).youngs_modulus
-        == SensorVariation.draw(3).youngs_modulus
-        != SensorVariation.draw(4).youngs_modulus
-    )
-    counts = counts_from_impedance(np.exp(patterns))
-    assert counts.min() > 1000 and counts.max() < 4000
+def test_sensors_differ_as_measured_ones_do():
+    drawn = [SensorVariation.draw(k) for k in range(40)]
+    modulus = np.array([v.youngs_modulus for v in drawn])
+    fill = np.array([v.rest_pressure for v in drawn]) / modulus
+    assert 0.47e6 < modulus.min() < 0.6e6 and 1.2e6 < modulus.max() < 1.36e6
+    assert fill.min() < 0.002 and 0.017 < fill.max() < 0.0194
+    gain = np.array([np.diag(v.mixing) for v in drawn])
+    assert 0.2 < np.log(gain[np.isfinite(np.log(gain))]).std() < 0.4
+    film = np.array([v.film for v in drawn])
+    assert 20e-6 < film.min() < 30e-6 and 70e-6 < film.max() < 100e-6
+    assert SensorVariation.draw(3).youngs_modulus == modulus[3] != modulus[4]
+
+
+def test_a_relief_is_smooth_and_of_its_size():
+    waves = Waves((1, 2), 0.2e-3, 2e-3)
+    at = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * 20e-3
+    value = waves(at)
+    assert abs(value.mean()) < 0.02e-3 and abs(value.std() - 0.2e-3) < 0.03e-3
+    far = value[:, None] * np.stack([waves(at + [d, 0, 0]) for d in (0.2e-3, 2e-3, 8e-3)], 1)
+    near, one, beyond = far.mean(0) / value.var()
+    assert near > 0.98 and abs(one - np.exp(-0.5)) < 0.15 and abs(beyond) < 0.35
+
+
+def test_changes_are_mixed_and_the_liquid_is_thicker_where_the_relief_says(skin):
+    plain = LiquidConduction(skin, EXCITATION)
+    raised = LiquidConduction(skin, EXCITATION, relief=lambda at: np.full(len(at), 0.2e-3))
+    gap = plain.gap(skin.vert)
+    n = len(gap)
+    thick = [np.linalg.norm(one.nodes(gap)[-n:] - one.core_point, axis=1) for one in (plain, raised)]
+    np.testing.assert_allclose(thick[1], np.maximum(gap + 0.2e-3, raised.residual_film), atol=1e-9)
+    assert (raised.impedance(skin.vert) < plain.impedance(skin.vert)).all()
 
 
 def test_rest_reads_the_rest_counts(meter, skin):
     got = counts_from_impedance(meter.impedance(skin.vert[None])[0])
-    np.testing.assert_allclose(got, meter.variation.rest_counts, rtol=1e-9)
+    np.testing.assert_allclose(got, meter.variation.sensor.rest, rtol=1e-9)
 
 
 def test_simulator_does_not_use_it():

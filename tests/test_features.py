@@ -231,7 +231,7 @@ def by_generate(material, options, file, worlds=None):
         count=2, labelled=0, steps=len(TIP), rate=1 / DT, skin=file, material=material, options=options,
         vary=vary or None, tier="full",
     )  # fmt: skip
-    maker = Maker("", chosen, {})
+    maker = Maker(chosen, {})
     skins = None, {}
     if vary:
         *skins, drawn = draw_worlds(vary, maker.model.material, [[0, i, 2] for i in (2, 3)])

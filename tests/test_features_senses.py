@@ -132,7 +132,7 @@ def walked(file, tier, shaken):
     chosen = GenerateOptions(
         count=1, labelled=0, steps=N, rate=1 / DT, skin=file, tier=tier, material=MATERIAL, texture=texture
     )
-    maker = Maker("", chosen, {})
+    maker = Maker(chosen, {})
     motion = Motion("walk", {}, WAY, np.tile(np.eye(3), (N, 1, 1)))
     walk = simulate if tier == "full" else simulate_condensed
     tool = f"geom:sphere:{RADIUS}"

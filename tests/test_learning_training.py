@@ -22,10 +22,12 @@ from biotac_mj.learning.patch import contact_patch  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
+from biotac_mj.learning.training import experiment  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import train_all  # noqa: E402
 from biotac_mj.learning.training.few_shot import adapt, evaluate_new_sensor  # noqa: E402
+from biotac_mj.learning.training.fitting import Watch  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
@@ -106,6 +108,39 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
     for name, changes in (("models", same | {"only": None}), ("limit", same | {"limit": 9})):
         with pytest.raises(ValueError, match=rf"json is of other settings \({name}\): choose another --out"):
             train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
+
+
+def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
+    count, steps = Watch.count, []
+
+    def counted(self, n, seconds=0.0):
+        count(self, n, seconds)
+        steps.append(n)
+        if len(steps) == 400:  # within the second network, between two of its states that are kept
+            raise KeyboardInterrupt
+
+    same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
+    monkeypatch.setattr(experiment, "_step_time", lambda *_: 0.0)  # its steps are not these
+    monkeypatch.setattr(Watch, "count", counted)
+    with pytest.raises(KeyboardInterrupt):
+        train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
+    (kept,) = tmp_path.glob("unfinished-*")
+    assert len(list(kept.iterdir())) == 4
+    train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
+    done = steps[400:]
+    # three whole trainings, and the fourth up to a state that was kept
+    assert max(done) == 120 and done[:3] == [120, 120, 120] and 0 < done[3] < 120
+    for name in ("trajectory-0.npz", "forward-trajectory.safetensors", "inverse-trajectory.safetensors"):
+        assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
+    assert not kept.exists()
+
+
+def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, capsys):
+    train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False, only=("pod_log",))
+    said, bar = capsys.readouterr()
+    assert "80 interactions" in said and "minutes on one core" in said
+    total = 120 * (1 + 1 + 2 + 1)  # the head, both inverses
+    assert f"0/{total}" in bar and (tmp_path / "trajectory-0.json").is_file()
 
 
 @pytest.mark.slow

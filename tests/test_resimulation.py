@@ -81,6 +81,17 @@ def test_poses_come_back_through_sensor_and_mount(truth):
         biotac_poses(still, MOUNT)
 
 
+@pytest.mark.slow
+def test_processes_of_ray_make_the_same_set(truth, tmp_path):
+    pytest.importorskip("ray")
+    recording = truth[0]
+    options = ResimulateOptions(object="sphere_7mm", mount=MOUNT, skin="coarse", batch=1)
+    for out, ray in (("here", None), ("ray", "local")):
+        assert resimulate(recording, tmp_path / out, options, 0, False, ray).made == 2
+    for path in (tmp_path / "here").glob("shard-*.h5"):
+        assert path.read_bytes() == (tmp_path / "ray" / path.name).read_bytes()
+
+
 def test_a_recording_becomes_a_labelled_set_and_goes_on(truth, tmp_path, capsys):
     recording, _, _, fields = truth
     write(tmp_path / "rec.h5", [recording])

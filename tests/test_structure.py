@@ -12,6 +12,7 @@ LAYERS = {
     "fields": "",
     "files": "",
     "reading": "",
+    "shards": "files versions",
     "threads": "",
     "versions": "biotac_mj",
     "geometry": "files reading",
@@ -26,14 +27,14 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",
-    "data": "recordings geometry skin sensor effects fields files reading versions press.approach "
+    "data": "recordings geometry skin sensor effects fields files reading shards versions press.approach "
     "press.indenter press.path",
     "tasks": "coupling plugin batch sensor effects geometry files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
-    "learning": "arguments recordings data sensor effects geometry fields files reading",
+    "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
-    "resimulation": "arguments matching data recordings skin sensor geometry files",
+    "resimulation": "arguments matching data recordings skin sensor geometry files shards",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

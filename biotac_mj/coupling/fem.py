@@ -252,7 +252,7 @@ class FemStepper:
         ):
             return False
         # one that is deformed and let go comes to rest: nearer than this it may bulge to the geoms
-        margin = 0.0 if self.resting(state) else _CLEAR
+        margin = 0.0 if self.resting(state) else CLEAR
         return self._search.clear(geom_pos, geom_mat, max(margin, self._reach))
 
     def _met_at(self, state, geom_pos, geom_mat):

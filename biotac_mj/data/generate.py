@@ -217,6 +217,7 @@ def generate(
     options: GenerateOptions = GenerateOptions(),
     workers: int | None = None,
     progress: bool = True,
+    ray: str | None = None,
 ) -> Report:  # noqa: B008 - frozen
     """Makes a set in folder `out`, or what is missing of it.
 
@@ -225,6 +226,8 @@ def generate(
       options: see GenerateOptions.
       workers: processes for film and readings; None takes the cores there are, 0 this process.
       progress: whether to show a bar.
+      ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for each batch, of one core, one GPU
+        where the device is one, and `workers` cores (none: 0).
 
     Raises:
       ValueError: the folder holds a set with other options, or an option is not possible.
@@ -247,9 +250,11 @@ def generate(
     settings = json.loads(json.dumps(settings))
     todo = [batch for batch in batches(options) if not made_already(out / batch.path, settings)]
     begin = time.perf_counter()
+    if workers is None and ray is not None:
+        workers = 0
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
-    seconds = make_shards(out, options, settings, todo, workers, progress) if todo else {}
+    seconds = make_shards(out, options, settings, todo, workers, progress, ray) if todo else {}
     seconds["all"] = time.perf_counter() - begin
     with TactileSet(out) as data:
         report = Report(

@@ -7,6 +7,8 @@ liquid along them), and the potential is solved with scikit-fem. The mesh is mad
 core along fixed directions and end where they meet the skin, wherever it is, so no tetrahedron turns over
 when the skin slides over the electrodes or is pressed onto the core."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
@@ -39,7 +41,9 @@ class LiquidConduction:
       excitation: (4, 2) x [m] and angle from the pad's midline [rad] of X1..X4, which are shorted and
         grounded.
       conductivity: of the liquid [S/m].
-      residual_film: liquid that stays where the skin lies on the core [m].
+      residual_film: liquid that stays where the skin lies on the core [m]; a function of places (n, 3) [m]
+        on the core gives (n,).
+      relief: by how much the liquid is thicker than the geometry says, a function like that; None: by none.
 
     Attributes:
       core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's
@@ -55,7 +59,8 @@ class LiquidConduction:
         geometry: SkinGeometry,
         excitation: np.ndarray,
         conductivity: float = 0.4,
-        residual_film: float = 4e-5,
+        residual_film: float | Callable[[np.ndarray], np.ndarray] = 4e-5,
+        relief: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
         self.geometry, self.conductivity, self.residual_film = geometry, conductivity, residual_film
         self._layers = _LAYERS
@@ -87,6 +92,8 @@ class LiquidConduction:
                 f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
                 "move the electrode"
             )
+        self._floor = residual_film(self.core_point) if callable(residual_film) else residual_film
+        self._relief = 0.0 if relief is None else relief(self.core_point)
         self._pair = self._near(np.arange(len(keep)))
         self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
         self._elem = np.ascontiguousarray(self.elem.T)
@@ -125,7 +132,7 @@ class LiquidConduction:
 
     def nodes(self, gap: np.ndarray) -> np.ndarray:
         """(4 n, 3) nodes of the columns [m] for thicknesses gap (n,) [m]."""
-        film = np.maximum(gap, self.residual_film)
+        film = np.maximum(gap + self._relief, self._floor)
         return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
 
     def gap(self, vert_xpos: np.ndarray, rest: bool = False) -> np.ndarray:

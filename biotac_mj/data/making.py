@@ -1,45 +1,47 @@
 """The pipeline behind `biotac generate`: while workers read one batch, the next one is planned and simulated.
 
 With several GPUs there is one such pipeline in a process for each; they take the batches one after another.
+On a Ray cluster each batch is a task.
 """
 
 import dataclasses
 import gc
-import multiprocessing
-import os
 import pathlib
 import platform
-import queue
-import signal
 import time
-import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
-import tqdm
 
 from ..geometry.rigid import quaternion
+from ..shards import Task, one_per_gpu, run_tasks
 from .plan import plan_motions
 from .schema import DISPLACEMENT_SCALE, Interaction
 from .splits import assign
 from .store import write_shard
 from .vary import draw_sense, draw_worlds, refuse_impossible
 
-__all__ = ["Maker", "make_shards"]
+__all__ = ["MakeShards", "Maker", "make_shards"]
 
-_VISIBLE = "CUDA_VISIBLE_DEVICES"
+_STAGES = ("start", "plan", "skin", "measured skin", "waiting for readings")
 _AHEAD = 4  # batches that wait for their readings at most: they lie in memory
 
 
 def make_shards(
-    out: pathlib.Path, options: Any, settings: dict, todo: Iterable, workers: int, progress: bool
+    out: pathlib.Path,
+    options: Any,
+    settings: dict,
+    todo: Iterable,
+    workers: int,
+    progress: bool,
+    ray: str | None = None,
 ) -> dict:
-    """Makes the shards of batches `todo` in folder `out`, on all of the options' devices.
+    """Makes the shards of batches `todo` in folder `out`, on all of the options' devices, or on a cluster.
 
     Args:
-      settings: kept with every shard. workers: processes for film and readings, shared by the devices.
-        progress: whether to show a bar.
+      settings: kept with every shard. workers: processes for film and readings, shared by the devices; on Ray
+        those of each task. progress: whether to show a bar. ray: see `shards.run_tasks`.
 
     Returns:
       seconds of each stage, of all devices together.
@@ -48,95 +50,45 @@ def make_shards(
       ValueError: an option is not possible.
       RuntimeError: a device's process failed; the text is its error.
     """
-    total = options.steps * sum(len(batch.members) * (batch.simulated + batch.measured) for batch in todo)
-    with tqdm.tqdm(total=total, desc="generate", unit="step", disable=not progress, leave=False) as bar:
-
-        def tell(text):
-            if progress:
-                bar.write(text)
-
-        if len(options.devices) == 1:
-            maker = Maker(out, options, settings, options.device, bar.update, tell)
-            maker.run(iter(todo), workers)
-            return maker.seconds
-        return _make_on_all(out, options, settings, todo, workers, bar.update, tell)
-
-
-def _make_on_all(out, options, settings, todo, workers, update, tell, seen="cuda:0"):
-    """A process for each device, in which it is the only one and called `seen`; what they tell comes through
-    one queue."""
-    context = multiprocessing.get_context("spawn")
-    batches, news = context.Queue(), context.Queue()
-    heavy_first = sorted(todo, key=lambda batch: not batch.measured)
-    for batch in [*heavy_first, *[None] * len(options.devices)]:
-        batches.put(batch)
-    share = -(-workers // len(options.devices))
-    visible = os.environ.get(_VISIBLE)
-    names = visible.split(",") if visible else None
-    running, seconds = {}, {}
-    try:
-        for device in options.devices:
-            number = int(device.split(":")[1])
-            os.environ[_VISIBLE] = names[number] if names else str(number)
-            args = (out, options, settings, seen, batches, news, share, device)
-            running[device] = context.Process(target=_make_on_one, args=args)
-            running[device].start()
-        while running:
-            try:
-                device, what, value = news.get(timeout=2.0)
-            except queue.Empty:
-                gone = [
-                    f"{d} (exit code {p.exitcode})" for d, p in running.items() if p.exitcode not in (None, 0)
-                ]
-                if gone:
-                    raise RuntimeError(
-                        f"the process of {', '.join(gone)} ended: "
-                        "run the command again, what is there is kept"
-                    ) from None
-                continue
-            if what == "step":
-                update(value)
-            elif what == "text":
-                tell(f"{device}: {value}")
-            elif what == "error":
-                raise (ValueError if value[0] == "ValueError" else RuntimeError)(f"{device}: {value[1]}")
-            else:
-                running.pop(device).join()
-                seconds = {name: seconds.get(name, 0) + s for name, s in value.items()}
-    finally:
-        os.environ.pop(_VISIBLE, None)
-        if visible is not None:
-            os.environ[_VISIBLE] = visible
-        for process in running.values():
-            process.terminate()
+    cuda, several = options.devices[0] != "cpu", len(options.devices) > 1
+    alone = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
+    share = workers if ray is not None else -(-workers // len(options.devices))
+    steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
+    tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
+    if several or ray is not None:
+        tasks.sort(key=lambda task: not task.value.measured)  # what takes long first
+    work = MakeShards(options, settings, "cuda:0" if alone else options.device, share)
+    seconds = {}
+    for spent in run_tasks(
+        work,
+        tasks,
+        out,
+        "generate",
+        "step",
+        ray,
+        one_per_gpu(options.devices) if several else None,
+        cpus=max(1, share),
+        gpus=int(cuda),
+        progress=progress,
+    ):
+        seconds = {name: seconds.get(name, 0) + value for name, value in spent.items()}
     return seconds
 
 
-def _make_on_one(out, options, settings, device, batches, news, workers, name):
-    """What the process of one device does."""
-    signal.signal(signal.SIGTERM, _leave)
-    try:
-        maker = Maker(
-            out,
-            options,
-            settings,
-            device,
-            lambda n: news.put((name, "step", n)),
-            lambda text: news.put((name, "text", text)),
-        )
-        maker.run(iter(batches.get, None), workers)
-        news.put((name, "end", maker.seconds))
-    except ValueError as error:
-        news.put((name, "error", ("ValueError", str(error))))
-    except Exception:
-        news.put((name, "error", ("RuntimeError", traceback.format_exc())))
+@dataclasses.dataclass
+class MakeShards:
+    """Work of `shards.run_tasks`: shards of batches, made on a device of Warp with that many worker
+    processes; a result is the seconds that went into each stage."""
 
+    options: Any
+    settings: dict
+    device: str
+    workers: int
 
-def _leave(*_):
-    """A process that is told to stop takes its workers with it."""
-    for child in multiprocessing.active_children():
-        child.terminate()
-    os._exit(1)
+    def __call__(self, values: Iterable, folder: pathlib.Path, say: Callable) -> Iterator[dict]:
+        if not hasattr(self, "_maker"):
+            self._maker = Maker(self.options, self.settings, self.device)
+        return self._maker.run(values, folder, self.workers, say)
 
 
 @dataclasses.dataclass
@@ -158,24 +110,14 @@ class Maker:
     """Makes shards on one device.
 
     Args:
-      out: folder of the set.
       options: GenerateOptions. settings: what of them is kept with every shard.
       device: of Warp.
-      update: called with time steps done. tell: called with a line on each batch.
 
     Attributes:
-      seconds: of each stage. film: settings of the skin's FilmConduction.
+      film: settings of the skin's FilmConduction.
     """
 
-    def __init__(
-        self,
-        out: pathlib.Path,
-        options: Any,
-        settings: dict,
-        device: str = "cpu",
-        update: Callable[[int], object] = lambda n: None,
-        tell: Callable[[str], object] = lambda text: None,
-    ):
+    def __init__(self, options: Any, settings: dict, device: str = "cpu"):
         from ..geometry import load_skin
         from ..sensor.film import read_film
         from ..skin import SkinModel
@@ -183,14 +125,7 @@ class Maker:
         from ..skin.per_world import NAMES, make_room
         from ..skin.settings import read_settings
 
-        self.out, self.options, self.update, self.tell = out, options, update, tell
-        self.seconds = {
-            "start": 0.0,
-            "plan": 0.0,
-            "skin": 0.0,
-            "measured skin": 0.0,
-            "waiting for readings": 0.0,
-        }
+        self.options, self.seconds = options, dict.fromkeys(_STAGES, 0.0)
         clock = time.perf_counter()
         self.geometry = load_skin(options.skin)
         chosen = {name: getattr(options, name) for name in ("element", "liquid")}
@@ -239,8 +174,11 @@ class Maker:
             self._rest = dataclasses.replace(self.geometry, vert=model.rest.vert)
         self._count("start", clock)
 
-    def run(self, todo: Iterable, workers: int) -> None:
-        """Makes the shards of an iterator of batches with that many worker processes."""
+    def run(
+        self, todo: Iterable, out: pathlib.Path, workers: int, say: Callable[[int | str], object]
+    ) -> Iterator[dict]:
+        """Makes the shards of an iterator of batches in folder `out` with that many worker processes; yields
+        the seconds that went into each stage. say: called with time steps done, and a line on each batch."""
         from . import readings, synthetic_sensor
 
         rest = None if self._rest is self.geometry else self._rest.vert
@@ -248,17 +186,24 @@ class Maker:
         with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:
-                waiting.append(self._begin(batch, pool))
+                waiting.append(self._begin(batch, pool, say))
                 while waiting and (len(waiting) > _AHEAD or waiting[0].done()):
-                    written.append(self._end(waiting.pop(0), pool))
+                    written.append(self._end(waiting.pop(0), pool, out))
                 for one in written:  # a shard that could not be written stops the run now, not at its end
                     if one.done():
                         one.result()
-            written += [self._end(one, pool) for one in waiting]
+                yield self._spent()
+            written += [self._end(one, pool, out) for one in waiting]
             for one in written:
                 one.result()
+            yield self._spent()
 
-    def _begin(self, batch, pool) -> _Running:
+    def _spent(self):
+        """Seconds of each stage since it was asked last."""
+        seconds, self.seconds = self.seconds, dict.fromkeys(_STAGES, 0.0)
+        return seconds
+
+    def _begin(self, batch, pool, say) -> _Running:
         """Plans and simulates a batch and hands its readings to the workers."""
         from . import readings, simulate, synthetic_sensor
 
@@ -294,7 +239,7 @@ class Maker:
                 senses.append(sense)
                 motion.parameters.update(drawn)
             fields = running.fields = walk(
-                self.model, batch.names, motions, self.update, self.time, *skins, modes=self.modes
+                self.model, batch.names, motions, say, self.time, *skins, modes=self.modes
             )
             clock = self._count("skin", clock)
             running.reads = [
@@ -312,7 +257,7 @@ class Maker:
             ]
         if batch.measured:
             self._free()
-            answer = running.answer = self.measured.simulate(batch.names, motions, self.update)
+            answer = running.answer = self.measured.simulate(batch.names, motions, say)
             self._count("measured skin", clock)
             # each contact of the session begins some seconds after the last one, while the sensor warms up
             running.labels = [
@@ -329,7 +274,7 @@ class Maker:
         spent = ", ".join(
             f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05
         )
-        self.tell(f"{batch.path}: {len(motions)} worlds, {spent}")
+        say(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
     def _free(self):
@@ -346,7 +291,7 @@ class Maker:
         self.seconds[stage] += now - since
         return now
 
-    def _end(self, running, pool):
+    def _end(self, running, pool, out):
         """Waits for the readings of a batch and has its shard written: compressing it takes a core some
         seconds."""
         batch, ones = running.batch, []
@@ -370,8 +315,10 @@ class Maker:
                 }
                 columns["converged"] &= fields.converged[k] & ~read.failed
             if batch.measured:
+                counts, pac = running.labels[k].result()
                 columns |= {
-                    "measured_counts": running.labels[k].result(),
+                    "measured_counts": counts,
+                    "measured_pac": pac,
                     "measured_wrench": running.answer.wrench[k],
                 }
                 columns["converged"] &= running.answer.converged[k]
@@ -390,7 +337,7 @@ class Maker:
         self._count("waiting for readings", clock)
         return pool.submit(
             write_shard,
-            self.out / batch.path,
+            out / batch.path,
             ones,
             self.geometry if batch.simulated else None,
             self.attributes,

@@ -99,26 +99,32 @@ def _row(readings, time):
 
 
 def sample(
-    time: np.ndarray, impedance: np.ndarray, pressure: np.ndarray, seed: int, temperature: float | None = None
-) -> np.ndarray:
-    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time; of PAC's 22 the
-    latest.
+    time: np.ndarray,
+    impedance: np.ndarray,
+    pressure: np.ndarray,
+    seed: int,
+    temperature: float | None = None,
+    sensor: Sensor = SENSORS["1"],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time, of PAC the
+    latest, and (n, 22) all of PAC of the last frame in the order of time.
 
     Args:
       time: (n,) [s]; impedance: (n, 19) [ohm]; pressure: (n,) above rest [Pa]; linear between samples.
       seed: of the noise.
-      temperature: (n,) of the core [C]; None is steady.
+      temperature: (n,) of the core [C]; None is steady. sensor: whose noise and levels these are.
     """
-    acquisition = Acquisition(seed=seed, film_every_step=True)
+    acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor)
     state = np.zeros(acquisition.nstate)
     heat = {} if temperature is None else {"temperature": temperature[0]}
     acquisition.reset(state, impedance[0], pressure[0], time=time[0], **heat)
-    rows = []
+    counts, pac = [], []
     for i, (before, dt) in enumerate(_steps(time)):
         heat = None if temperature is None else temperature[i]
         acquisition.advance(state, before, dt, impedance[i], pressure[i], heat)
-        rows.append(_row(acquisition.readings(state), time[i])[0])
-    return np.array(rows, np.float32)
+        for rows, row in zip((counts, pac), _row(acquisition.readings(state), time[i])):
+            rows.append(row)
+    return np.array(counts, np.float32), np.array(pac, np.float32)
 
 
 def _steps(time):

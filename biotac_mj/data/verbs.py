@@ -38,7 +38,7 @@ def generate_verb(args: argparse.Namespace) -> None:
     if args.effects:
         settings = amend_settings(settings, GenerateOptions, args.effects)
     options = GenerateOptions(**settings)
-    report = generate(args.out, options, args.workers, not args.quiet)
+    report = generate(args.out, options, args.workers, not args.quiet, args.ray)
     stages = ", ".join(f"{name} {value:g} s" for name, value in report.seconds.items() if name != "all")
     print(
         f"{report.interactions} interactions, {report.steps} time steps, "

@@ -7,7 +7,6 @@ import os
 import pathlib
 
 import numpy as np
-import tqdm
 
 from ..data.generate import made_already
 from ..data.objects import OBJECTS, make_object
@@ -22,6 +21,7 @@ from ..geometry import load_skin
 from ..geometry.rigid import quaternion
 from ..recordings import Recording
 from ..sensor.channels import NELECTRODE, log_impedance
+from ..shards import Task, run_tasks
 from ..skin import SkinModel
 from ..skin.settings import plain, read_dict, read_settings
 from .fitted import PLATE, fitted_touches
@@ -105,6 +105,7 @@ def resimulate(
     options: ResimulateOptions | None = None,
     workers: int | None = None,
     progress: bool = True,
+    ray: str | None = None,
 ) -> ResimulateReport:
     """Makes a set in folder `out`, or what is missing of it: an interaction of kind "resimulated" for each
     touch, with the simulated skin's columns and those measured.
@@ -113,6 +114,8 @@ def resimulate(
       recording: with poses, or with force for fitted ones. options: see ResimulateOptions.
       workers: processes for film and readings; None takes the cores there are, 0 this process.
       progress: whether to show a bar.
+      ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for each shard, of one core, one GPU
+        where the device is one, and `workers` cores (None: 0). Touches are found in this process, on the CPU.
 
     Raises:
       ValueError: the recording lacks what is needed, the folder holds another set, or an option is not
@@ -125,13 +128,13 @@ def resimulate(
     )
     name = PLATE if options.poses == "fitted" else _object(recording, options.object)
     make_object(name)
-    model = SkinModel(geometry, rubber, skin, options.device, modulus=modulus)
+    here = options.device if ray is None else "cpu"
     if options.poses == "fitted":
         touches, rubber, notes = fitted_touches(
             recording, geometry, rubber, skin, options.rate, options.block, progress=progress
         )
-        model = SkinModel(geometry, rubber, skin, options.device, modulus=modulus)
     else:
+        model = SkinModel(geometry, rubber, skin, here, modulus=modulus)
         touches, notes = touches_of(
             recording,
             name,
@@ -139,42 +142,30 @@ def resimulate(
             options.object_pose,
             options.rate,
             dataclasses.replace(model.geometry, vert=model.rest.vert),
-            options.device,
+            here,
         )
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"}
     settings |= {"count": len(touches), "recording": _fingerprint(recording), "object": name}
     settings = json.loads(json.dumps(settings))
-    groups = [range(k, min(k + options.batch, len(touches))) for k in range(0, len(touches), options.batch)]
-    paths = [shard_path(out, number) for number in range(len(groups))]
-    todo = [number for number, path in enumerate(paths) if not made_already(path, settings)]
-    split = assign(len(touches), options.seed)
-    if todo:
-        about = {
-            "settings": settings,
-            "skin": options.skin,
-            "material": dataclasses.asdict(model.material),
-            "element": model.element,
-            "tier": "full",
-            "liquid": model.has_liquid,
-            "device": str(model.device),
-            "source": recording.source,
-            "poses": options.poses,
-            "notes": notes,
-        }
-        if workers is None:
-            workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
-        total = sum(len(touches[i].time) for number in todo for i in groups[number])
-        with (
-            tqdm.tqdm(total=total, desc="resimulate", unit="step", disable=not progress, leave=False) as bar,
-            readings_pool(model.geometry, workers, start_args=(model.geometry, model.rest.vert)) as pool,
-        ):
-            waiting = None
-            for number in [*todo, None]:
-                begun = None if number is None else _begin(model, name, touches, groups[number], pool, bar)
-                if waiting is not None:  # its readings were made while the skin went on
-                    _end(waiting, touches, name, options, split, paths, model, about)
-                waiting = None if number is None else (number, groups[number], begun)
-    report = _report(out, len(todo), notes)
+    groups = [
+        list(range(k, min(k + options.batch, len(touches)))) for k in range(0, len(touches), options.batch)
+    ]
+    tasks = []
+    for number, group in enumerate(groups):
+        path = shard_path(out, number)
+        if not made_already(path, settings):
+            tasks.append(Task((path.name, group), sum(len(touches[i].time) for i in group), path.name))
+    if workers is None:
+        cores = len(os.sched_getaffinity(0))
+        workers = cores if cores > 1 and ray is None else 0
+    if tasks:
+        about = {"settings": settings, "source": recording.source, "poses": options.poses, "notes": notes}
+        skins = geometry, rubber, skin, modulus
+        work = _Drive(options, skins, name, touches, assign(len(touches), options.seed), about, workers)
+        needs = dict(cpus=max(1, workers), gpus=int(options.device != "cpu"))
+        for _ in run_tasks(work, tasks, out, "resimulate", "step", ray, progress=progress, **needs):
+            pass
+    report = _report(out, len(tasks), notes)
     with replacing(out / "resimulate.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(dataclasses.asdict(report), indent=1) + "\n")
     return report
@@ -198,25 +189,99 @@ def _fingerprint(recording):
     return found.hexdigest()[:16]
 
 
-def _begin(model, name, touches, members, pool, bar):
-    """Simulates touches: of each (fields, its number there, readings to come)."""
-    members = list(members)
-    together = [members] if model.device.is_cuda else [[i] for i in members]
-    out = []
-    for group in together:
-        longest = max(len(touches[i].time) for i in group)
-        time = [_longer(touches[i].time, longest) for i in group]
-        motions = [_longer_motion(touches[i].motion, longest) for i in group]
-        fields = simulate(model, name, motions, time=time)
-        for k, i in enumerate(group):
-            n = len(touches[i].time)
-            seed = int(np.random.SeedSequence([i, 1]).generate_state(1, np.uint64)[0])
-            answer = pool.submit(
-                read_in_worker, fields.displacement[k, :n], touches[i].time, fields.pressure[k, :n], seed
+@dataclasses.dataclass
+class _Drive:
+    """Work of `shards.run_tasks`: shards of touches, given as name of the file and numbers of its touches.
+
+    Attributes:
+      skins: geometry, material, options and modulus of the skin. name: of the object. touches, split: all.
+      about: what is kept with each shard, besides the skin. workers: processes for film and readings.
+    """
+
+    options: ResimulateOptions
+    skins: tuple
+    name: str
+    touches: list[Touch]
+    split: np.ndarray
+    about: dict
+    workers: int
+
+    def __call__(self, values, folder, say):
+        if not hasattr(self, "_model"):
+            *skin, modulus = self.skins
+            self._model = SkinModel(*skin, self.options.device, modulus=modulus)
+        model = self._model
+        with readings_pool(
+            model.geometry, self.workers, start_args=(model.geometry, model.rest.vert)
+        ) as pool:
+            waiting = None
+            for value in values:
+                begun = self._begin(value[1], pool, say)
+                if waiting is not None:  # its readings were made while the skin went on
+                    yield self._end(*waiting, folder)
+                waiting = *value, begun
+            if waiting is not None:
+                yield self._end(*waiting, folder)
+
+    def _begin(self, members, pool, say):
+        """Simulates touches: of each (fields, its number there, readings to come)."""
+        together = [members] if self._model.device.is_cuda else [[i] for i in members]
+        out = []
+        for group in together:
+            touches = [self.touches[i] for i in group]
+            longest = max(len(touch.time) for touch in touches)
+            time = [_longer(touch.time, longest) for touch in touches]
+            motions = [_longer_motion(touch.motion, longest) for touch in touches]
+            fields = simulate(self._model, self.name, motions, time=time)
+            for k, (i, touch) in enumerate(zip(group, touches)):
+                n = len(touch.time)
+                seed = int(np.random.SeedSequence([i, 1]).generate_state(1, np.uint64)[0])
+                read = (fields.displacement[k, :n], touch.time, fields.pressure[k, :n], seed)
+                out.append((fields, k, pool.submit(read_in_worker, *read)))
+                say(n)
+        return out
+
+    def _end(self, path, members, parts, folder):
+        """Writes a shard; gives its file's name."""
+        ones = []
+        for i, (fields, k, answer) in zip(members, parts):
+            touch = self.touches[i]
+            n, read = len(touch.time), answer.result()
+            ones.append(
+                Interaction(
+                    id=f"{i:06d}",
+                    object=self.name,
+                    kind="resimulated",
+                    split=str(self.split[i]),
+                    seed=self.options.seed,
+                    parameters=touch.motion.parameters | {"clock": float(touch.time[0])},
+                    time=touch.time,
+                    displacement=fields.displacement[k, :n] * np.float32(DISPLACEMENT_SCALE),
+                    wrench=fields.wrench[k, :n],
+                    contact_force=fields.contact_force[k, :n],
+                    pressure=fields.pressure[k, :n],
+                    impedance=read.impedance,
+                    counts=read.counts,
+                    pac=read.pac,
+                    indenter_pos=touch.motion.pos,
+                    indenter_quat=quaternion(touch.motion.mat),
+                    converged=fields.converged[k, :n] & ~read.failed,
+                    measured_counts=touch.counts,
+                    measured_pac=touch.pac,
+                    measured_wrench=touch.wrench,
+                )
             )
-            out.append((fields, k, answer))
-            bar.update(n)
-    return out
+        model = self._model
+        about = self.about | {
+            "skin": self.options.skin,
+            "material": dataclasses.asdict(model.material),
+            "element": model.element,
+            "tier": "full",
+            "liquid": model.has_liquid,
+            "device": str(model.device),
+        }
+        write_shard(folder / path, ones, model.geometry, about)
+        return path
 
 
 def _longer(time, n):
@@ -228,39 +293,6 @@ def _longer_motion(motion, n):
     """The motion, standing still where it has ended, n rows long."""
     row = np.minimum(np.arange(n), len(motion.pos) - 1)
     return Motion(motion.kind, motion.parameters, motion.pos[row], motion.mat[row])
-
-
-def _end(begun, touches, name, options, split, paths, model, about):
-    number, members, parts = begun
-    ones = []
-    for i, (fields, k, answer) in zip(members, parts):
-        touch: Touch = touches[i]
-        n, read = len(touch.time), answer.result()
-        ones.append(
-            Interaction(
-                id=f"{i:06d}",
-                object=name,
-                kind="resimulated",
-                split=str(split[i]),
-                seed=options.seed,
-                parameters=touch.motion.parameters | {"clock": float(touch.time[0])},
-                time=touch.time,
-                displacement=fields.displacement[k, :n] * np.float32(DISPLACEMENT_SCALE),
-                wrench=fields.wrench[k, :n],
-                contact_force=fields.contact_force[k, :n],
-                pressure=fields.pressure[k, :n],
-                impedance=read.impedance,
-                counts=read.counts,
-                pac=read.pac,
-                indenter_pos=touch.motion.pos,
-                indenter_quat=quaternion(touch.motion.mat),
-                converged=fields.converged[k, :n] & ~read.failed,
-                measured_counts=touch.counts,
-                measured_pac=touch.pac,
-                measured_wrench=touch.wrench,
-            )
-        )
-    write_shard(paths[number], ones, model.geometry, about)
 
 
 def _report(out, made, notes):

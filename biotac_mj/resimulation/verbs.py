@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from ..arguments import SEED, check_device, device, output_folder, real, whole
+from ..arguments import SEED, add_ray, check_device, device, output_folder, real, whole
 from ..recordings.verbs import add_load_arguments
 
 __all__ = ["add_verb"]
@@ -54,6 +54,7 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     v.add_argument(
         "--out", type=output_folder("resimulate.json"), required=True, metavar="DIR", help="folder of the set"
     )
+    add_ray(v)
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -61,7 +62,8 @@ def _resimulate(args):
     from ..recordings import load_one
     from .resimulate import ResimulateOptions, resimulate
 
-    check_device(args.device)
+    if args.ray is None:  # a cluster has its own devices
+        check_device(args.device)
     recording, notes = load_one(
         args.recording, args.sensor, force=args.force, rate=args.rate, scale=args.scale
     )
@@ -76,7 +78,7 @@ def _resimulate(args):
             for name in "block skin material liquid options batch seed device".split()
         },
     )
-    report = resimulate(recording, args.out, options, args.workers, not args.quiet)
+    report = resimulate(recording, args.out, options, args.workers, not args.quiet, args.ray)
     print(
         f"{report.interactions} touches, {report.steps} time steps, {report.nonconverged} of them not "
         f"converged; {report.made} shards made"

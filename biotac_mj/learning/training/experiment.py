@@ -1,11 +1,14 @@
 """`biotac train`: every model on every split and seed of a data set; predictions, errors and the weights
 worth keeping go to a folder."""
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import pathlib
+import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -15,11 +18,13 @@ from ...fields import refuse_unknown
 from ...files import replacing, write_npz
 from ...reading import read_json
 from ...sensor.channels import FULL_SCALE
+from ...shards import Task, run_tasks
 from ..instants.force import ridge
 from ..weights import save_forward, save_inverse
-from .arrays import Arrays, load_arrays
+from .arrays import load_arrays
 from .config import LearningConfig
 from .features import Pod
+from .fitting import Watch
 from .inverse import contact_centre, field_errors, patch_overlap, train_inverse
 from .local import Features, train_head
 from .paper import train_latent_projection, train_pointnet
@@ -49,9 +54,12 @@ def train_all(
     only: Iterable[str] | None = None,
     limit: int | None = None,
     progress: bool = True,
+    ray: str | None = None,
 ) -> None:
-    """Trains and predicts for all splits and seeds; what is there already is kept, so an interrupted run goes
-    on.
+    """Trains and predicts for all splits and seeds. What is there already is kept, so an interrupted run goes
+    on, within a network's training too (on Ray: with the split and seed).
+
+    On the CPU each training takes one core: the same bits however many there are.
 
     Args:
       path: data set. out: folder.
@@ -60,9 +68,10 @@ def train_all(
       config: LearningConfig. device: of torch. paper: False leaves out what is slow without a GPU: latent
         projection and PointNet++.
       only: names of our models to train; None takes all of FORWARD. limit: interactions to read.
+      progress: whether to show a bar. ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for
+        each split and seed, of one core, and one GPU where the device is one. All nodes read the set at its
+        path.
     """
-    from tqdm import tqdm
-
     config = config or LearningConfig()
     out = pathlib.Path(out)
     names = list(FORWARD) if only is None else list(only)
@@ -75,34 +84,113 @@ def train_all(
         "limit": limit,
     }
     _refuse_others(out, json.loads(json.dumps(settings)))
-    jobs = [(s, k) for s in splits for k in seeds if not (out / f"{s}-{k}.json").exists()]
-    if not jobs:
+    size = _steps_of(config, names, paper)
+    tasks = [
+        Task((split, seed), size, f"{split}-{seed}.json")
+        for split in splits
+        for seed in seeds
+        if not (out / f"{split}-{seed}.json").exists()
+    ]
+    if not tasks:
         return
-    begun = time.time()
-    arrays = load_arrays(path, device, limit)
+    with TactileSet(path) as data:
+        count = min(len(data), limit or len(data))
     for split in splits:
-        division_of(path, split, 0, len(arrays.objects))  # refuses what cannot be divided
-    features = Features(arrays, config)
-    print(
-        f"{len(arrays.objects)} interactions, "
-        f"{len(arrays.owner)} time steps read in {time.time() - begun:.0f} s"
-    )
-    with tqdm(jobs, disable=not progress, desc="train") as bar:
-        for split, seed in bar:
-            bar.set_postfix_str(f"{split}, seed {seed}")
-            train_split(
-                arrays,
-                features,
-                path,
-                split,
-                seed,
-                config,
-                out,
-                names,
-                paper,
-                settings=settings,
-                step=lambda text: bar.set_postfix_str(text),
-            )
+        division_of(path, split, 0, count)  # refuses what cannot be divided
+    ahead = size * len(tasks) if ray is None and str(device) == "cpu" else 0
+    work = _Train(settings, str(device), size, ahead)
+    for _ in run_tasks(
+        work, tasks, out, "train", "step", ray, gpus=int(str(device) != "cpu"), progress=progress
+    ):
+        pass
+
+
+def _steps_of(config, names, paper):
+    """Steps of all networks of a split and seed, at most."""
+    head = {
+        name: config.steps * (2 if kind["teach"] and kind["log"] else 1) for name, kind in FORWARD.items()
+    }
+    ours = [head[name] for name in names]
+    again = (config.members - 1) * max(ours, default=0)
+    papers = config.mesh_steps + 4 * config.paper_steps
+    return sum(ours) + again + (1 + 3) * config.steps + (papers if paper else 0)
+
+
+@dataclasses.dataclass
+class _Train:
+    """Work of `shards.run_tasks`: all models of a split and seed; size: their steps.
+
+    Attributes:
+      settings: of the whole training. device: of torch. ahead: steps to say the time of, 0: say nothing.
+    """
+
+    settings: dict
+    device: str
+    size: int
+    ahead: int
+
+    def __call__(self, values, folder, say):
+        with _one_thread():
+            for split, seed in values:
+                if not hasattr(self, "_features"):
+                    self._features = self._read(say)
+                given = self.settings
+                name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
+                watch = Watch(folder / f"unfinished-{name}", say)
+                train_split(self._features, split, seed, folder, given, watch)
+                say(self.size - watch.steps)  # where a network of fewer steps was the best
+                shutil.rmtree(watch.folder, ignore_errors=True)
+                yield split, seed
+
+    def _read(self, say):
+        begun = time.time()
+        given = self.settings
+        config = LearningConfig(**given["config"])
+        arrays = load_arrays(given["set"], self.device, given["limit"])
+        features = Features(arrays, config)
+        text = f"{len(arrays.objects)} interactions, {len(arrays.owner)} time steps"
+        say(f"{text} read in {time.time() - begun:.0f} s")
+        if self.ahead:
+            minutes = self.ahead * _step_time(features, given["models"], given["paper"]) / 60
+            say(f"about {max(1, round(minutes))} minutes on one core; stopped, it goes on where it was")
+        return features
+
+
+def _step_time(features, names, paper, steps=4):
+    """[s] of a step, in the mean over all networks, of a training a few steps long; components, whose values
+    take no time, are left at zero."""
+    arrays, config = features.arrays, features.config
+    labelled = np.flatnonzero(arrays.labelled)
+    rows = arrays.rows(labelled)
+    basis = Pod.fit(arrays.field, rows[: 4 * config.pod], min(config.pod, len(rows)))
+    flat = torch.zeros(len(arrays.owner), len(basis.scale))
+    pod = (basis, flat, flat if config.mirror else None)
+    papers = {
+        name: max(1, getattr(config, name) * steps // config.steps) for name in ("paper_steps", "mesh_steps")
+    }
+    short = dataclasses.replace(config, steps=steps, **papers)
+    parts = labelled, labelled[:8], short
+    for watch in (Watch(), Watch()):  # what is called first is slow at first
+        for name in names:
+            train_head(features, *parts, pod=pod, watch=watch, **FORWARD[name])
+        for teach in (False, True):
+            train_inverse(arrays, *parts, pod, 0, teach, watch)
+    if paper:
+        train_latent_projection(arrays, *parts, watch=watch)
+        train_pointnet(arrays, *parts, watch=watch)
+    return watch.seconds / watch.steps
+
+
+@contextlib.contextmanager
+def _one_thread():
+    """On a CPU the last bits of sums depend on the number of threads, and these networks gain little by
+    more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _refuse_others(out, settings):
@@ -119,20 +207,17 @@ def _refuse_others(out, settings):
 
 
 def train_split(
-    arrays: Arrays,
     features: Features,
-    path: pathlib.Path | str,
     split: str,
     seed: int,
-    config: LearningConfig,
     out: pathlib.Path,
-    names: list[str],
-    paper: bool = True,
-    settings: dict | None = None,
-    step: Callable[[str], object] | None = None,
+    settings: dict,
+    watch: Watch | None = None,
 ) -> None:
     """One split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of seed 0,
-    and last SPLIT-SEED.json, which keeps the settings of the whole training."""
+    and last SPLIT-SEED.json, which keeps the settings of the whole training. watch: of all networks."""
+    arrays, config = features.arrays, features.config
+    path, names, watch = settings["set"], settings["models"], watch or Watch()
     division = division_of(path, split, seed, len(arrays.objects))
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -143,8 +228,6 @@ def train_split(
 
     def timed(name, work):
         begun = time.time()
-        if step:
-            step(f"{split}, seed {seed}: {name}")
         result = work()
         if device.type == "cuda":
             torch.cuda.synchronize()
@@ -165,7 +248,7 @@ def train_split(
         models[name] = timed(
             name,
             lambda name=name: train_head(
-                features, train, validation, config, seed=seed, pod=pod, **FORWARD[name]
+                features, train, validation, config, seed=seed, pod=pod, watch=watch, **FORWARD[name]
             ),
         )
         predictions[name] = models[name](both)
@@ -182,7 +265,14 @@ def train_split(
             timed(
                 f"{best} again {k}",
                 lambda k=k: train_head(
-                    features, train, validation, config, seed=1000 * (k + 1) + seed, pod=pod, **FORWARD[best]
+                    features,
+                    train,
+                    validation,
+                    config,
+                    seed=1000 * (k + 1) + seed,
+                    pod=pod,
+                    watch=watch,
+                    **FORWARD[best],
                 ),
             )
             for k in range(config.members - 1)
@@ -192,7 +282,8 @@ def train_split(
 
     inverses = {
         name: timed(
-            name, lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach)
+            name,
+            lambda teach=teach: train_inverse(arrays, train, validation, config, pod, seed, teach, watch),
         )
         for name, teach in (("pod_inverse", False), ("pod_inverse_taught", True))
     }
@@ -200,9 +291,9 @@ def train_split(
     report = {
         "split": split,
         "seed": seed,
-        "settings": settings or {},
+        "settings": settings,
         "config": dataclasses.asdict(config),
-        "set": str(path),
+        "set": path,
         "sensor": arrays.sensor,
         "interactions": len(arrays.objects),
         "labelled": int(arrays.labelled.sum()),
@@ -212,16 +303,17 @@ def train_split(
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
     back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
-    if paper:
+    if settings["paper"]:
         lp = timed(
-            "latent_projection", lambda: train_latent_projection(arrays, train, validation, config, seed)
+            "latent_projection",
+            lambda: train_latent_projection(arrays, train, validation, config, seed, watch),
         )
         unit = 1e-3 / config.mesh_scale
         predictions["latent_projection"] = _in_parts(
             lambda r: config.scale * lp(unit * arrays.field[r].float()), both
         )
         predictions["electrode_vae"] = config.scale * lp.electrode(truth / config.scale)[0].detach()
-        net = timed("pointnet", lambda: train_pointnet(arrays, train, validation, config, seed))
+        net = timed("pointnet", lambda: train_pointnet(arrays, train, validation, config, seed, watch))
         predictions["pointnet"] = _in_parts(
             lambda r: config.scale * net(unit * arrays.field[r].float()), both
         )

@@ -8,11 +8,15 @@ replayed.
 import contextlib
 import copy
 import math
+import pathlib
+import time
 from collections.abc import Callable, Iterator
 
 import torch
 
-__all__ = ["cycle", "fast_products", "root_mean_square"]
+from ...files import replacing
+
+__all__ = ["Watch", "cycle", "fast_products", "root_mean_square"]
 
 _WARM = 5  # steps before one is recorded
 
@@ -27,6 +31,48 @@ def fast_products() -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+class Watch:
+    """Sees the trainings of one job go by, and keeps where they are: run again in the same order, those that
+    are done are not repeated, and one that was stopped goes on, on the CPU to the same bits.
+
+    Args:
+      folder: of what is kept, None keeps nothing. say: called with 1 at each step.
+
+    Attributes:
+      steps: of all trainings so far, seconds: that those took which were done now, without their judging.
+    """
+
+    def __init__(
+        self, folder: pathlib.Path | None = None, say: Callable[[int], object] = lambda n: None
+    ) -> None:
+        self.folder, self.say = folder, say
+        self.number = self.steps = 0
+        self.seconds = 0.0
+
+    def begin(self) -> dict | None:
+        """What is kept of the next training."""
+        self.number += 1
+        path = self._path()
+        kept = torch.load(path, weights_only=True) if path is not None and path.is_file() else None
+        self.count(kept["step"] if kept else 0)
+        return kept
+
+    def count(self, steps: int, seconds: float = 0.0) -> None:
+        """Some steps more."""
+        self.steps += steps
+        self.seconds += seconds
+        self.say(steps)
+
+    def keep(self, **state: object) -> None:
+        """Keeps the training's state."""
+        if self.folder is not None:
+            with replacing(self._path()) as temporary:
+                torch.save(state, temporary)
+
+    def _path(self):
+        return None if self.folder is None else self.folder / f"training-{self.number:02d}.pt"
 
 
 def root_mean_square(error: torch.Tensor) -> torch.Tensor:
@@ -47,7 +93,7 @@ def cycle(
     decay: float | None = None,
     seed: int = 0,
     graph: bool = True,
-    progress: Callable[[], object] | None = None,
+    watch: Watch | None = None,
 ) -> float | None:
     """Trains in place.
 
@@ -61,6 +107,7 @@ def cycle(
         host.
       validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
         end. None keeps the last.
+      watch: what sees and keeps the steps.
 
     Returns:
       smallest value of validate, or None.
@@ -77,9 +124,18 @@ def cycle(
     optimizer = torch.optim.AdamW(parameters, rate, weight_decay=weight_decay, fused=cuda, capturable=cuda)
     generator = torch.Generator(device=rows.device).manual_seed(seed)
     chosen = torch.zeros(min(batch, len(rows)), dtype=rows.dtype, device=rows.device)
-    best, state = None, None
+    best, state, first = None, None, 0
     module.train()
     every = max(1, steps // checks)
+    watch = watch or Watch()
+    kept = watch.begin()
+    if kept:
+        best, state, first = kept["best"], kept["state"], kept["step"]
+        module.load_state_dict(kept["module"])
+        optimizer.load_state_dict(kept["optimizer"])
+        optimizer.param_groups[0]["lr"] = rate
+        generator.set_state(kept["generator"])
+        _set_random(kept["random"])
 
     def one():
         value = loss(chosen)
@@ -89,18 +145,20 @@ def cycle(
         return value
 
     replay = None
-    for step in range(steps):
+    for step in range(first, steps):
+        clock = time.perf_counter()
         rate.fill_(
             learning_rate * (_one_cycle(step / steps) if decay is None else decay ** (20 * step / steps))
         )
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
-        elif cuda and graph and step >= _WARM:
+        elif cuda and graph and step >= first + _WARM:
             replay, value = _record(one)
             replay.replay()
         else:
             value = _aside(one) if cuda and graph else one()
+        watch.count(1, time.perf_counter() - clock)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
@@ -114,12 +172,30 @@ def cycle(
                 module.train()
                 if best is None or now < best:
                     best, state = now, copy.deepcopy(module.state_dict())
-        if progress:
-            progress()
+            watch.keep(
+                step=step + 1,
+                best=best,
+                state=state,
+                module=module.state_dict(),
+                optimizer=optimizer.state_dict(),
+                generator=generator.get_state(),
+                random=_random(cuda),
+            )
     if state is not None:
         module.load_state_dict(state)
     module.eval()
     return best
+
+
+def _random(cuda):
+    """State of the generators that dropout and new networks draw from."""
+    return [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if cuda else [])]
+
+
+def _set_random(states):
+    torch.set_rng_state(states[0].cpu())
+    for state in states[1:]:
+        torch.cuda.set_rng_state(state.cpu())
 
 
 def _one_cycle(share):

@@ -1,7 +1,6 @@
 """From electrodes back to the skin: displacements, contact forces and the patch that touches."""
 
 import typing
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from ...sensor.channels import NELECTRODE, check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
 from .features import ELECTRODE_MIRROR
-from .fitting import cycle, root_mean_square
+from .fitting import Watch, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays
@@ -65,7 +64,7 @@ def train_inverse(
     pod: tuple,
     seed: int = 0,
     teach: bool = False,
-    progress: Callable[[], object] | None = None,
+    watch: Watch | None = None,
 ) -> InverseHead:
     """Trains on labelled interactions; pod: (Pod, components of all rows, those of the mirrored touches or
     None).
@@ -118,7 +117,7 @@ def train_inverse(
             2 * config.learning_rate,
             seed=seed,
             graph=config.graphs,
-            progress=progress,
+            watch=watch,
         )
     rate = config.learning_rate * (0.5 if teach else 1)
     head.validation = cycle(
@@ -132,7 +131,7 @@ def train_inverse(
         weight_decay=0.01,
         seed=seed,
         graph=config.graphs,
-        progress=progress,
+        watch=watch,
     )
     return head
 

@@ -11,7 +11,7 @@ from ...sensor.channels import FULL_SCALE, log_impedance
 from ..networks.graph import SparseMatrix
 from ..networks.heads import LocalHead, PodHead, averages
 from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
-from .fitting import cycle, root_mean_square
+from .fitting import Watch, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays
@@ -82,7 +82,7 @@ def train_head(
     log: bool = True,
     seed: int = 0,
     pod: tuple | None = None,
-    progress: Callable[[], object] | None = None,
+    watch: Watch | None = None,
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Trains one head.
 
@@ -153,7 +153,7 @@ def train_head(
             2 * config.learning_rate,
             seed=seed,
             graph=config.graphs,
-            progress=progress,
+            watch=watch,
         )
     rate = config.learning_rate * (0.5 if teach else 1)
     cycle(
@@ -167,7 +167,7 @@ def train_head(
         weight_decay=0.01,
         seed=seed,
         graph=config.graphs,
-        progress=progress,
+        watch=watch,
     )
 
     @torch.no_grad()

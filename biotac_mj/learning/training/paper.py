@@ -2,7 +2,6 @@
 PointNet++ beside them."""
 
 import typing
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from ..networks.electrode_vae import ElectrodeVAE, mlp
 from ..networks.hierarchy import build_hierarchy
 from ..networks.mesh_vae import MeshVAE
 from ..networks.pointnet import PointNet
-from .fitting import cycle, fast_products, root_mean_square
+from .fitting import Watch, cycle, fast_products, root_mean_square
 
 if typing.TYPE_CHECKING:
     from .arrays import Arrays
@@ -50,7 +49,7 @@ def train_latent_projection(
     validation: np.ndarray,
     config: "LearningConfig",
     seed: int = 0,
-    progress: Callable[[], object] | None = None,
+    watch: Watch | None = None,
 ) -> LatentProjection:
     """Trains both VAEs, freezes them, trains the projections.
 
@@ -97,7 +96,7 @@ def train_latent_projection(
         decay=config.decay,
         seed=seed,
         graph=False,
-        progress=progress,
+        watch=watch,
     )
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
@@ -111,7 +110,7 @@ def train_latent_projection(
 
     cycle(electrode, electrode_loss, rows, config.batch, config.paper_steps, config.learning_rate,
           lambda: (electrode(y[check])[0] - y[check]).square().mean(), decay=config.decay, seed=seed,
-          graph=config.graphs, progress=progress)  # fmt: skip
+          graph=config.graphs, watch=watch)  # fmt: skip
 
     model = LatentProjection(vae, electrode, config).to(device)
     for part in (vae, electrode):
@@ -148,7 +147,7 @@ def train_latent_projection(
         decay=config.decay,
         seed=seed,
     )
-    kind |= dict(graph=config.graphs, progress=progress)
+    kind |= dict(graph=config.graphs, watch=watch)
     cycle(model.to_electrode, forward_loss, rows, validate=lambda: forward_loss(check), **kind)
     cycle(model.to_mesh, inverse_loss, rows, validate=lambda: inverse_loss(check), **kind)
     return model.eval()
@@ -161,7 +160,7 @@ def train_pointnet(
     validation: np.ndarray,
     config: "LearningConfig",
     seed: int = 0,
-    progress: Callable[[], object] | None = None,
+    watch: Watch | None = None,
 ) -> PointNet:
     """Trains the baseline on labelled interactions alone; input displacements / mesh_scale, output tared
     counts / 2048."""
@@ -188,7 +187,7 @@ def train_pointnet(
         decay=config.decay,
         seed=seed,
         graph=False,
-        progress=progress,
+        watch=watch,
     )
     return net
 
