@@ -53,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     _add_press(verbs)
+    _add_samples(verbs)
     _add_view(verbs)
     _add_import_mesh(verbs)
     _add_calibrate(verbs)
@@ -277,6 +278,28 @@ def _press(args):
             "press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)"
         )
     print(report.table(record, files))
+
+
+def _add_samples(verbs):
+    verb = _verb(
+        verbs,
+        "samples",
+        _samples,
+        "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+    )
+    verb.add_argument("out", type=output_folder(), metavar="DIR", help="folder to make")
+    verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _samples(args):
+    from .samples import OBJECT, make_samples
+
+    electrodes, forces, log, made = make_samples(args.out, args.seed, not args.quiet)
+    print("synthetic, made by the simulation. Next:")
+    print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
+    print(f"  biotac diagnose {log} --object {OBJECT}")
+    print(f"  biotac train {made} --no-paper --seeds 0 --splits trajectory")
 
 
 def _add_view(verbs):

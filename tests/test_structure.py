@@ -34,6 +34,7 @@ LAYERS = {
     "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
     "resimulation": "arguments matching data recordings skin sensor geometry files",
+    "samples": "coupling plugin press.indenter data resimulation recordings effects sensor geometry files",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

@@ -24,6 +24,7 @@ TYPED = (
     "skin",
     "matching",
     "resimulation",
+    "samples",
 )
 
 
