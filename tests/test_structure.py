@@ -8,7 +8,7 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
-    "arguments": "files",
+    "arguments": "calm files",
     "fields": "",
     "files": "",
     "reading": "",
@@ -28,7 +28,7 @@ LAYERS = {
     "recordings": "arguments sensor geometry files reading",
     "data": "recordings geometry skin sensor effects fields files reading versions press.approach "
     "press.indenter press.path",
-    "tasks": "coupling plugin sensor effects geometry files reading data.objects view.offscreen",
+    "tasks": "coupling plugin sensor effects geometry fields files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading",
     "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
