@@ -46,3 +46,14 @@ def test_readme_shows_the_quickstart(repo):
     source = (repo / "examples" / "quickstart.py").read_text()
     shown = [line for line in lines if line in source]
     assert len(shown) >= 6, f"the README's example drifted from examples/quickstart.py: only {shown} is in it"
+
+
+def test_many_at_once_are_what_each_is_alone(repo):
+    """rollout and batch agree to the bit; deeper presses change more."""
+    example = load(repo, "many_at_once")
+    whole, stepwise = example.main(count=3, threads=2)
+    assert np.array_equal(whole, stepwise)
+    alone, _ = example.main(count=3, threads=1)
+    assert np.array_equal(whole, alone)
+    change = np.abs(whole[:, -1] - whole[:, 0]).max(axis=1)
+    assert change[-1] > 150 and (np.diff(change) > 50).all()

@@ -23,6 +23,7 @@ LAYERS = {
     "coupling": "skin sensor effects geometry fields learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor effects geometry learning.serve",
+    "neighbours": "batch",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",

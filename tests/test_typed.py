@@ -25,6 +25,7 @@ TYPED = (
     "matching",
     "resimulation",
     "samples",
+    "neighbours",
 )
 
 
