@@ -24,6 +24,7 @@ __all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
 OBJECT, SKIN = "sphere_7mm", "coarse"
 TOUCHES = 20
 _TOUCH, _AWAY = 24, 8  # rows of a touch, and on either side of it
+_GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
 _LOGGED, _EVERY = (
     6,
@@ -137,7 +138,8 @@ def _way(ways):
     out = np.r_[np.full(_AWAY - _AWAY // 2, 1.0), np.linspace(1, 0, _AWAY // 2, endpoint=False)][:, None]
     pos, mat = [], []
     for way in ways:
-        first, last = (way.pos[k] - _CLEAR * out * way.mat[k][:, 1] for k in (0, -1))
-        pos += [first, way.pos, last[::-1]]
+        inside = way.pos[0] + _GENTLE * (way.pos - way.pos[0])
+        first, last = (inside[k] - _CLEAR * out * way.mat[k][:, 1] for k in (0, -1))
+        pos += [first, inside, last[::-1]]
         mat.append(way.mat[np.r_[np.zeros(_AWAY, int), : len(way.mat), np.full(_AWAY, -1)]])
     return np.concatenate(pos), quaternion(np.concatenate(mat))

@@ -6,6 +6,8 @@ import pytest
 from biotac_mj import cli, samples
 from biotac_mj.data import TactileSet
 from biotac_mj.recordings import load_one
+from biotac_mj.recordings.own import rest_of
+from biotac_mj.sensor.channels import REST_COUNTS
 
 
 @pytest.mark.slow
@@ -34,3 +36,11 @@ def test_touches_repeat_by_their_seed():
     np.testing.assert_array_equal(one.electrodes, two.electrodes)
     assert np.abs(one.object_pos[-1] - other.object_pos[-1]).max() > 1e-4
     assert np.linalg.norm(one.force, axis=1).max() > 0.1 > np.linalg.norm(one.force[:1000], axis=1).max()
+
+
+def test_a_force_of_exactly_nothing_is_a_rest():
+    """Simulated forces are 0 to the bit in most rows: these are the rest, not none of them."""
+    touch = np.clip(np.sin(np.arange(600) / 40) - 0.5, 0, 1)
+    counts = REST_COUNTS["1"] - np.linspace(50, 400, 19) * touch[:, None]
+    force = np.column_stack([0 * touch, 0 * touch, -2 * touch])
+    np.testing.assert_allclose(rest_of(counts, 100.0, force)["rest"], REST_COUNTS["1"], atol=1)
