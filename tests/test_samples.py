@@ -15,7 +15,9 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     folder = tmp_path / "samples"
     assert cli.main(["samples", str(folder), "--quiet"]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("synthetic") and f"biotac diagnose {folder}/log.csv --object sphere_7mm" in said
+    assert (
+        said.startswith("synthetic") and f"biotac diagnose {folder}/log.csv --object sphere_7mm  # " in said
+    )
     rows, _ = load_one(folder / "electrodes.txt", force=folder / "forces.txt")
     load = np.linalg.norm(rows.force, axis=1)
     assert len(rows) >= 800 and (load < 1e-9).mean() > 0.3 and (load > 0.3).mean() > 0.1
