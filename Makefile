@@ -20,6 +20,7 @@ test test-all test-newest: export OMP_NUM_THREADS := 1
 .PHONY: press test test-all test-newest docs benchmarks assets clean
 
 press: $(VENV)/.installed
+	@echo "a press takes 20 s of processor time; the first on a machine 40, its kernels are compiled"
 	$(BIN)/biotac press $(ARGS)
 
 test: $(VENV)/.installed-test
@@ -57,6 +58,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV), once: 20 s of processor time, and the time to download 0.5 GB"
 	$(BIN)/python $(PIP) --editable .
 	touch $@
 

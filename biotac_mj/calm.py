@@ -1,19 +1,49 @@
 """Warp without its list of devices and of the modules it loads, which would go between a program's own
 lines."""
 
+import contextlib
 import os
 import pathlib
 import sys
+import tempfile
 
 import warp as wp
 
 __all__ = ["announce_compilation", "calm_warp"]
 
 
+_NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
+
+
 def calm_warp() -> None:
-    """Leaves Warp its warnings; does nothing with BIOTAC_VERBOSE=1, or after the user set a log level."""
+    """Starts Warp and leaves it its warnings, but for the one that there is no GPU; does nothing with
+    BIOTAC_VERBOSE=1, or after the user set a log level."""
     if wp.config.log_level == wp.LOG_INFO and os.environ.get("BIOTAC_VERBOSE", "0") in ("", "0"):
         wp.config.log_level = wp.LOG_WARNING
+        with _without(_NO_GPU):
+            wp.init()
+
+
+@contextlib.contextmanager
+def _without(words):
+    """Leaves lines with these words out of what is written to the process's standard error, which C code does
+    without asking."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            said.seek(0)
+            for line in said:
+                if words not in line:
+                    os.write(2, line)
 
 
 def announce_compilation(device: wp.DeviceLike) -> None:

@@ -53,7 +53,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     _add_press(verbs)
+    _add_samples(verbs)
     _add_view(verbs)
+    _add_mount(verbs)
     _add_import_mesh(verbs)
     _add_calibrate(verbs)
     _add_compare(verbs)
@@ -279,6 +281,28 @@ def _press(args):
     print(report.table(record, files))
 
 
+def _add_samples(verbs):
+    verb = _verb(
+        verbs,
+        "samples",
+        _samples,
+        "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+    )
+    verb.add_argument("out", type=output_folder(), metavar="DIR", help="folder to make")
+    verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _samples(args):
+    from .samples import OBJECT, make_samples
+
+    electrodes, forces, log, made = make_samples(args.out, args.seed, not args.quiet)
+    print("synthetic, made by the simulation. Next:")
+    print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
+    print(f"  biotac diagnose {log} --object {OBJECT}  # some minutes: the skin is solved again and again")
+    print(f"  biotac train {made} --no-paper --seeds 0 --splits trajectory")
+
+
 def _add_view(verbs):
     verb = _verb(
         verbs,
@@ -330,6 +354,39 @@ def _view(args):
         port=args.port,
         options=args.options,
     )
+
+
+def _add_mount(verbs):
+    verb = _verb(
+        verbs,
+        "mount",
+        _mount,
+        "Find where a BioTac goes on a hand's link, for attach_to_hand(mount=FILE), and draw it.",
+    )
+    verb.add_argument("hand", metavar="HAND.xml", help="MJCF of the hand")
+    verb.add_argument(
+        "--body", nargs="+", required=True, metavar="NAME", help="the links with the fingertips"
+    )
+    for name, text in (
+        ("tip", "where the fingertip points in the link's frame (default: its longest way)"),
+        ("pad", "where the pad looks there (default: where its joint bends it to)"),
+        ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
+    ):
+        verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)
+    verb.add_argument(
+        "--replaces",
+        nargs="*",
+        metavar="GEOM",
+        help="geoms that the BioTac stands for (default: all of the link)",
+    )
+    verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
+    verb.add_argument("--picture", type=output_file(), metavar="PNG", help="the link before and after")
+
+
+def _mount(args):
+    from .tasks.mounting import mount_verb
+
+    mount_verb(args)
 
 
 def _add_import_mesh(verbs):

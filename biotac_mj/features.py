@@ -264,6 +264,20 @@ _READINGS = (
 )  # fmt: skip
 
 
+_NEIGHBOURS = (
+    ("`mujoco.rollout`, `mujoco.batch`", "the engine plugin, on any number of threads, to the bit",
+     "`examples/many_at_once.py`"),
+    ("mjlab", "`neighbours.mjlab.BioTacSensorCfg` with the interface of its `SensorCfg` and `Sensor`: the "
+     "batch inside `mujoco_warp.step`, two-way; on CUDA `sim.create_graph()` once more",
+     "a double of its scene on the CPU, not in mjlab"),
+    ("Isaac Lab", "`neighbours.isaaclab.BioTacSensor` with the methods of its `SensorBase`, no subclass: "
+     "`batch.make` beside its physics, told poses, forces handed back explicitly, one step late; put into "
+     "`scene.sensors`", "a double of its calls on the CPU, not in Isaac Lab"),
+    ("ROS 1 and 2", "`biotac import` and `biotac export`: bags with `biotac_sensors` or `tactile_msgs`; "
+     "`biotac record` from running topics; nothing is published live", "`rosbags`"),
+)  # fmt: skip
+
+
 _TRAVEL = """\
 `material` is a preset's name, a dict of Material's fields, a `.json` file of them or a Material; `options` is
 `{"skin": {...}, "modulus": [...]}`, in Python a dict (with SkinOptions, a ContactLaw or arrays in it, if you
@@ -336,6 +350,8 @@ def markdown() -> str:
     lines.append("vibration out; calibrate and compare have no sensor.")
     lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _READINGS]
+    lines += ["", "## Beside other software", "", "| what | how | tried in |", "|---|---|---|"]
+    lines += [f"| {' | '.join(row)} |" for row in _NEIGHBOURS]
     lines += ["", "## How options travel", ""]
     lines.append(_TRAVEL)
     return "\n".join(lines) + "\n"

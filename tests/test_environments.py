@@ -1,6 +1,7 @@
 """The tasks in Gymnasium: its own checker is content, episodes repeat with their seed, several run side by
 side."""
 
+import copy
 import pickle
 import warnings
 
@@ -128,10 +129,11 @@ def test_pictures_need_no_setting(monkeypatch):
     env.close()
 
 
-def test_a_pickle_makes_it_anew():
+@pytest.mark.parametrize("again", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy])
+def test_a_pickle_or_a_copy_makes_it_anew(again):
     env = gymnasium.make("BioTac/Press-v0")
-    first, second = (x.reset(seed=3)[0] for x in (env, pickle.loads(pickle.dumps(env))))
+    first, second = (x.reset(seed=3)[0] for x in (env, again(env)))
     assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)
     loaded = biotac_mj.tasks.load("finger", "press", task_kwargs={"random": 4})
-    first, second = (x.reset().observation for x in (loaded, pickle.loads(pickle.dumps(loaded))))
+    first, second = (x.reset().observation for x in (loaded, again(loaded)))
     assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)

@@ -43,3 +43,14 @@ def test_lines_of_the_readme_run_as_they_stand(repo, capsys):
     force = names["finger"].read(names["data"], "contact_force")[:3]
     assert np.isclose(force[1], 0.1 * 9.81, rtol=0.01)
     assert "electrodes [counts]: [" in capsys.readouterr().out
+
+
+def test_many_at_once_are_what_each_is_alone(repo):
+    """rollout and batch agree to the bit; deeper presses change more."""
+    example = load(repo, "many_at_once")
+    whole, stepwise = example.main(count=3, threads=2)
+    assert np.array_equal(whole, stepwise)
+    alone, _ = example.main(count=3, threads=1)
+    assert np.array_equal(whole, alone)
+    change = np.abs(whole[:, -1] - whole[:, 0]).max(axis=1)
+    assert change[-1] > 150 and (np.diff(change) > 50).all()

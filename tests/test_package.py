@@ -1,6 +1,7 @@
 """The package: light import, names, what the wheel carries."""
 
 import importlib.resources
+import importlib.util
 import re
 import subprocess
 import sys
@@ -51,6 +52,17 @@ def test_a_gl_library_that_fails_does_not_stop_the_import():
     assert "MUJOCO_GL=nonsense does not work here" in result.stderr
 
 
+def test_warp_starts_in_silence_unless_asked():
+    code = "from biotac_mj.arguments import check_device; check_device('cpu'); import biotac_mj.skin"
+    quiet, loud = (run(code, BIOTAC_VERBOSE=asked) for asked in ("", "1"))
+    assert quiet.returncode == 0 and quiet.stdout + quiet.stderr == ""
+    assert "Warp" in loud.stdout + loud.stderr
+    noted = (
+        "import os; from biotac_mj.calm import _without\nwith _without(b'a'): os.write(2, b'abc\\nxyz\\n')"
+    )
+    assert run(noted).stderr == "xyz\n"
+
+
 @pytest.mark.parametrize("name", [n for n in biotac_mj.__all__ if n != "__version__"])
 def test_public_names_are_there(name):
     assert getattr(biotac_mj, name) is not None and name in dir(biotac_mj)
@@ -95,6 +107,8 @@ def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
         capture_output=True,
     )
     (wheel,) = tmp_path.glob("*.whl")
+    if importlib.util.find_spec("twine"):
+        subprocess.run([sys.executable, "-m", "twine", "check", "--strict", wheel], check=True)
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
         file.extractall(tmp_path / "site")

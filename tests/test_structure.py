@@ -8,7 +8,7 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
-    "arguments": "files",
+    "arguments": "calm files",
     "fields": "",
     "files": "",
     "reading": "",
@@ -24,17 +24,19 @@ LAYERS = {
     "coupling": "skin sensor effects geometry fields learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor effects geometry fields learning.serve",
+    "neighbours": "batch",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards versions press.approach "
     "press.indenter press.path",
-    "tasks": "coupling plugin batch sensor effects geometry files reading data.objects view.offscreen",
+    "tasks": "coupling plugin batch sensor effects geometry fields files reading data.objects view.offscreen",
     "view": "coupling plugin skin sensor geometry files reading tasks press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
     "resimulation": "arguments matching data recordings skin sensor geometry files shards",
+    "samples": "coupling plugin press.indenter data resimulation recordings effects sensor geometry files",
     "biotac_mj": "plugin",
 }
 ABOVE_ALL = {"cli"}

@@ -24,6 +24,8 @@ TYPED = (
     "skin",
     "matching",
     "resimulation",
+    "samples",
+    "neighbours",
 )
 
 

@@ -19,12 +19,13 @@ __all__ = ["press", "render"]
 
 
 def _read(handle, data):
-    """What one step left: (3,) force of the skin on the indenter [N], (23,) counts, non-converged steps."""
-    # of PAC's 22 the latest
+    """What one step left: (3,) force of the skin on the indenter [N], (23,) counts with the latest of PAC,
+    its 22, non-converged steps."""
     counts = np.concatenate(
         [handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])]
     )
-    return -handle.read(data, "contact_force")[:3], counts, handle.read(data, "status")[1]
+    force, lost = -handle.read(data, "contact_force")[:3], handle.read(data, "status")[1]
+    return force, counts, handle.read(data, "pac"), lost
 
 
 def press(
@@ -80,7 +81,9 @@ def press(
     seconds = time.perf_counter() - begin
     if render is not None:
         picture = render(model, data)
-    times, depth, position, xpos, force, counts, nonconverged = (np.array(column) for column in zip(*rows))
+    times, depth, position, xpos, force, counts, pac, nonconverged = (
+        np.array(column) for column in zip(*rows)
+    )
     record = PressRecord(
         geometry=geometry,
         parameters={
@@ -92,6 +95,7 @@ def press(
         depth=depth,
         force=force,
         counts=counts,
+        pac=pac,
         nonconverged=nonconverged,
         vert_xpos=xpos.astype(np.float32),
         indenter_pos=position,

@@ -34,6 +34,7 @@ class PressRecord:
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4), pose of the indenter's frame.
       indenter_vert, indenter_face: (p, 3) [m], (q, 3), its surface in that frame, for pictures.
       seconds: wall time of the steps [s].
+      pac: (n, 22) samples of each row's latest frame [counts], None where they were not kept.
     """
 
     geometry: SkinGeometry
@@ -49,6 +50,7 @@ class PressRecord:
     indenter_vert: np.ndarray
     indenter_face: np.ndarray
     seconds: float
+    pac: np.ndarray | None = None
 
     def __post_init__(self):
         n = len(self.time)
@@ -111,6 +113,8 @@ def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
         indenter_pose=(pose, "m, then quaternion w x y z"),
         nonconverged=(record.nonconverged, "steps"),
     )
+    if record.pac is not None:
+        columns["pac"] = record.pac, "count"
     topology = dict(
         vert=(geometry.vert, "m"),
         elem=(geometry.tets, "node"),

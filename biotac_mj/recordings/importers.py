@@ -12,6 +12,7 @@ from .columns import open_bytes
 from .matlab import read_matlab, read_matlab_hdf5
 from .nvidia import read_nvidia
 from .parts import Part, join
+from .pressed import KEYS, read_press
 from .published import companions, is_beside_the_point, object_of, rate_of
 from .recording import Recording, read
 from .text import read_text
@@ -31,8 +32,8 @@ def load(
     object_name: str | None = None,
     objects: list[str] | None = None,
 ) -> list[Recording]:
-    """Recordings of files: our own HDF5, text and CSV, MATLAB, .btd, bags of ROS, NVIDIA's HDF5, gzipped
-    or not.
+    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, .btd, bags of ROS, NVIDIA's HDF5,
+    gzipped or not.
 
     Files without electrodes (forces, poses) are put on the rows of those that have them: by their clocks,
     or row by
@@ -155,6 +156,8 @@ def _read_hdf5(path, rate, objects):
         )
     if "electrode_vals" in names or "contact_loc" in names or "force_vec" in names:
         return read_nvidia(path, rate, objects)
+    if set(KEYS) <= names:
+        return read_press(path)
     if schema or path.suffix != ".mat":
         return read(path)
     return _named(path, read_matlab_hdf5(path))

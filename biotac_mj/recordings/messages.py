@@ -78,7 +78,10 @@ def _leaves(value, name, out, depth):
             out[name] = np.asarray(value, float)
     elif isinstance(value, list | tuple):
         for i, one in enumerate(value):
-            _leaves(one, f"{name}_{i}", out, depth + 1)
+            if _fields(one) == ["name", "values"]:  # a channel of sensor_msgs, as tactile_msgs has them
+                _leaves(one.values, f"{name}_{one.name}", out, depth + 1)
+            else:
+                _leaves(one, f"{name}_{i}", out, depth + 1)
     elif hasattr(value, "typecode"):  # array.array, ROS 2's
         out[name] = np.asarray(value, float)
     else:

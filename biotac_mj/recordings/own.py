@@ -42,7 +42,7 @@ def rest_of(counts: np.ndarray, rate: float, force: np.ndarray | None) -> dict:
     load, light = np.zeros((len(counts), 0)), np.ones(len(counts), bool)
     if force is not None:
         load, normal = np.column_stack([force, force[:, 2] ** 2]), np.abs(force[:, 2])
-        light = normal < np.quantile(normal, _LIGHT)
+        light = normal <= np.quantile(normal, _LIGHT)  # often all of it is 0
     best = None
     for tau in _TIMES * time[-1]:
         design = np.column_stack([np.ones(len(time)), 1 - np.exp(-time / tau), load])[light]

@@ -1,16 +1,17 @@
-"""The verbs `biotac import`, `biotac show` and `biotac record`: their arguments here, their work beside
-it."""
+"""The verbs `biotac import`, `export`, `show` and `record`: their arguments here, their work beside it."""
 
 import argparse
 from collections.abc import Callable
 
 from ..arguments import output_file, real, whole
 
+_FORMS = ("biotac_sensors", "tactile_msgs")
+
 __all__ = ["add_load_arguments", "add_verbs", "load_given"]
 
 
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds the three to argparse's subparsers; verb(verbs, name, run, text) makes one."""
+    """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""
     v = verb(
         verbs,
         "import",
@@ -21,6 +22,19 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     v.add_argument("files", nargs="+", metavar="FILE", help="of a sensor, and of forces and poses beside it")
     add_load_arguments(v)
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+    v = verb(
+        verbs,
+        "export",
+        _export,
+        "Write a recording, or the skin.h5 of a simulated press, as the bag of a driver of the real sensor.",
+    )
+    v.add_argument("file", metavar="FILE", help="skin.h5 of a press, or what `biotac import` reads")
+    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_load_arguments(v)
+    bag = v.add_mutually_exclusive_group(required=True)
+    bag.add_argument("--ros1", type=output_file(), metavar="OUT.bag", help="a bag of ROS 1")
+    bag.add_argument("--ros2", type=output_file(), metavar="OUT", help="a bag of ROS 2: a folder to make")
+    v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
     v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac import` wrote or reads")
     v.add_argument(
@@ -79,6 +93,20 @@ def _import(args):
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join([*findings(one), *one.notes]))
     print(f"written: {args.out}; see it with `biotac show {args.out}`")
+
+
+def _export(args):
+    from .bags import write_bag
+    from .importers import load_one
+
+    recording, notes = load_one(
+        args.file, args.sensor, rate=args.rate, scale=args.scale, object_name=args.object
+    )
+    out, ros = (args.ros1, 1) if args.ros1 else (args.ros2, 2)
+    topics = write_bag(out, recording, ros, args.form)
+    for note in notes:
+        print(f"  note: {note}")
+    print(f"written: {out}, {len(recording)} rows on {', '.join(topics)}")
 
 
 def _show(args):

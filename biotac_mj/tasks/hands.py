@@ -1,8 +1,9 @@
-"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, the gripper
+"""BioTacs as the fingertips of robot hands: the Shadow Hand in two variants, Allegro, LEAP, Aero, the gripper
 2F-85, any other by body name."""
 
 import dataclasses
 import itertools
+import pathlib
 import typing
 from collections.abc import Iterable
 
@@ -10,58 +11,19 @@ import mujoco
 import numpy as np
 
 from ..coupling.config import SOLID, integer
-from ..geometry.rigid import quaternion
+from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
     from ..coupling.attachment import Handle
 
-__all__ = ["HANDS", "Mount", "attach_to_hand"]
+__all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms"]
 
-_TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
 _CORE_MASS = 4e-3  # of the BioTac [kg], taken off the link that carries it
-
-
-@dataclasses.dataclass(frozen=True)
-class Mount:
-    """Where a BioTac goes on a hand's link.
-
-    Attributes:
-      body: name of the link; a hand that was attached with a prefix is found by the end of the name.
-      pos: of the BioTac frame's origin in the link's frame [m].
-      tip, pad: directions in that frame in which the fingertip points and in which the pad looks.
-      replaces: names of the geoms that the BioTac stands for; None is all of the link and of what is fixed to
-        it.
-      shown: names of hidden geoms that stay and are drawn, where what was drawn of the link is replaced.
-    """
-
-    body: str
-    pos: tuple
-    tip: tuple = (0.0, 0.0, 1.0)
-    pad: tuple = (0.0, -1.0, 0.0)
-    replaces: tuple | None = None
-    shown: tuple = ()
-
-    @property
-    def quat(self) -> np.ndarray:
-        """(w, x, y, z) of the BioTac frame in the link's: its tip is -x, its pad -y.
-
-        Raises:
-          ValueError: tip and pad are not at right angles.
-        """
-        x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
-        if not np.isfinite([*x, *y]).all() or abs(x @ y) > 1e-6 or not x.any() or not y.any():
-            raise ValueError(
-                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: "
-                "a BioTac's pad looks sideways"
-            )
-        x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
-        return quaternion(np.stack([x, y, np.cross(x, y)], axis=1))
-
 
 # The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the
 # Menagerie's meshes.
 _SHADOW = {
-    finger: Mount(f"{finger}distal", (0, 0, (35e-3 if finger == "th" else 32e-3) - _TIP))
+    finger: Mount(f"{finger}distal", (0, 0, (35e-3 if finger == "th" else 32e-3) - TIP))
     for finger in ("ff", "mf", "rf", "lf", "th")
 }
 # Shadow's BioTac fingers (shadow-robot/sr_common, hand/xacro/finger/biotac): no moving distal joint; the
@@ -74,7 +36,7 @@ _SHADOW_AUTHENTIC = {
 # Menagerie's Allegro: capsules end 41 mm (fingers) and 55 mm (thumb) beyond the last joint; fingers bend
 # towards +x.
 _ALLEGRO = {
-    finger: Mount(f"{finger}_tip", (0, 0, (55e-3 if finger == "th" else 41e-3) - _TIP), pad=(1.0, 0.0, 0.0))
+    finger: Mount(f"{finger}_tip", (0, 0, (55e-3 if finger == "th" else 41e-3) - TIP), pad=(1.0, 0.0, 0.0))
     for finger in ("ff", "mf", "rf", "th")
 }
 # Menagerie's LEAP: tips end at y = -50 mm (fingers) and -62 mm (thumb), their flat pads look to -x at 11.2
@@ -82,7 +44,7 @@ _ALLEGRO = {
 _LEAP = {
     finger: Mount(
         f"{finger}_ds",
-        (8.2e-3 - 11.2e-3, _TIP - length, z),
+        (8.2e-3 - 11.2e-3, TIP - length, z),
         tip=(0.0, -1.0, 0.0),
         pad=(-1.0, 0.0, 0.0),
         replaces=(f"{finger}_tip", f"{finger}_ds_visual"),  # the latter draws the tip too, and the link
@@ -97,12 +59,22 @@ _LEAP = {
 }
 # Menagerie's 2F-85: the pads end at z = 37.5 mm; the plate behind them, which stays, begins at y = 0, and a
 # BioTac reaches 5.3 mm behind its axis.
-_GRIPPER = {f: Mount(f"{f}_pad", (0, -5.3e-3, 37.5e-3 - _TIP)) for f in ("left", "right")}
+_GRIPPER = {f: Mount(f"{f}_pad", (0, -5.3e-3, 37.5e-3 - TIP)) for f in ("left", "right")}
+# Menagerie's Tetheria Aero: the tip's mesh ends at z = 26.8 mm (thumb 31.8 mm), its middle lies 2.2 mm
+# (3.4 mm) to the pad's side of the joint's plane. Tendons that the link carries stay.
+_AERO = {
+    finger: Mount(
+        f"{name}_distal_link",
+        (0, -3.4e-3 if finger == "th" else -2.2e-3, (31.8e-3 if finger == "th" else 26.8e-3) - TIP),
+    )
+    for finger, name in zip(("if", "mf", "rf", "pf", "th"), ("index", "middle", "ring", "pinky", "thumb"))
+}
 HANDS = {
     "shadow_hand": _SHADOW,
     "shadow_hand_authentic": _SHADOW_AUTHENTIC,
     "allegro_hand": _ALLEGRO,
     "leap_hand": _LEAP,
+    "aero_hand": _AERO,
     "robotiq_2f85": _GRIPPER,
 }
 
@@ -116,6 +88,7 @@ def attach_to_hand(
     self_touch: bool = False,
     slots: int | None = None,
     batch: bool = False,
+    mount: pathlib.Path | str | None = None,
     **settings: object,
 ) -> dict[str, "Handle"] | dict[str, str]:
     """Puts BioTacs onto the fingertips of a hand.
@@ -126,8 +99,9 @@ def attach_to_hand(
 
     Args:
       spec: the MjSpec that holds the hand. Add the objects first, as for `attach`.
-      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, robotiq_2f85: Menagerie's models, left or
-        right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with that variant.
+      hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, aero_hand, robotiq_2f85: Menagerie's
+        models, left or right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with
+        that variant.
       fingers: which of them, e.g. ("ff", "th"); None takes all.
       variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
         BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
@@ -136,6 +110,7 @@ def attach_to_hand(
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
       batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
+      mount: a file that `biotac mount` wrote, in place of `hand`.
       settings: further ones of `attach`, for every finger (each gets its own noise seed).
 
     Returns:
@@ -152,6 +127,8 @@ def attach_to_hand(
     for name in ("site", "body", "pos", "quat"):
         if name in settings:
             raise ValueError(f"{name}={settings[name]!r} is given: a finger's place is its Mount's")
+    if mount is not None:
+        hand = read_mounts(mount)
     mounts = _mounts(hand, variant)
     fingers = tuple(mounts) if fingers is None else (fingers,) if isinstance(fingers, str) else tuple(fingers)
     if not fingers:
@@ -159,7 +136,7 @@ def attach_to_hand(
     for finger in fingers:
         if finger not in mounts:
             raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
-    links = {finger: _find(spec, mounts[finger].body) for finger in fingers}
+    links = {finger: find_link(spec, mounts[finger].body) for finger in fingers}
     own = _subtree(_root(next(iter(links.values()))))
     taken = {body.name for body in spec.bodies}
     free = (name for i in itertools.count() if (name := f"{prefix}link{i}") not in taken)
@@ -249,7 +226,12 @@ def _mounts(hand, variant):
     return HANDS[hand]
 
 
-def _find(spec, name):
+def find_link(spec: mujoco.MjSpec, name: str) -> "mujoco._specs.MjsBody":
+    """The body of that name, or the only one whose name ends with it.
+
+    Raises:
+      ValueError: none, or several; the text lists them.
+    """
     found = [b for b in spec.bodies if b.name == name] or [b for b in spec.bodies if b.name.endswith(name)]
     if len(found) != 1:
         there = ", ".join(b.name for b in (found or spec.bodies) if b.name) or "no named bodies"
@@ -273,11 +255,8 @@ def _subtree(body):
 
 def _replace(spec, link, mount, own):
     """Puts what the BioTac stands for out of the way; the skin touches nothing of the bodies named `own`."""
-    geoms = _fixed_geoms(link)
-    shown = [g for name in mount.shown for g in _named(geoms, name, link)]
-    if mount.replaces is not None:
-        geoms = [g for name in mount.replaces for g in _named(geoms, name, link)]
-    for geom in geoms:
+    shown = fixed_geoms(link, mount.shown)
+    for geom in fixed_geoms(link, mount.replaces):
         geom.contype = geom.conaffinity = 0
         geom.mass, geom.material, geom.rgba[3] = 0.0, "", 0.0
         for pair in [p for p in spec.pairs if geom.name and geom.name in (p.geomname1, p.geomname2)]:
@@ -287,21 +266,32 @@ def _replace(spec, link, mount, own):
         geom.group = 0
 
 
-def _named(geoms, name, link):
-    found = [g for g in geoms if g.name and g.name.endswith(name)]
-    if not found:
-        there = ", ".join(g.name for g in geoms if g.name) or "no named geom"
-        raise ValueError(
-            f"link {link.name!r} has no geom {name!r}: its geoms are {there}; give Mount(replaces=...) those "
-            "that the BioTac stands for, () for none"
-        )
-    return found
+def fixed_geoms(
+    link: "mujoco._specs.MjsBody", names: Iterable[str] | None = None
+) -> list["mujoco._specs.MjsGeom"]:
+    """Geoms of a link and of the bodies that do not move against it.
 
+    Args:
+      names: of those that are wanted, or how they end; None is all.
 
-def _fixed_geoms(link):
-    """Geoms of a link and of the bodies that do not move against it."""
+    Raises:
+      ValueError: no geom has one of the names; the text lists those there are.
+    """
     fixed = (body for body in link.bodies if not body.joints and not body.mocap)
-    return [*link.geoms, *(g for body in fixed for g in _fixed_geoms(body))]
+    geoms = [*link.geoms, *(g for body in fixed for g in fixed_geoms(body))]
+    if names is None:
+        return geoms
+    out = []
+    for name in names:
+        found = [g for g in geoms if g.name and g.name.endswith(name)]
+        if not found:
+            there = ", ".join(g.name for g in geoms if g.name) or "no named geom"
+            raise ValueError(
+                f"link {link.name!r} has no geom {name!r}: its geoms are {there}; give Mount(replaces=...) "
+                "those that the BioTac stands for, () for none"
+            )
+        out += found
+    return out
 
 
 def _let_touch(spec, name, own):

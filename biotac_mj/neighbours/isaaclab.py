@@ -1,0 +1,203 @@
+"""A BioTac with the interface of Isaac Lab's sensors, beside a simulation that is not MuJoCo's.
+
+`BioTacSensor` has the methods of `isaaclab.sensors.SensorBase` that a scene calls, and is no subclass of it:
+`SensorBase` needs a USD stage. `InteractiveScene` therefore does not make it from its configuration; put it
+there when the simulation is ready:
+
+    scene.sensors["biotac"] = BioTacSensor(BioTacSensorCfg(model=model, poses=poses, num_envs=n))
+
+The scene then updates and resets it with its own. The skin is told where bodies are; what it answers lies in
+`forces`, for `set_external_force_and_torque` of the assets.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Callable, Sequence
+
+import mujoco
+import numpy as np
+
+from .. import batch
+from .readings import BioTacData, world_mask
+
+if typing.TYPE_CHECKING:
+    import torch
+
+__all__ = ["BioTacSensor", "BioTacSensorCfg"]
+
+_EARLY = 1e-6  # [s] a period is over so much before its end: sums of time steps err
+
+
+@dataclasses.dataclass(kw_only=True)
+class BioTacSensorCfg:
+    """Configuration.
+
+    Attributes:
+      model: MjModel of the BioTac and of what can touch it, made with `biotac_mj.batch.add(spec,
+        coupling="one-way")`; its time step is the simulation's.
+      poses: () -> {body name: ((n, 3) [m], (n, 4) w x y z)} of the model's bodies that move, torch tensors in
+        one frame; bodies that are left out stay where the model has them.
+      num_envs: n. device: of Warp and torch.
+      update_period: [s] between values of `data`, 0 for every step. prim_path, history_length, debug_vis: as
+        in `SensorBaseCfg`; no history is kept and nothing is drawn.
+      settings: further arguments of `biotac_mj.batch.make`, as {"skin": "coarse", "prefix": "biotac_"}.
+    """
+
+    model: mujoco.MjModel
+    poses: Callable[[], dict]
+    num_envs: int
+    device: str = "cpu"
+    update_period: float = 0.0
+    prim_path: str = ""
+    history_length: int = 0
+    debug_vis: bool = False
+    settings: dict = dataclasses.field(default_factory=dict)
+
+    @property
+    def class_type(self) -> type:
+        """The sensor's class."""
+        return BioTacSensor
+
+
+class BioTacSensor:
+    """BioTacs of all environments.
+
+    Raises:
+      ValueError: a setting that cannot be, or a history, which is not kept.
+    """
+
+    has_debug_vis_implementation = False
+    supports_batch_update = False
+
+    def __init__(self, cfg: BioTacSensorCfg):
+        import torch
+
+        if cfg.history_length or cfg.update_period < 0:
+            raise ValueError(
+                f"history_length is {cfg.history_length} and update_period {cfg.update_period}: no history "
+                "is kept, take 0; the period is 0 or more"
+            )
+        self.cfg, model = cfg, cfg.model
+        self.batch = batch.make(model, cfg.num_envs, cfg.device, **cfg.settings)
+        rest = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, rest)
+        self._rest = [self._tensor(x) for x in (rest.xpos, rest.xmat.reshape(-1, 3, 3))]
+        self._ipos = self._tensor(model.body_ipos)
+        self._pos, self._mat = (x.expand(cfg.num_envs, *x.shape).clone() for x in self._rest)
+        self._elapsed = torch.full((cfg.num_envs,), cfg.update_period, device=cfg.device)
+        self._data = self._read()
+
+    def _tensor(self, value):
+        import torch
+
+        return torch.tensor(value, dtype=torch.float32, device=self.cfg.device)
+
+    @property
+    def is_initialized(self) -> bool:
+        """It is, once made."""
+        return True
+
+    @property
+    def num_instances(self) -> int:
+        """Sensors: one in each environment."""
+        return self.cfg.num_envs
+
+    @property
+    def device(self) -> str:
+        """Of `data`."""
+        return self.cfg.device
+
+    @property
+    def data(self) -> BioTacData:
+        """As of each environment's last due update."""
+        return self._data
+
+    @property
+    def forces(self) -> dict[str, "torch.Tensor"]:
+        """{body name: (n, 6)} force and torque [N, N m] on the bodies that `poses` names, at their centres of
+        mass, in the frame of the poses, as of the last update."""
+        import warp as wp
+
+        applied = wp.to_torch(self.batch.xfrc_applied)
+        return {name: applied[:, self.cfg.model.body(name).id] for name in self.cfg.poses()}
+
+    def set_debug_vis(self, debug_vis: bool) -> bool:
+        """False: nothing is drawn."""
+        return False
+
+    def update(self, dt: float, force_recompute: bool = False) -> None:
+        """After a step of the simulation. The skin is solved every time, as it has a memory; `data` is new
+        where the period is over.
+
+        Args:
+          dt: [s], the model's time step. force_recompute: new data everywhere.
+
+        Raises:
+          ValueError: another time step, a body that the model does not have, or poses of another shape.
+        """
+        step = self.cfg.model.opt.timestep
+        if abs(dt - step) > 1e-9 + 1e-6 * step:
+            raise ValueError(f"dt is {dt:g} s, the model's time step {step:g} s: make them equal")
+        self._place()
+        self.batch.step(self._pos, self._mat, self._pos + (self._mat @ self._ipos[..., None])[..., 0])
+        self._elapsed += dt
+        due = (self._elapsed + _EARLY >= self.cfg.update_period) | force_recompute
+        new = self._read()
+        for field in dataclasses.fields(BioTacData):
+            getattr(self._data, field.name)[due] = getattr(new, field.name)[due]
+        self._elapsed[due] = 0.0
+
+    def reset(self, env_ids: Sequence[int] | None = None, env_mask: object = None) -> None:
+        """Puts skins and clocks of some environments to rest: their next update is due.
+
+        Args:
+          env_ids: their numbers, None for all. env_mask: (n,) of bool, in their place; of Warp, too.
+        """
+        if hasattr(env_mask, "numpy"):
+            env_mask = env_mask.numpy()
+        mask = world_mask(env_ids if env_mask is None else np.asarray(env_mask, bool), self.cfg.num_envs)
+        self.batch.reset(mask)
+        self._elapsed[mask.nonzero()[0]] = self.cfg.update_period
+
+    def _place(self):
+        """Puts the bodies, and what is fixed to them, where `poses` says."""
+        model, n = self.cfg.model, self.cfg.num_envs
+        there = [model.body(i).name for i in range(model.nbody)]
+        told = self.cfg.poses()
+        for name, (pos, quat) in told.items():
+            if name not in there:
+                raise ValueError(
+                    f"poses name {name!r}: the model's bodies are {', '.join(filter(None, there))}"
+                )
+            if tuple(pos.shape) != (n, 3) or tuple(quat.shape) != (n, 4):
+                raise ValueError(
+                    f"poses of {name!r} have shapes {tuple(pos.shape)} and {tuple(quat.shape)}: ({n}, 3) and "
+                    f"({n}, 4) are needed"
+                )
+        tops = {there.index(name): self._pose(*pose) for name, pose in told.items()}
+        for body in range(1, model.nbody):
+            top = body
+            while top and top not in tops:
+                top = model.body_parentid[top]
+            if top:
+                back = self._rest[1][top].T
+                pos, mat = tops[top]
+                self._pos[:, body] = pos + mat @ (back @ (self._rest[0][body] - self._rest[0][top]))
+                self._mat[:, body] = mat @ (back @ self._rest[1][body])
+
+    def _pose(self, pos, quat):
+        """(n, 3), (n, 3, 3) of positions and quaternions w x y z."""
+        import torch
+
+        quat = quat / quat.norm(dim=1, keepdim=True)
+        w, v = quat[:, 0, None, None], quat[:, 1:]
+        x, y, z, o = *v.T, torch.zeros_like(quat[:, 0])
+        cross = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=1).reshape(-1, 3, 3)
+        return pos, torch.eye(3, device=quat.device) + 2 * (w * cross + cross @ cross)
+
+    def _read(self):
+        import warp as wp
+
+        return BioTacData(
+            **{name: wp.to_torch(value).clone() for name, value in self.batch.readings().items()}
+        )

@@ -1,0 +1,145 @@
+"""Synthetic samples of what the verbs read, for who has no real sensor at hand: `biotac samples`."""
+
+import pathlib
+
+import mujoco
+import numpy as np
+
+from .coupling import attach
+from .data.objects import make_object
+from .data.plan import plan_motions
+from .effects.catalogue import by_id
+from .files import replacing
+from .geometry import load_skin
+from .geometry.rigid import quaternion
+from .plugin import explained
+from .press.indenter import add_indenter
+from .recordings import Recording
+from .recordings.recording import BUS_RATE
+from .resimulation.resimulate import ResimulateOptions, resimulate
+from .sensor.channels import CHANNELS, NELECTRODE
+
+__all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
+
+OBJECT, SKIN = "sphere_7mm", "coarse"
+TOUCHES = 20
+_TOUCH, _AWAY = 24, 8  # rows of a touch, and on either side of it
+_GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
+_BEFORE = 1000  # rows before the first touch
+_LOGGED, _EVERY = (
+    6,
+    2,
+)  # touches and rows in log.csv: `biotac diagnose` solves the skin in each again and again
+_CLEAR = 4e-3  # [m] that the object goes away
+_SET_RATE = 33.0  # [Hz] of the rows that the set takes: eight or nine of a touch
+# what the recorded sensor has and the simulated one lacks, for `biotac diagnose` to find
+EFFECT = ("warmup", {"a": -0.25, "tau": 5.0})
+
+
+def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = True) -> list[pathlib.Path]:
+    """Writes a synthetic recording of touches by a sphere in the forms that people have, and a set of it.
+
+    electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
+    log.csv has all channels and the sphere's pose beside them for the first touches; set/ is all touches with
+    the simulated skin under them, for `biotac train`.
+
+    Args:
+      folder: made if it is not there; what is in it under these names is written anew.
+      seed: of the touches and the noise. progress: whether to show a bar for the set.
+
+    Returns:
+      the paths written.
+
+    Raises:
+      ValueError: set/ holds another set.
+    """
+    folder = pathlib.Path(folder)
+    recording = record_touches(seed)
+    out = [folder / name for name in ("electrodes.txt", "forces.txt", "log.csv", "set")]
+    _write(out[0], recording.electrodes, "%.0f")
+    _write(out[1], recording.force, "%.4f")
+    logged = slice(0, _BEFORE + _LOGGED * (_TOUCH + 2 * _AWAY), _EVERY)
+    columns = {
+        "time": recording.time,
+        **{f"e{i + 1}": column for i, column in enumerate(recording.electrodes.T)},
+        **{name: getattr(recording, name) for name in ("pdc", "tac", "tdc")},
+        **{f"F{a}": column for a, column in zip("xyz", recording.force.T)},
+        **{f"object_pos_{a}": column for a, column in zip("xyz", recording.object_pos.T)},
+        **{f"object_q{a}": column for a, column in zip("wxyz", recording.object_quat.T)},
+    }
+    _write(out[2], np.column_stack(list(columns.values()))[logged], "%.9g", ",".join(columns))
+    options = ResimulateOptions(skin=SKIN, rate=_SET_RATE, batch=TOUCHES, seed=seed)
+    resimulate(recording, out[3], options, workers=0, progress=progress)
+    return out
+
+
+def _write(path, rows, form, header=""):
+    with replacing(path) as temporary:
+        np.savetxt(temporary, rows, form, "," if header else " ", header=header, comments="")
+
+
+def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
+    """A sphere that presses and slides at one place of the skin after another, as a sensor with EFFECT reads
+    it at 100 Hz: synthetic, by the condensed skin.
+
+    Args:
+      seed: of the touches and the noise. touches: how many.
+    """
+    ways = plan_motions(
+        load_skin(SKIN), OBJECT, [[seed, i] for i in range(touches)], _TOUCH, ("press", "slide")
+    )
+    pos, quat = _way(ways)
+    pos, quat = (np.concatenate([np.tile(x[:1], (_BEFORE, 1)), x]) for x in (pos, quat))
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 1 / BUS_RATE, np.zeros(3)
+    spec.worldbody.add_body(name="finger")
+    body = spec.worldbody.add_body(name="object", pos=pos[0], quat=quat[0], mocap=True)
+    add_indenter(spec, body, make_object(OBJECT), contype=0, conaffinity=0)
+    name, theta = EFFECT
+    handle = attach(
+        spec,
+        body="finger",
+        skin=SKIN,
+        tier="condensed",
+        coupling="one-way",
+        geoms=["indenter"],
+        effects=[(by_id(name), theta)],
+        seed=seed,
+        on_error="raise",
+    )
+    read, rows = ("electrodes", *CHANNELS[NELECTRODE:], "contact_force"), []
+    with explained():
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        for p, q in zip(pos, quat):
+            data.mocap_pos[0], data.mocap_quat[0] = p, q
+            mujoco.mj_step(model, data)
+            rows.append([handle.read(data, name) for name in read])
+    electrodes, pdc, pac, tdc, tac, wrench = (np.array(column) for column in zip(*rows))
+    return Recording(
+        np.arange(len(pos)) / BUS_RATE,
+        electrodes=electrodes,
+        pdc=pdc[:, 0],
+        pac=pac,
+        tdc=tdc[:, 0],
+        tac=tac[:, 0],
+        force=-wrench[:, :3],
+        object_pos=pos,
+        object_quat=quat,
+        name="synthetic",
+        object=OBJECT,
+        source="biotac samples: synthetic",
+        frame="BioTac",
+    )
+
+
+def _way(ways):
+    """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back."""
+    out = np.r_[np.full(_AWAY - _AWAY // 2, 1.0), np.linspace(1, 0, _AWAY // 2, endpoint=False)][:, None]
+    pos, mat = [], []
+    for way in ways:
+        inside = way.pos[0] + _GENTLE * (way.pos - way.pos[0])
+        first, last = (inside[k] - _CLEAR * out * way.mat[k][:, 1] for k in (0, -1))
+        pos += [first, inside, last[::-1]]
+        mat.append(way.mat[np.r_[np.zeros(_AWAY, int), : len(way.mat), np.full(_AWAY, -1)]])
+    return np.concatenate(pos), quaternion(np.concatenate(mat))

@@ -1,0 +1,205 @@
+"""`biotac mount`: where a BioTac goes on a link of a hand that nobody has described yet, as a file and a
+picture."""
+
+import argparse
+import pathlib
+
+import mujoco
+import numpy as np
+
+from ..files import replacing
+from ..geometry.rigid import matrix
+from ..reading import reading
+from ..view.offscreen import Offscreen, find_gl
+from .hands import attach_to_hand, find_link, fixed_geoms
+from .mounts import TIP, Mount, write_mounts
+
+__all__ = ["draw_mount", "guess_mount", "light", "mount_verb", "side_view"]
+
+_END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
+_VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
+
+
+def guess_mount(spec: mujoco.MjSpec, body: str, **given: object) -> Mount:
+    """A Mount by the link's own shape: the fingertip points along the axis of its frame on which its geoms
+    reach farthest, the pad looks where its joint bends it to, and the BioTac ends where the link ended.
+
+    Args:
+      spec: of the hand. body: the link's name, or how it ends.
+      given: fields of Mount that are known.
+
+    Raises:
+      ValueError: no such link, or one without geoms; directions that are not at right angles.
+    """
+    link = find_link(spec, body)
+    model = spec.copy().compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    here = data.body(model.body(link.name).id)
+    frame = here.xmat.reshape(3, 3)
+    points = (_points(model, data, _fixed(model, here.id)) - here.xpos) @ frame
+    if not len(points):
+        raise ValueError(
+            f"link {link.name!r} has no geom to tell its end by: choose the link with the fingertip"
+        )
+    if "tip" not in given:
+        reach = np.concatenate([points.max(0), -points.min(0)])
+        given["tip"] = _plain(np.concatenate([np.eye(3), -np.eye(3)])[reach.argmax()])
+    tip = np.asarray(given["tip"], float) / np.linalg.norm(given["tip"])
+    if "pad" not in given:
+        bends = np.cross(frame.T @ _axis(model, data, here.id), tip)
+        if np.linalg.norm(bends) < 0.5:
+            raise ValueError(
+                f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
+            )
+        given["pad"] = _plain((bends / np.linalg.norm(bends)).round(6))
+    if "pos" not in given:
+        along = points @ tip
+        end = points[along > along.max() - _END]
+        middle = (end.max(0) + end.min(0)) / 2
+        given["pos"] = _plain((middle + (along.max() - TIP - middle @ tip) * tip).round(5))
+    mount = Mount(link.name, **given)
+    _ = mount.quat  # says what is wrong with the directions
+    return mount
+
+
+def _plain(vector):
+    return tuple((vector + 0.0).tolist())  # -0.0 reads badly
+
+
+def _fixed(model, link):
+    """(nbody,) whether a body is the link or does not move against it."""
+    found = np.zeros(model.nbody, bool)
+    found[link] = True
+    for i in range(link + 1, model.nbody):  # parents come first
+        found[i] = found[model.body_parentid[i]] and not model.body_jntnum[i] and model.body_mocapid[i] < 0
+    return found
+
+
+def _points(model, data, bodies):
+    """(n, 3) of the geoms of some bodies: vertices of meshes, corners of the boxes around others [m]."""
+    corners = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)
+    out = [np.zeros((0, 3))]
+    for g in np.flatnonzero(bodies[model.geom_bodyid]):
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
+            m = model.geom_dataid[g]
+            start, n = model.mesh_vertadr[m], model.mesh_vertnum[m]
+            local = model.mesh_vert[start : start + n]
+        else:
+            local = model.geom_aabb[g, :3] + corners * model.geom_aabb[g, 3:]
+        out.append(data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T)
+    return np.concatenate(out)
+
+
+def _axis(model, data, body):
+    """(3,) axis of the nearest hinge that moves a body, turned so that it bends the finger further."""
+    while body:
+        for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE:
+                low, high = model.jnt_range[j] if model.jnt_limited[j] else (0.0, 1.0)
+                return data.xaxis[j] * (1 if high >= -low - 1e-9 else -1)
+        body = model.body_parentid[body]
+    raise ValueError("no hinge moves this link: say where its pad looks, --pad X Y Z")
+
+
+def side_view(
+    pos: np.ndarray, mat: np.ndarray, eye: tuple = _VIEWS[0], distance: float = 0.11
+) -> mujoco.MjvCamera:
+    """A camera on a BioTac.
+
+    Args:
+      pos, mat: (3,) [m], (3, 3) of the BioTac frame. eye: direction in it from which is looked.
+      distance: [m] of the camera.
+    """
+    camera, look = mujoco.MjvCamera(), -mat @ np.asarray(eye) / np.linalg.norm(eye)
+    camera.lookat[:], camera.distance = pos - 5e-3 * mat[:, 0], distance
+    camera.azimuth = np.degrees(np.arctan2(look[1], look[0]))
+    camera.elevation = np.degrees(np.arcsin(look[2]))
+    return camera
+
+
+def draw_mount(
+    path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
+) -> np.ndarray | None:
+    """(height, 3 width, 3) uint8: the link as it was, what the BioTac stands for in red; then with the
+    BioTac and its axes (x red, to the clamp; y green, to the nail; z blue), from beside and onto its pad.
+    None where no GL library works.
+
+    Args:
+      path: MJCF of the hand.
+    """
+    gl, views = find_gl(), []
+    if gl is None:
+        return None
+    for attached, eyes in ((False, _VIEWS[:1]), (True, _VIEWS)):
+        spec = mujoco.MjSpec.from_file(str(path))
+        link = find_link(spec, mount.body)
+        if attached:
+            (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
+            _add_axes(spec.body(handle.body))
+        else:
+            for geom in fixed_geoms(link, mount.replaces):
+                geom.material, geom.rgba = "", [0.9, 0.15, 0.1, 1]
+        light(spec)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        here = data.body(link.name)
+        frame = here.xmat.reshape(3, 3)
+        pos, mat = here.xpos + frame @ mount.pos, frame @ matrix(mount.quat)
+        with Offscreen(model, width, height, gl) as screen:
+            views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
+    return np.concatenate(views, axis=1)
+
+
+def light(spec: mujoco.MjSpec) -> None:
+    """Light from where the camera is, a white background, and nothing cut off that is near the camera."""
+    spec.stat.extent, spec.visual.map.znear = 0.2, 0.02
+    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.5, 0.6
+    for texture in [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]:
+        spec.delete(texture)
+    flat = dict(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
+    spec.add_texture(name="biotac_sky", width=8, height=48, rgb1=[1, 1, 1], rgb2=[1, 1, 1], **flat)
+
+
+def _add_axes(body):
+    for axis, colour in zip(np.eye(3), np.eye(3)):
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[0, 0, 0, *(0.02 * axis)],
+            size=[6e-4, 0, 0],
+            rgba=[*colour, 1],
+            contype=0,
+            conaffinity=0,
+            mass=0,
+        )
+
+
+def mount_verb(args: argparse.Namespace) -> None:
+    """`biotac mount`: guesses, writes, draws and says what was done."""
+    with reading(args.hand, "MJCF of a hand", "give its .xml, beside its meshes"):
+        mujoco.MjSpec.from_file(args.hand).compile()
+    given = {name: getattr(args, name) for name in ("tip", "pad", "pos", "replaces")}
+    given = {name: tuple(value) for name, value in given.items() if value is not None}
+    mounts = {}
+    for body in args.body:
+        spec = mujoco.MjSpec.from_file(args.hand)
+        mount = guess_mount(spec, body, **given)
+        mounts[mount.body] = mount
+        replaced = fixed_geoms(find_link(spec, mount.body), mount.replaces)
+        names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in replaced]
+        print(f"{mount.body}: at {mount.pos} m, tip {mount.tip}, pad {mount.pad}")
+        print(f"  stands for {', '.join(names) or 'nothing'}: not drawn, touches nothing")
+    write_mounts(args.out, mounts)
+    print(f'written: {args.out}; biotac_mj.attach_to_hand(spec, mount="{args.out}")')
+    if args.picture:
+        rows = [draw_mount(args.hand, mount) for mount in mounts.values()]
+        if rows[0] is None:
+            raise ValueError(
+                "no GL library works here: leave --picture out, or install libosmesa6 or libegl1"
+            )
+        import matplotlib.image
+
+        with replacing(args.picture) as temporary:
+            matplotlib.image.imsave(temporary, np.concatenate(rows))
+        print(f"drawn: {args.picture}")

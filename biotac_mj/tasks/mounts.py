@@ -1,0 +1,85 @@
+"""Where a BioTac goes on a link of a hand, and the file that keeps it."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from ..fields import check_entries, check_types, refuse_unknown
+from ..files import replacing
+from ..geometry.rigid import quaternion
+from ..reading import read_yaml, reading
+
+__all__ = ["TIP", "Mount", "read_mounts", "write_mounts"]
+
+TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
+_REMEDY = "give a file that `biotac mount` wrote"
+
+
+@dataclasses.dataclass(frozen=True)
+class Mount:
+    """Where a BioTac goes on a hand's link.
+
+    Attributes:
+      body: name of the link; a hand that was attached with a prefix is found by the end of the name.
+      pos: of the BioTac frame's origin in the link's frame [m].
+      tip, pad: directions in that frame in which the fingertip points and in which the pad looks.
+      replaces: names of the geoms that the BioTac stands for; None is all of the link and of what is fixed to
+        it.
+      shown: names of hidden geoms that stay and are drawn, where what was drawn of the link is replaced.
+    """
+
+    body: str
+    pos: tuple
+    tip: tuple = (0.0, 0.0, 1.0)
+    pad: tuple = (0.0, -1.0, 0.0)
+    replaces: tuple | None = None
+    shown: tuple = ()
+
+    @property
+    def quat(self) -> np.ndarray:
+        """(w, x, y, z) of the BioTac frame in the link's: its tip is -x, its pad -y.
+
+        Raises:
+          ValueError: tip and pad are not at right angles.
+        """
+        x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
+        if not np.isfinite([*x, *y]).all() or abs(x @ y) > 1e-6 or not x.any() or not y.any():
+            raise ValueError(
+                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: "
+                "a BioTac's pad looks sideways"
+            )
+        x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
+        return quaternion(np.stack([x, y, np.cross(x, y)], axis=1))
+
+
+def write_mounts(path: pathlib.Path | str, mounts: dict[str, Mount]) -> None:
+    """{finger: Mount} as YAML, which `attach_to_hand(mount=path)` reads."""
+    import yaml
+
+    document = {
+        finger: {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(mount).items()}
+        for finger, mount in mounts.items()
+    }
+    text = "# of BioTacs: attach_to_hand(spec, mount=FILE); metres and directions in the link's frame\n"
+    with replacing(path) as temporary:
+        temporary.write_text(text + yaml.safe_dump(document, sort_keys=False))
+
+
+def read_mounts(path: pathlib.Path | str) -> dict[str, Mount]:
+    """What `write_mounts` wrote.
+
+    Raises:
+      FileNotFoundError, ValueError: no such file, or another one; the text names what is wrong.
+    """
+    document = read_yaml(path, "file of mounts", _REMEDY)
+    names = [field.name for field in dataclasses.fields(Mount)]
+    out = {}
+    with reading(path, "file of mounts", _REMEDY):
+        for finger, fields in document.items():
+            check_entries(f"finger {finger}", fields, {"body": str, "pos": tuple})
+            refuse_unknown(fields, names, f"finger {finger}")
+            out[finger] = Mount(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+            check_types(out[finger])
+            _ = out[finger].quat
+    return out

@@ -1,0 +1,82 @@
+"""The README and the tutorials do what they say: their blocks run in order, in one folder."""
+
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+REPO = pathlib.Path(__file__).resolve().parents[1]
+DOCUMENTS = [REPO / "README.md", *sorted((REPO / "docs" / "tutorials").glob("*.md"))]
+BLOCK = re.compile(r"^```(sh|python|\{code-cell\}[^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+MINUTES = 20  # more than any document takes
+
+# All Python of a document is one session, as in a notebook. An error names the document and its line.
+RUNNER = """
+import json, subprocess, sys
+name, blocks = json.loads(sys.stdin.read())
+session = {"__name__": "__main__"}
+for language, line, text in blocks:
+    if language == "sh":
+        trap = f"trap 'echo {name}:$((LINENO + {line - 1})): $BASH_COMMAND >&2' ERR\\n"
+        done = subprocess.run(["bash", "-eE", "-c", trap + text], stdin=subprocess.DEVNULL)
+        if done.returncode:
+            sys.exit(1)
+    else:
+        exec(compile("\\n" * line + text, name, "exec"), session)
+"""
+
+
+def blocks(text):
+    """(language, lines before its first, text) of each block that runs, a cell's options left out."""
+    found = []
+    for match in BLOCK.finditer(text):
+        language, body = match.groups()
+        before = text.count("\n", 0, match.start(2))
+        body = re.sub(r"^(:[\w-]+:.*|---)$", "", body, flags=re.MULTILINE)
+        found.append(("sh" if language == "sh" else "python", before, body))
+    return found
+
+
+def run(name, found, folder):
+    """What a document's blocks leave, run in a folder with the commands of this Python's environment."""
+    paths = {
+        "PATH": f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": REPO,
+    }
+    return subprocess.run(
+        [sys.executable, "-c", RUNNER],
+        input=json.dumps([name, found]),
+        cwd=folder,
+        env={**os.environ, **{key: str(value) for key, value in paths.items()}},
+        capture_output=True,
+        text=True,
+        timeout=60 * MINUTES,
+    )
+
+
+def test_a_block_that_fails_is_named_with_its_line(tmp_path):
+    text = "# A\n\n```sh\necho a > f\n```\n```console\nfalse\n```\n"
+    text += "```{code-cell} python\n:tags: [x]\nn = 1\n```\n"
+    found = blocks(text)
+    assert [(kind, line) for kind, line, _ in found] == [("sh", 3), ("python", 9)]
+    assert run("a.md", found, tmp_path).returncode == 0 and (tmp_path / "f").read_text() == "a\n"
+    for last, where in (
+        ("```python\nassert open('f').read()\n\nassert n == 2\n```\n", r'File "a.md", line 16'),
+        ("```sh\ntrue\nls nowhere\n```\n", r"a.md:15: ls nowhere"),
+    ):
+        done = run("a.md", blocks(text + last), tmp_path)
+        assert done.returncode and re.search(where, done.stderr), done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_blocks_run_in_order(path, tmp_path):
+    name = str(path.relative_to(REPO))
+    found = blocks(path.read_text())
+    assert found, f"{name} has no block marked sh or python"
+    done = run(name, found, tmp_path)
+    assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"

@@ -1,0 +1,111 @@
+"""`biotac mount`: places found by a link's own shape, the file that `attach_to_hand` takes, the picture;
+hands of the Menagerie where it is."""
+
+import importlib.util
+import re
+
+import mujoco
+import numpy as np
+import pytest
+from test_hands import FINGER, HAND, springs
+
+from biotac_mj import cli
+from biotac_mj.tasks.hands import HANDS, attach_to_hand
+from biotac_mj.tasks.mounting import guess_mount
+from biotac_mj.tasks.mounts import read_mounts, write_mounts
+from biotac_mj.view.offscreen import find_gl
+
+
+@pytest.fixture
+def hand(tmp_path):
+    path = tmp_path / "hand.xml"
+    path.write_text(
+        HAND.format(fingers="".join(FINGER.format(n=n, x=x) for n, x in (("a", -0.02), ("b", 0.02))))
+    )
+    return path
+
+
+def test_a_mount_by_the_links_shape(hand):
+    """The capsule ends 30 mm from the joint, which bends it towards -y."""
+    mount = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal")
+    assert mount.body == "my_adistal" and mount.tip == (0, 0, 1) and mount.pad == (0, -1, 0)
+    np.testing.assert_allclose(mount.pos, [0, 0, 30e-3 - 21.3e-3], atol=1e-5)
+    turned = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal", tip=(1.0, 0, 0), pad=(0, 0, 1.0))
+    np.testing.assert_allclose(turned.pos, [8e-3 - 21.3e-3, 0, 12e-3], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("body", "given", "text"),
+    [
+        ("nowhere", {}, "no link ends with 'nowhere': the model has world, ball, my_palm"),
+        ("distal", {}, "several links end with 'distal'"),
+        ("my_palm", {}, "no hinge moves this link: say where its pad looks, --pad X Y Z"),
+        ("adistal", {"tip": (1.0, 0, 0)}, "turns about its own length: say where its pad looks"),
+        ("adistal", {"tip": (0, 1.0, 0), "pad": (0, 1.0, 0)}, "must be at right angles"),
+    ],
+)
+def test_what_cannot_be_guessed_is_said(hand, body, given, text):
+    with pytest.raises(ValueError, match=text):
+        guess_mount(mujoco.MjSpec.from_file(str(hand)), body, **given)
+
+
+def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
+    out, picture = tmp_path / "mount.yaml", tmp_path / "mount.png"
+    words = ["mount", str(hand), "--body", "adistal", "bdistal", "--out", str(out)]
+    words += ["--picture", str(picture)] if find_gl() else []
+    assert cli.main(words) == 0
+    assert "stands for atip: not drawn, touches nothing" in capsys.readouterr().out
+    spec = mujoco.MjSpec.from_file(str(hand))
+    handles = attach_to_hand(spec, mount=out, **springs())
+    assert list(handles) == ["my_adistal", "my_bdistal"] and spec.compile().nplugin == 2
+    if find_gl():
+        from matplotlib.image import imread
+
+        for row in np.split(imread(picture)[..., :3], 2):
+            before, beside, onto = np.split(row, 3, axis=1)
+            pure = [(x[..., i] > 0.6 * x.sum(2)).sum() for x, i in ((before, 0), (beside, 1), (onto, 2))]
+            assert pure[0] > 1000 and min(pure[1:]) > 20  # the capsule that goes; axes to the nail and across
+            assert (beside[..., 1] > 1.3 * beside[..., 0]).mean() > 0.01  # the skin
+
+
+def test_mounts_come_back(tmp_path):
+    write_mounts(tmp_path / "all.yaml", HANDS["leap_hand"])
+    assert read_mounts(tmp_path / "all.yaml") == HANDS["leap_hand"]
+    for text, said in (
+        ("f: {body: a, pos: [0, 0, 0], tips: [1, 0, 0]}", "finger f has 'tips': did you mean 'tip'"),
+        ("f: {pos: [0, 0, 0]}", "finger f has no body: add what is missing"),
+        ("f: {body: 3, pos: [0, 0, 0]}", "body of finger f is 3: pass a text"),
+        ("f: [1]", "finger f is [1]: a dict is needed"),
+    ):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(ValueError, match=f"bad.yaml is no file of mounts .*{re.escape(said)}"):
+            read_mounts(tmp_path / "bad.yaml")
+    with pytest.raises(
+        FileNotFoundError, match="no file of mounts at .*: give a file that `biotac mount` wrote"
+    ):
+        attach_to_hand(mujoco.MjSpec(), mount=tmp_path / "none.yaml")
+
+
+def benchmark(repo):
+    spec = importlib.util.spec_from_file_location("mounts", repo / "benchmarks" / "mounts.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("hand", ["allegro_hand", "leap_hand", "robotiq_2f85", "aero_hand", "shadow_hand"])
+def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
+    """As hard on every finger, and on the pad; a link's shape says what was measured on its meshes."""
+    mounts = benchmark(repo)
+    path = mounts.model_of(hand)
+    if path is None:
+        pytest.skip(f"needs the Menagerie's {mounts.MODELS[hand]}: set MENAGERIE_ROOT")
+    found, *_ = mounts.press(path, hand)
+    assert list(found) == list(HANDS[hand])
+    for one in found.values():
+        assert one["lost"] == 0 and 0.3 < one["force"][1] < 1.0  # towards the nail
+        assert np.abs(one["change"]).argmax() in (0, 10) and one["change"].max() > 150  # e1, e11: beneath it
+    for mount in HANDS[hand].values():
+        guessed = guess_mount(mujoco.MjSpec.from_file(str(path)), mount.body)
+        np.testing.assert_allclose((guessed.tip, guessed.pad), (mount.tip, mount.pad), atol=0.03)
+        assert abs(np.dot(np.subtract(guessed.pos, mount.pos), mount.tip)) < 3e-4
