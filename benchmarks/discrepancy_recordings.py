@@ -241,18 +241,22 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "size": 1, "lead": 1},
-    "one": {"nats": 1, "counts": 1, "turns": -1, "lead": 1},
-    "answer": {"nats": 1, "spread": -1},
+    "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1},
+    "one": {"nats": 1, "counts": 1, "turns": -1, "lead": 1, "stands": 1},
+    "answer": {"nats": 1, "spread": -1, "factor": 1},
     "order": {"nats": 1, "ratio": 1},
     "samples": {"nats": 1},
-    "limit": {"nats": 1, "blocks": 1, "pile": 1},
-    "lost": {"times": 1},
+    "single": {"nats": 1, "alone": 1},
+    "still": {"nats": 1, "share": 1},
+    "limit": {"nats": 1, "blocks": 1, "share": 1, "runs": 1},
+    "lost": {"times": 1, "alike": 1, "number": -1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1},
     "pairs": {"share": 1, "kappa": 1, "t": 1},
-    "common": {"kappa": 1, "t": 1},
+    "common": {"factor": 1, "loaded": 1},
     "size": {"factor": 1, "counts": 1},
-    "force": {"gain": 1, "size": 1},
+    "late": {"gain": 1, "size": 1},
+    "memory": {"gain": 1, "size": 1, "blocks": 1},
     "left_loaded": {"fast1": 1, "level1": 1},
     "left_unloaded": {"counts1": 1, "level3": 1, "stands": 1},
 }
@@ -298,16 +302,21 @@ def _left_out(cases, signs, key):
     return out
 
 
+def _author(row):
+    """Whose recording it is."""
+    return row["base"] in {base.split()[0] for base in foreign.NATURAL if base not in first.NATURAL}
+
+
 def fit(rows: list) -> dict:
     """Weights of the confidence's logistic functions, by family, made as sure as they are of forms and of
-    sensors that were left out: log odds a s + b + one number for each family, drawn to nothing, fitted to
+    authors that were left out: log odds a s + b + one number for each family, drawn to nothing, fitted to
     the scores s of names left out (Platt); and the rate of the surest, which none exceeds."""
     from scipy.optimize import minimize
 
     out, score, family, y = {}, [], [], []
     for name, signs in CLUES.items():
         mine = [
-            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "base": r["base"]}
+            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "by": _author(r)}
             for r in rows
             for n in (*r["named"], *r["weak"])
             if n["family"] == name
@@ -329,7 +338,7 @@ def fit(rows: list) -> dict:
             "right": sum(n["right"] is not None for n in mine),
         }
         if not name.startswith("left"):
-            for key in ("form", "base"):
+            for key in ("form", "by"):
                 score += np.clip(_left_out(mine, signs, key), -6, 6).tolist()
                 family += [name] * len(mine)
                 y += [n["right"] is not None for n in mine]

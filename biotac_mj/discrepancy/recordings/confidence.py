@@ -11,11 +11,14 @@ from .findings import Finding
 __all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "probability"]
 
 FAMILIES = {
-    "shared": ("warmup", "fluidloss", "count_offset", "count_gain", "thermal"),
+    "shared": ("warmup", "thermal"),
+    "supply": ("fluidloss", "count_offset", "count_gain"),
     "one": ("drift",),
     "answer": ("gain", "flip"),
     "order": ("swap",),
-    "samples": ("stuck", "spikes", "freeze", "quantise"),
+    "samples": ("freeze", "quantise"),
+    "single": ("spikes",),
+    "still": ("stuck",),
     "limit": ("saturate",),
     "lost": ("lost_rows",),
     "line": ("hum",),
@@ -23,7 +26,8 @@ FAMILIES = {
     "pairs": ("crosstalk",),
     "common": ("common_noise",),
     "size": ("noise",),
-    "force": ("latency", "relax", "hyster"),
+    "late": ("latency",),
+    "memory": ("relax", "hyster"),
 }
 # confidence from which a finding is named: right names and missed ones on practice recordings
 NAMED = 0.55
@@ -33,8 +37,12 @@ _WEIGHTS = json.loads(_FITTED.read_text())
 
 def family(finding: Finding) -> str:
     """Key of FAMILIES."""
-    if finding.seen is not None:
-        return "force"
+    if finding.seen is not None:  # a low-pass may be of the noise alone
+        return "late" if finding.id == "latency" else "memory"
+    if "places" in finding.clues:
+        return "lost"
+    if "spread" in finding.clues:  # one that no longer answers is told as a gain is
+        return "answer"
     return next(name for name, ids in FAMILIES.items() if finding.id in ids)
 
 
