@@ -88,7 +88,7 @@ def _single(session, course, k, options):
         note=f"{'a step' if course.kind == 'step' else 'a course over time'} of "
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
-        | {"lead": float(np.clip(np.log(lead), -1, 2)), "stands": _stands(m, i), "course": course},
+        | {"lead": float(np.clip(np.log(lead), -1, 5)), "stands": _stands(m, i), "course": course},
         correct=correct,
     )
 
