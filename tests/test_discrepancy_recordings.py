@@ -240,9 +240,8 @@ def _irregular(x, rng):
     return x[at] + rng.integers(-1, 2, x.shape)
 
 
-def _bursts(x, rng):
-    on = np.arange(len(x)) // 200 % 2
-    return x + 15 * (on * rng.standard_normal(len(x)))[:, None] * rng.uniform(0.6, 1.4, 19)
+def _uneven(x, rng):
+    return x + 15 * rng.standard_normal((len(x), 1)) * rng.uniform(0.6, 1.4, 19)
 
 
 def _decimal(x, rng):
@@ -254,13 +253,13 @@ def _decimal(x, rng):
     [
         ("saturate", 4, _soft),
         ("freeze", None, _irregular),
-        ("common_noise", None, _bursts),
+        ("common_noise", None, _uneven),
         ("quantise", None, _decimal),
     ],
 )
 def test_forms_that_are_none_of_the_textbooks(name, channel, form):
-    """A limit that gives way, rows held for uneven times, noise in common that comes and goes, counts written
-    with too few decimals: of synthetic recordings."""
+    """A limit that gives way, rows held for uneven times, noise in common of uneven shares, counts
+    written with too few decimals: of synthetic recordings."""
     counts, _, rng = pressed(3)
     clean = noisy(counts, rng)
     assert name not in ids(diagnose_recording(Recording(clean, rate=RATE)))
