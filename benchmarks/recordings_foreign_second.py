@@ -564,10 +564,18 @@ def _held(rows):
     return form
 
 
-def _collections(n, rate, rng, size):
-    """A program that stops regularly to tidy up."""
-    period, pause = rng.uniform(3, 6) * rate, rng.uniform(0.35, 0.8) * rate
-    return (np.arange(n) + rng.integers(int(period))) % period < pause
+def _regularly(periods, pauses):
+    """A program that stops to tidy up, a buffer that is thrown away when it is full: so long [s] every so
+    often."""
+
+    def rows(n, rate, rng, size):
+        period, pause = rng.uniform(*periods) * rate, rng.uniform(*pauses) * rate
+        return (np.arange(n) + rng.integers(int(period))) % period < pause
+
+    return rows
+
+
+_TIDIES, _OVERFLOWS = _regularly((3, 6), (0.35, 0.8)), _regularly((6, 12), (0.3, 1.2))
 
 
 def _two_clocks(n, rate, rng, size):
@@ -599,12 +607,6 @@ def _lossy(rows):
         return range(19)
 
     return form
-
-
-def _overflow(n, rate, rng, size):
-    """A full buffer is thrown away, every so often."""
-    period, lost = rng.uniform(6, 12) * rate, rng.uniform(0.3, 1.2) * rate
-    return (np.arange(n) + rng.integers(int(period))) % period < lost
 
 
 def _interference(n, rate, rng, size):
@@ -906,8 +908,12 @@ EFFECTS = {
     "stuck": Effect((_two_codes, _loose_wire, _floating), "noisy", True),
     "saturate": Effect(_BOUNDS, "loaded", True),
     "spikes": Effect((_discharges, *_WORDS), "any", True),
-    "freeze": Effect(tuple(map(_held, (_collections, _two_clocks, _radio))), "noisy", True),
-    "lost": Effect(tuple(map(_lossy, (_overflow, _interference, _half_rate))), "loaded", True),
+    "freeze": Effect(
+        tuple(map(_held, (_regularly((3, 6), (0.35, 0.8)), _two_clocks, _radio))), "noisy", True
+    ),
+    "lost": Effect(
+        tuple(map(_lossy, (_regularly((6, 12), (0.3, 1.2)), _interference, _half_rate))), "loaded", True
+    ),
     "dither": Effect(_REFRESHED, "noisy"),
     "noise": Effect(_HISS),
     "common_noise": Effect(_GROUND),

@@ -6,7 +6,7 @@
 FOLDER holds flat presses on a force plate: epfl_flat_press/SynImpF1.txt with ForceData.txt, and
 epfl_f2/SynImpF2.txt.gz with ForceData.txt.gz. Every row gets the pose of the simulated plate that fits it;
 then each mechanism is tried as one number more, on blocks of time that it was not fitted on, and what is
-named is judged on the last 30 % of the rows. The first time states of the skin are solved: half an hour of
+named is judged on the last 30 % of the rows. The first time states of the skin are solved: ten minutes of
 processor time."""
 
 import argparse

@@ -228,6 +228,46 @@ def late(e, k, change, share=0.35):
     return out
 
 
+def _soft(x, rng):
+    level = np.quantile(x[:, 4], 0.2)
+    x[:, 4] = np.where(x[:, 4] < level, level + 0.04 * (x[:, 4] - level), x[:, 4])
+    return x
+
+
+def _irregular(x, rng):
+    read = np.unique(np.concatenate([[0], np.cumsum(rng.integers(3, 9, len(x)))]))
+    at = read[np.searchsorted(read, np.arange(len(x)), "right") - 1]
+    return x[at] + rng.integers(-1, 2, x.shape)
+
+
+def _uneven(x, rng):
+    return x + 15 * rng.standard_normal((len(x), 1)) * rng.uniform(0.6, 1.4, 19)
+
+
+def _decimal(x, rng):
+    return np.rint(np.rint(x / 4095 * 500) * 4095 / 500)
+
+
+@pytest.mark.parametrize(
+    ("name", "channel", "form"),
+    [
+        ("saturate", 4, _soft),
+        ("freeze", None, _irregular),
+        ("common_noise", None, _uneven),
+        ("quantise", None, _decimal),
+    ],
+)
+def test_forms_that_are_none_of_the_textbooks(name, channel, form):
+    """A limit that gives way, rows held for uneven times, noise in common of uneven shares, counts
+    written with too few decimals: of synthetic recordings."""
+    counts, _, rng = pressed(3)
+    clean = noisy(counts, rng)
+    assert name not in ids(diagnose_recording(Recording(clean, rate=RATE)))
+    d = diagnose_recording(Recording(np.clip(np.rint(form(clean, rng)), 0, 4095), rate=RATE))
+    found = [f for f in d.findings if name in (f.id, *f.ties)]
+    assert found and (channel is None or found[0].channels == (channel,)), summary(d)
+
+
 def test_gain_sign_and_order_under_load():
     e, _, rng = pressed(6, seconds=120)
     k = int(np.argmax(e.std(0)))

@@ -7,28 +7,33 @@ import os
 import pathlib
 import types
 
+import mujoco
 import numpy as np
 import pytest
 from made_up_plate import made_up_states
 
+import biotac_mj
 from biotac_mj.discrepancy.recordings.recording import Recording, read_recording
+from biotac_mj.discrepancy.recordings.search import diagnose_recording
 from biotac_mj.discrepancy.simulated import diagnosis
 from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
 from biotac_mj.discrepancy.simulated.mechanisms import COARSER, MECHANISMS, base_response, bonded, moved
 from biotac_mj.discrepancy.simulated.report import simulated_dict, summary, write_simulated
 from biotac_mj.discrepancy.verbs import diagnose_verb
+from biotac_mj.effects.amended import amend_settings
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
 from biotac_mj.matching.match import SIGNS
 from biotac_mj.matching.response import Response
+from biotac_mj.press.path import PressOptions
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
+from biotac_mj.skin.rubber.material import CALIBRATED_FILL
 
 TIP = [6, 7, 8, 9]
 MODULUS = 1.2e6  # [Pa] of the synthetic sensors
-TRIED = tuple(
-    dataclasses.replace(m, base=0.0, other=1.0) for m in MECHANISMS if m.id in ("tip_film", "friction")
-)
-AT_TIP = [0.8 if m.id == "tip_film" else 0.0 for m in TRIED]
+BY_ID = {m.id: m for m in MECHANISMS}
+TRIED = dataclasses.replace(BY_ID["friction"], base=0.0, other=1.0), BY_ID["fill"]
+AT_TIP = [0.0, 0.8]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +45,7 @@ def tables():
     here = Response(states, log_z)
     pairs = {
         "friction": (here, Response(states, log_z * np.where(np.arange(19) > 15, 0.6, 1.0))),
-        "tip_film": (here, Response(states, log_z * np.where(at_tip, 1.8, 1.0))),
+        "fill": (here, Response(states, log_z * np.where(at_tip, 1.8, 1.0))),
     }
     straight = dataclasses.replace(states.grid, drag=())
     return (
@@ -82,25 +87,37 @@ def of_both(tables):
 
 
 def test_what_two_sensors_share_is_the_base_models(of_both):
-    assert of_both.named == ("tip_film",) and "base model" in of_both.verdict
+    assert of_both.named == ("fill",) and "base model" in of_both.verdict
     by_id = {f.id: f for f in of_both.findings}
-    for sensor, tested in zip(of_both.sensors, by_id["tip_film"].tested):
+    for sensor, tested in zip(of_both.sensors, by_id["fill"].tested):
         assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
-        assert np.allclose(tested.value, 0.8, atol=0.25)
+        assert np.allclose(tested.value, 0.8 * CALIBRATED_FILL, atol=0.25 * CALIBRATED_FILL)
         assert tested.locked["worst"][1] < 0.6 * tested.locked["worst"][0]
     assert all(by_id["drag"].significant), "drag, which it has, is missed where it is left out"
 
 
-def test_what_is_written(of_both, tmp_path):
+def test_what_is_written_runs(of_both, tables, tmp_path):
     verdict = simulated_dict(of_both)
-    assert verdict["effects"][0]["id"] == "tip_film" and verdict["effects"][0]["confirmed"]
+    assert verdict["effects"][0]["id"] == "fill" and verdict["effects"][0]["confirmed"]
     assert verdict["effects"][0]["ties"] == []
     cells = verdict["where"]["synthetic 1"]["cells"]
     assert cells[0]["red"] and cells[0]["counts"] > cells[0]["expected"]
-    paths = write_simulated(of_both, tmp_path)
-    assert json.loads(paths[0].read_text())["verdict"] == of_both.verdict
-    assert paths[1].stat().st_size > 10_000
+    first = diagnose_recording(synthetic(tables, AT_TIP, 1)[0])
+    paths = write_simulated(of_both, first, tmp_path)
+    written = json.loads(paths[0].read_text())
+    assert written["verdict"] == f"{first.verdict}; {of_both.verdict}"
+    assert written["effects"][-1]["id"] == "fill" and "gap" in written and written["simulated"]["tried"]
+    assert paths[2].stat().st_size > 10_000
     assert "synthetic 2" in summary(of_both)
+    fill = verdict["effects"][0]["attach"]["synthetic 1"]["options"]["skin"]["fill_volume"]
+    assert 0.5 * CALIBRATED_FILL < fill < 1.1 * CALIBRATED_FILL
+    spec = mujoco.MjSpec()
+    handle = biotac_mj.attach(spec, body="world", effects=paths[1], skin="coarse")
+    assert handle.config.options["skin"]["fill_volume"] == pytest.approx(fill)
+    assert handle.config.material["youngs_modulus"] == pytest.approx(MODULUS, rel=0.1)
+    assert np.ptp(handle.numbers.rest) > 0 and spec.compile().nsensor
+    pressed = amend_settings({}, PressOptions, paths[1])
+    assert pressed["options"]["skin"]["fill_volume"] == pytest.approx(fill)
 
 
 @pytest.mark.slow
@@ -109,7 +126,7 @@ def test_what_one_sensor_has_alone_is_the_sensors(tables, monkeypatch):
     monkeypatch.setattr(diagnosis, "_MEMORY", ())
     recordings = [synthetic(tables, AT_TIP, 1)[0], synthetic(tables, [0.0, 0.0], 2)[0]]
     found = diagnose_simulated(recordings, *tables, TRIED, quiet=True)
-    finding = next(f for f in found.findings if f.id == "tip_film")
+    finding = next(f for f in found.findings if f.id == "fill")
     assert finding.significant == (True, False) and finding.whose == "sensor synthetic 1"
     assert found.named == ()
     clean = found.sensors[1]

@@ -41,7 +41,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             from .simulated.verb import diagnose_with_states
 
             others = [read_recording(*pair) for pair in args.also or ()]
-            diagnose_with_states([recording, *others], pathlib.Path(args.out), args.quiet)
+            diagnose_with_states([recording, *others], pathlib.Path(args.out), args.quiet, first=diagnosis)
         return
     from .trajectories.report import diagnose_data
 

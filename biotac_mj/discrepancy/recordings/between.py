@@ -354,8 +354,8 @@ def _finding(session, view, one, rest, best, gain, null):
     without = view.errors(rest).mean(1)
     g = gain(effect, theta, score, rest, without)
     ties = ["creep"] if effect.id == "relax" else []  # a plateau takes longer than these holds
-    for other in next(kin for kin in _KINS if effect in kin):
-        if other is not effect:
+    for other in BETWEEN:
+        if other is not effect and other not in [known for known, _ in rest]:
             rival, said, _ = best(other, rest)
             lead = said - score
             close = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)

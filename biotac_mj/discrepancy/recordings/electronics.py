@@ -23,6 +23,8 @@ __all__ = ["coloured", "correlated", "humming", "noisy"]
 _NAN = float("nan")
 _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
+# channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
+_FACTOR = 3.0
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
 
@@ -262,8 +264,8 @@ def _line(session):
 
 def correlated(session: Session) -> Finding | None:
     """Noise that electrodes have in common: with neighbours (cross-talk) or with all (reference, supply)."""
-    d, _ = _differences(session, 5)
-    if len(d) < 40 * BLOCKS // 2:
+    d, rows = _differences(session, 5)
+    if len(d) < 40 * BLOCKS // 2 or _with_temperature(session, d, rows):
         return None
     cells, block = _calm(d, 0.3 if session.loaded else 1.0)
     known = np.isfinite(cells)
@@ -279,7 +281,7 @@ def correlated(session: Session) -> Finding | None:
         y = x[block == b].reshape(-1, len(alive))
         power = np.maximum((y**2).sum(0), 1e-9)
         value.append((y.T @ y / np.sqrt(np.outer(power, power)))[pairs])
-    value = np.array(value)  # (blocks, pairs)
+    value = np.nan_to_num(np.array(value))  # (blocks, pairs)
     mean = value.mean(0)
     common = float(np.median(mean))
     best = None
@@ -295,7 +297,6 @@ def correlated(session: Session) -> Finding | None:
             level, slope = np.linalg.lstsq(np.column_stack([np.ones(len(k)), k]), mean, rcond=None)[0]
             best = name, share, by_block, t, slope**2 * (k @ k) > level**2 * len(k)
     name, share, by_block, t, near = best
-    off = np.median(value, axis=1)
     size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
     last = session.recording.time[-1]
     p = sign_flip(by_block)
@@ -323,8 +324,10 @@ def correlated(session: Session) -> Finding | None:
             clues={"kappa": float(np.log(coupling)), "share": share, "t": float(np.log(max(t, 1.0)))},
             correct=lambda counts, at: centre + (counts - centre) @ matrix.T,
         )
-    p = sign_flip(off)
-    if p < 0.01 and common > 0.02:
+    factor = np.array([_together(value[np.arange(BLOCKS) != b].mean(0), value[b]) for b in range(BLOCKS)])
+    p, size_of = sign_flip(factor), float(factor.mean())
+    if p < 0.01 and size_of > 0.02 * len(alive):
+        common = size_of / len(alive)
         return Finding(
             "common_noise",
             tuple(range(19)),
@@ -333,16 +336,35 @@ def correlated(session: Session) -> Finding | None:
             p,
             0.0,
             last,
-            ties=("crosstalk",) if common < 0.2 else (),
-            note=f"noise of all pairs alike is correlated by {common:.2f}",
-            clues={
-                "kappa": float(np.log(common)),
-                "share": float(common / (mean.std() + 1e-3)),
-                "t": float(np.log(max(off.mean() / max(off.std(ddof=1), 1e-9) * 4, 1.0))),
-            },
+            ties=("crosstalk",) if size_of < _FACTOR else (),
+            note=f"noise has a part in common, as much as {1 + size_of:.1f} electrodes have alone",
+            clues={"factor": float(np.log(size_of)), "loaded": float(session.loaded)},
             correct=_without_common(x.reshape(-1, len(alive)), sd) if len(alive) == 19 else None,
         )
     return None
+
+
+def _with_temperature(session, d, rows):
+    """Whether what differences d (n, 19) have in common is the thermistor's."""
+    if session.recording.tdc is None:
+        return False
+    common = np.nan_to_num(np.nanmean(d, axis=1))
+    warm = np.diff(session.recording.tdc[np.r_[rows[0] - np.arange(5, 0, -1), rows]], n=5)
+    both = np.array([common, warm])
+    return bool(both.std(1).min() > 0 and abs(np.corrcoef(both)[0, 1]) > 0.5)
+
+
+def _together(others, mine):
+    """What one factor explains of correlations (pairs,) of a block, its shares taken from other blocks: the
+    largest eigenvalue without the channels' own, so much that some channels need not have it."""
+    number = int((1 + np.sqrt(1 + 8 * len(mine))) / 2)
+    pairs = np.triu_indices(number, 1)
+    both = np.zeros((2, number, number))
+    for out, c in zip(both, (others, mine)):
+        out[pairs] = c
+    both += both.transpose(0, 2, 1)
+    share = np.linalg.eigh(both[0])[1][:, -1]
+    return float(share @ both[1] @ share)
 
 
 def _without_common(x, sd):

@@ -152,7 +152,12 @@ def _dead(session, k, onset, gain, p):
         onset,
         time[-1],
         note=f"from {onset:.1f} s on it does not answer the load, at {value:.0f} counts",
-        clues={"nats": float(gain.mean()), "blocks": float(np.mean(gain > 0))},
+        clues={
+            "nats": float(gain.mean()),
+            "factor": float(-np.log(_DEAD)),
+            "spread": float(np.log(_DEAD)),
+            "blocks": float(np.mean(gain > 0)),
+        },
         mask=mask,
     )
 

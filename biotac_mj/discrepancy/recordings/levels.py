@@ -22,6 +22,7 @@ _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
 _NAN = float("nan")
+_ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 
 
@@ -87,7 +88,7 @@ def _single(session, course, k, options):
         note=f"{'a step' if course.kind == 'step' else 'a course over time'} of "
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
-        | {"lead": float(np.clip(np.log(lead), -1, 2)), "stands": _stands(m, i), "course": course},
+        | {"lead": float(np.clip(np.log(lead), -1, 5)), "stands": _stands(m, i), "course": course},
         correct=correct,
     )
 
@@ -141,7 +142,10 @@ def _clues(session, course, size, activity):
         "counts": float(np.log(max(size, 0.1))),
         "turns": float(np.log(max(course.turns, 1.0))),
         "blocks": float(np.mean(course.gain > 0)),
-        "seconds": float(np.log(session.fit.sum() / session.recording.rate)),
+        # under load what all share is told from it only where there is time for both
+        "room": float(min(np.log(session.fit.sum() / session.recording.rate / 90), 0))
+        if m.dimensions
+        else 0.0,
     }
 
 
@@ -275,7 +279,8 @@ def _name_shared(session, finding, course, change):
             gain = compare(null, out, block, scale)
             slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
             told = sign_flip(gain) < 0.02
-            if told and gain.sum() <= _TOLD * finding.nats:
+            alike = abs(np.corrcoef(y, warm)[0, 1]) > _ALIKE  # where both go one way they are not parted
+            if alike and not told or told and gain.sum() <= _TOLD * finding.nats:
                 ties = [*ties, "thermal"]
             elif told:
                 ties, finding.id = [finding.id, *ties], "thermal"

@@ -8,6 +8,7 @@ from ..noise import noise_level
 from . import electronics, sampling
 from .between import force_view
 from .findings import Finding
+from .recording import MIN_ROWS
 from .session import Session
 
 __all__ = ["prove", "views"]
@@ -27,7 +28,7 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = by(session, without, finding)
     elif finding.id in _NEUTRAL:
         before, after, floor, unit, name = _again(session, without, finding)
-    elif finding.id == "lost_rows":
+    elif finding.correct is None or "places" in finding.clues:  # nothing to take out, or it is over by then
         return
     else:
         before, after, floor, unit, name = _counts(session, without, finding)
@@ -125,6 +126,10 @@ def _again(session, without, finding):
     """The finding's own parameter on the part kept aside alone: its distance from none, and from what was
     fitted."""
     s = Session(without.recording, ~session.fit, without.findings)
+    name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
+    unit = finding.kind.params[name].unit
+    if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
+        return np.nan, np.nan, np.nan, unit, ""
     find = {
         "lowpass": electronics.coloured,
         "hum": electronics.humming,
@@ -136,8 +141,6 @@ def _again(session, without, finding):
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
     ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
-    name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
-    unit = finding.kind.params[name].unit
     value = finding.parameters[name][0]
     floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
     late = found[0].parameters[name][0] if found else _NEUTRAL[finding.id]

@@ -12,7 +12,7 @@ from .session import Session
 
 __all__ = ["Rest", "rest"]
 
-_UNKNOWN = 0.42
+_UNKNOWN = 0.33
 
 
 @dataclasses.dataclass

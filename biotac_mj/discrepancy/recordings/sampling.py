@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import median_filter, percentile_filter, uniform_filter1d
+from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
 
+from ...sensor.channels import electrode_noise
 from ..evidence import sign_flip
 from ..noise import noise_level
 from .courses import BLOCKS
@@ -15,12 +16,21 @@ __all__ = ["lost", "quantised", "sampling_faults"]
 
 _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
+# visits of a code, of whose neighbours one in a hundred is then missed by chance
+_OFTEN = 5
+_STILL = 12  # rows in which a channel without noise is told from one with it
+_QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
+_SHARE = 0.01  # of the rows
+_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+# median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
+_UNEVEN = 0.36
+_HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
 
 def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
     """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
     without the samples of those before it."""
-    for find in (quantised, _held, _stuck, _clipped, _spiked):
+    for find in (quantised, _held, _still, _spiked):
         for finding in find(session):
             take(finding)
 
@@ -61,19 +71,19 @@ def _by_block(flags, chance):
 
 
 def quantised(session: Session) -> list[Finding]:
-    """Coarse channels: every value on a lattice of more than one count."""
+    """Coarse channels: of the codes that their noise should visit they leave out some, lattice or not."""
     x, _, _ = _rows(session)
     if np.any(x != np.rint(x)):
         return []
     blocks = np.array_split(x.astype(int), BLOCKS)
-    step = np.array([_lattice(c) for c in x.T.astype(int)])
-    coarse = np.flatnonzero(step >= 2)
-    if not len(coarse):
+    step = np.array([_spacing(c) for c in x.T.astype(int)])
+    coarse, told = np.flatnonzero(step >= 2), np.isfinite(step)
+    if not len(coarse) or 1 < len(coarse) < 0.5 * told.sum():  # levels that lie far apart look alike
         return []
     q = float(np.median(step[coarse]))
-    # of a lattice of single counts every q-th value would be met by chance
+    # of codes visited by chance every q-th would be one of these
     strength = [np.log(q) * sum(len(np.unique(b[:, k])) - 1 for k in coarse) for b in blocks]
-    channels = range(19) if len(coarse) > 15 else coarse
+    channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
     return [
         _finding(
             session,
@@ -81,16 +91,23 @@ def quantised(session: Session) -> list[Finding]:
             channels,
             {"step": (q, q, q)},
             None,
-            f"every value is a multiple of {q:g} counts (up to an offset)",
+            f"of the codes among those visited often only one in {q:.3g} is ever read",
             strength,
             BLOCKS,
         )
     ]
 
 
-def _lattice(x):
-    values = np.unique(x)
-    return int(np.gcd.reduce(np.diff(values))) if len(values) >= 4 else 1
+def _spacing(x):
+    """Typical distance of the codes that integers x (n,) visit, on a lattice or not; 1 where codes that are
+    visited often have neighbours, nan where too few are."""
+    value, count = np.unique(x[1:][np.diff(x) != 0], return_counts=True)  # one that stands still is no pile
+    often = count >= _OFTEN
+    if often.sum() < 3:
+        return np.nan
+    gap = np.diff(value)
+    alone = np.minimum(np.append(gap, gap[-1]), np.insert(gap, 0, gap[0]))[often] > 1
+    return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
 
 
 # --- held rows
@@ -99,7 +116,7 @@ def _lattice(x):
 def _held(session):
     """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
     explains; or that move in steps with nothing but white noise between them."""
-    x, n, rate = _rows(session)
+    _, n, rate = _rows(session)
     same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99])
     start, length = _runs(held)
@@ -130,52 +147,58 @@ def _held(session):
                     BLOCKS,
                 )
             ]
-    return _dithered(session) if held.mean() < 0.4 and noise_level(x).mean() > 0.7 else []
+    return _dithered(session) if held.mean() < 0.4 else []
 
 
 def _dithered(session):
-    x, n, rate = _rows(session)
-    noise = np.median(np.abs(np.diff(x, axis=0)), axis=0) / 0.954
-    step = (np.diff(x, axis=0) / np.maximum(noise, 0.5)) ** 2 + 1e-3
-    step = np.minimum(step.mean(1), np.quantile(step.mean(1), 0.99))
-    best = None
-    for period in range(2, int(min(0.25 * rate, 40)) + 1):
-        for phase in range(period):
-            strong = step[phase::period]
-            weak = np.delete(step, np.arange(phase, len(step), period))
-            # the weakest kind of the others: rows held say all others are alike
-            ratio = np.log(strong.mean() / weak.mean())
-            if best is None or ratio > best[0]:
-                best = ratio, period, phase
-    ratio, period, phase = best
-    blocks = np.array_split(np.arange(len(step)), BLOCKS)
-    gain = np.array(
-        [
-            np.log(step[b][(b % period) == phase].mean() / step[b][(b % period) != phase].mean())
-            for b in blocks
-        ]
-    )
-    # what is held does not move: between the steps there is noise alone
-    if ratio < 0.7 or np.median(gain) < 0.5:
+    """Values that are read now and then and tremble between: of the differences in a short window most are
+    small and a few as large as noise makes them, in most electrodes, at whatever rows."""
+    r = session.recording
+    if any(f.id == "quantise" for f in session.findings):
         return []
-    others = [np.log(step[(np.arange(len(step)) % period) == q].mean()) for q in range(period) if q != phase]
-    if len(others) > 1 and np.ptp(others) > 0.5 * ratio:
+    rows = np.flatnonzero(session.fit & ~r.repeated & ~session.masked.all(1))
+    step = np.abs(np.diff(r.electrodes[rows], axis=0))
+    k = len(step) // (2 * _STILL)
+    if k < BLOCKS:
         return []
-    mask = np.zeros((n, 19), bool)
-    mask[(np.arange(n) - phase - 1) % period != 0] = True
-    seconds = period / rate
+    cells = step[: k * 2 * _STILL].reshape(k, 2 * _STILL, 19)
+    size = np.sqrt((cells**2).mean(1))
+    lively = size > 2.5  # rounding alone makes differences uneven below
+    uneven = np.where(lively, np.maximum(np.median(cells, axis=1), 0.5) / np.maximum(size, 0.1), np.nan)
+    told = np.flatnonzero(lively.mean(0) > 0.2)
+    if len(told) < 12:
+        return []
+    typical = np.nanmedian(uneven[:, told], axis=0)
+    usual = np.maximum(np.median(step, axis=0), 0.5)
+    jump = step > 3 * usual
+    law = electrode_noise(np.median(r.electrodes[rows], axis=0))
+    height = [np.median(step[jump[:, e], e]) / law[e] for e in told if jump[:, e].any()]
+    # a median over rows jumps as well, by less than noise does
+    if np.median(typical) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
+        return []
+    mask, together = None, jump.mean(1) > 0.25
+    if jump[together].sum() > 0.8 * jump.sum():  # all at once: the rows between are none
+        mask = np.repeat(_between(r.electrodes, 3 * usual)[:, None], 19, axis=1)
+    seconds = float(1 / (r.rate * jump[:, told].mean()))
+    strength = -np.log(np.array([np.nanmedian(b[:, told]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
     return [
         _finding(
             session,
             "freeze",
             range(19),
-            {"seconds": (seconds, seconds, seconds)},
+            {"seconds": (seconds, _NAN, _NAN)},
             mask,
-            f"all electrodes move every {period} rows only, with noise between",
-            gain * len(step) / BLOCKS / period * 9,
+            f"electrodes take a new value every {seconds:.3f} s, and tremble between",
+            np.nan_to_num(strength) * k,
             BLOCKS,
         )
     ]
+
+
+def _between(x, usual):
+    """(n,) bool, rows of x (n, 19) in which less than a quarter of the electrodes take a new value."""
+    step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
+    return (step > usual).mean(1) <= 0.25
 
 
 def _stretch(mask):
@@ -193,131 +216,99 @@ def _runs(x):
 # --- single channels
 
 
-def _stuck(session):
-    _, n, rate = _rows(session)
-    free = ~session.masked[:, 0]
-    whole = session.recording.electrodes
+def _still(session):
+    """Channels that stand still: a live one has noise in every row. At an end of what it reads, to which it
+    comes again and again, it is clipped, else stuck."""
+    whole, rate = session.recording.electrodes, session.recording.rate
+    coarse = {k for f in session.findings if f.id == "quantise" for k in f.channels}
+    rows = np.flatnonzero(~session.masked.all(1) & ~session.recording.repeated)
+    # values that are held all the time stand still by themselves
+    if len(rows) < 4 * _STILL or any(f.id == "freeze" and f.mask is None for f in session.findings):
+        return []
+    x = whole[rows]
+    bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
+    level = uniform_filter1d(x, _STILL, axis=0)[1:-1]
+    size = np.sqrt(np.maximum(uniform_filter1d(bend, _STILL, axis=0), 0)) / electrode_noise(level)
+    lively = np.where(size > 0.2 * np.quantile(size, 0.9, axis=0), size, np.nan)
+    usual = np.nanmedian(lively, axis=0)
+    usual = np.minimum(usual, np.median(usual))  # spikes and bursts are not a channel's noise
+    # without noise a constant reading is no news
+    alive = usual * np.median(electrode_noise(level), axis=0) > _ALIVE
+    quiet = (size < _QUIET * usual) & alive
+    share = quiet[: (rows < session.fit.sum()).sum()].mean(0)
     found = []
-    lattice = {k: f.parameters["step"][0] for f in session.findings if f.id == "quantise" for k in f.channels}
-    # one channel that stands still while others move; a toggling last bit is no movement
-    size = max(8, int(0.25 * rate))
-    moves = np.array([_movement(c, size) for c in whole.T]).T  # (n,) range over `size` rows
-    usual = np.median(moves[session.fit & free], axis=0)
-    active = np.median(moves / np.maximum(usual, 0.5), axis=1) > 0.5
-    steps = np.array([lattice.get(k, 1.0) for k in range(19)])
-    # without noise a constant reading is no news; while it is stuck it has none
-    halves = np.array_split(whole, 2)
-    alive = np.maximum(*(noise_level(x) for x in halves)) > 0.7 * steps
-    for k in range(19):
-        if not alive[k] and not _edge_value(whole[:, k]):
+    # where several stand still at times it is nothing of one channel
+    for k in np.flatnonzero(share > np.maximum(_SHARE, 6 * np.sort(share)[-3])):
+        if k in coarse:
             continue
-        if usual[k] < 3 * lattice.get(k, 0.7) and not _edge_value(whole[:, k]):
+        at = np.zeros(len(x), bool)
+        at[1:-1] = quiet[:, k]
+        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of windows that touch one another
+        if not at.any():
             continue
-        still = (moves[:, k] <= min(1, 0.2 * max(usual[k], 2))) & active & free
-        mask = np.zeros((n, 19), bool)
-        start, length = _runs(still)
-        for s, m in zip(start, length):
-            if still[s] and m >= 2 * size:
-                mask[max(s - size // 2, 0) : s + m + size // 2, k] = True
-        if mask.any():
-            value = np.median(whole[mask[:, k], k])
-            on = np.flatnonzero(mask[:, k])
-            mask[on[0] : on[-1] + 1, k] |= np.abs(whole[on[0] : on[-1] + 1, k] - value) <= 1
-        if mask.sum() < max(30, 3 * size) or _clip_like(whole[:, k], mask[:, k]):
+        mask = np.zeros(whole.shape, bool)
+        # a row that repeats another is as that one
+        before = np.maximum(np.searchsorted(rows, np.arange(len(whole)), "right") - 1, 0)
+        mask[:, k] = at[before]
+        found += _stood(session, int(k), mask, rate)
+    return found
+
+
+def _stood(session, k, mask, rate):
+    """Findings of one channel that stands still in some samples (n, 19)."""
+    whole, found = session.recording.electrodes[:, k], []
+    moving = ~mask[:, k] & ~session.masked.all(1)
+    start, length = _runs(mask[:, k])
+    start, length = start[mask[start, k]], length[mask[start, k]]
+    values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
+    # where the channel goes when it moves: next to nowhere beyond a limit
+    ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
+    on = np.flatnonzero(mask[:, k])
+    stays = mask[on[0] : on[-1] + 1, k].mean() > 0.8  # a limit is left when the load goes back
+    for side, mine in ((-1, values <= ends[0] + 3), (1, values >= ends[1] - 3), (0, None)):
+        if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
-        value = float(np.median(whole[mask[:, k], k]))
-        chance = np.clip((moves[:, k] <= 1).mean() * 0.01, 1e-4, 0.5)
-        strength = _by_block(_stretch(mask[:, k]), chance)
+        mine = np.ones(len(values), bool) if mine is None else mine
+        rest = mask.copy()
+        for a, n in zip(start[~mine], length[~mine]):
+            rest[a : a + n, k] = False
+        if not rest.any() or (side == 0 and (found or length.max() < 0.25 * rate)):
+            continue
+        flags = rest[session.fit, k]
+        if not flags.any():
+            continue
+        value = float(np.median(values[mine]))
+        spread = float(np.ptp(values[mine])) / 2 + 0.5
+        name, key = ("saturate", "level") if side else ("stuck", "value")
+        text = ("largest" if side > 0 else "smallest") + " values" if side else "no end of what it reads"
         found.append(
             _finding(
                 session,
-                "stuck",
+                name,
                 (k,),
-                {"value": (value, value, value)},
-                mask,
-                f"{mask.sum() / rate:.1f} s without movement at {value:.0f} counts",
-                strength,
-                BLOCKS,
-            )
-        )
-    return found if len(found) <= 6 else []
-
-
-def _movement(x, size):
-    """(n,) second largest less second smallest of the rows around, so that one sample's bit does not
-    count."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
-    smooth = median_filter(x, 3, mode="nearest")
-    return maximum_filter1d(smooth, size) - minimum_filter1d(smooth, size)
-
-
-def _edge_value(x):
-    return bool(np.isin(x, (0, 4095)).mean() > 0.02)
-
-
-def _clip_like(x, mask):
-    """Stretches at one end of the channel's range, to which it comes back, are clipping, unless they are
-    long."""
-    if mask.mean() > 0.8 or not mask.any():
-        return False
-    value = np.median(x[mask])
-    edge = value <= np.quantile(x, 0.001) + 2 or value >= np.quantile(x, 0.999) - 2
-    return bool(edge and len(_runs(mask)[0]) > 4 and 5 < value < 4090)
-
-
-def _clipped(session):
-    hits = []
-    x = session.recording.electrodes
-    other = {k for f in session.findings if f.id in ("quantise", "stuck") for k in f.channels}
-    for k in sorted(set(range(19)) - other):
-        good = session.fit & ~session.masked[:, k]
-        y = x[good, k]
-        if len(y) < 100 or np.ptp(y) < 8 or noise_level(y[:, None])[0] < 0.7:
-            continue
-        for side in (1, -1):
-            values, count = np.unique(side * y, return_counts=True)
-            if len(values) < 12:
-                continue
-            # a pile at the limit, beside what lies within a few values below
-            top = int(np.argmax(count[-4:])) + len(count) - 4
-            pile, beyond = count[top], count[top + 1 :].sum()
-            near = count[max(top - 12, 0) : max(top - 2, 1)]
-            expected = max(float(np.median(near)), 1.0)
-            if pile > 6 * expected + 12 and pile > 0.004 * len(y) and beyond < 0.25 * pile:
-                hits.append((k, side, float(side * values[top]), pile, expected))
-    found = []
-    for side, level in {(h[1], round(h[2]) if h[2] in (0, 4095) else (h[0], h[2])) for h in hits}:
-        group = [h for h in hits if h[1] == side and (h[2] == level or (h[0], h[2]) == level)]
-        channels, limit = [h[0] for h in group], group[0][2]
-        mask = np.zeros(x.shape, bool)
-        mask[:, channels] = side * x[:, channels] >= side * limit - 2
-        flags = mask[session.fit][:, channels].any(1)
-        chance = min(0.5, sum(h[4] for h in group) / session.fit.sum())
-        found.append(
-            _finding(
-                session,
-                "saturate",
-                channels,
-                {"level": (limit, limit - 0.5, limit + 0.5)},
-                mask,
-                f"{flags.mean():.1%} of the samples lie on {limit:g}, the "
-                f"{'largest' if side > 0 else 'smallest'} value",
-                _by_block(flags, chance),
+                {key: (value, value - spread, value + spread)},
+                rest,
+                f"{rest[:, k].mean():.1%} of the samples stand still at {value:.0f} counts, {text}",
+                _by_block(_stretch(rest[session.fit, k]), 0.003),
                 BLOCKS,
             )
         )
         found[-1].beyond = side
-        found[-1].clues |= {
-            "pile": float(np.log(group[0][3] / group[0][4])),
-            "share": float(np.log(flags.mean())),
-        }
+        found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
+        found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
+        if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
+            found[-1].ties = ("gain",) if side else ("gain", "saturate")
     return found
 
 
 def _spiked(session):
     x = session.recording.electrodes
-    bad = _outliers(x) & ~session.masked
+    coarse = np.zeros(19)
+    for f in session.findings:
+        if f.id == "quantise":
+            coarse[list(f.channels)] = f.parameters["step"][0]
+    bad = _outliers(x, coarse) & ~session.masked
+    bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad[session.fit].sum(0)
     minutes = session.fit.sum() / session.recording.rate / 60
     found = []
@@ -337,17 +328,19 @@ def _spiked(session):
                 BLOCKS,
             )
         )
+        found[-1].p = 0.5 ** int(number[k])  # each is an event of its own
+        found[-1].clues["alone"] = float(np.log(number[k] / (1 + np.sort(number)[-3])))
     return found
 
 
-def _outliers(x):
-    """(n, 19) bool of one or two samples that leave the trace and come back."""
+def _outliers(x, coarse):
+    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes."""
     middle = median_filter(x, size=(7, 1), mode="nearest")
     off = np.abs(x - middle)
     before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
     around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
     # lively stretches leave the median by more
-    limit = np.maximum(np.maximum(10 * noise_level(x), 25), 10 * around)
+    limit = np.maximum(np.maximum(10 * noise_level(x), 25) + 4 * coarse, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
 
 
@@ -390,31 +383,49 @@ def lost(session: Session) -> list[Finding]:
     ]
     if not places:
         return []
-    at = rows[np.array(places) + h]
-    share = np.mean([np.mean(np.abs(jump[i]) > 3) for i in places])
-    strength = np.zeros(BLOCKS)
-    for row, i in zip(at, places):
-        strength[int(row * BLOCKS / len(r))] += 0.5 * score[i] ** 2
-    f = _finding(
-        session,
-        "lost_rows",
-        range(19),
-        {"seconds": (_NAN, _NAN, _NAN)},
-        None,
-        f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump between "
-        "two rows",
-        strength,
-        BLOCKS,
-    )
-    f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
-    f.p = len(places) / len(score)  # rows that stand alone as much
-    ratio = max(score[i] / max(around[i], 1) for i in places)
-    f.clues |= {
-        # up to a dozen times what is around it a place or two of every record jumps
-        "times": float(np.clip(ratio, 12, 30)),
-        "places": at / r.rate,
-        "number": float(np.log(len(places))),
-        "electrodes": float(share),
-        "score": float(np.log(max(score[i] for i in places))),
-    }
-    return [f]
+    change = (right[h:] - left[:-h])[places]
+    # the same counts on every electrode are a supply's, not a load's
+    alike = np.abs(change.mean(1)) > 2 * change.std(1)
+    found = []
+    for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
+        if not mine.any():
+            continue
+        chosen = np.array(places)[mine]
+        at = rows[chosen + h]
+        strength = np.zeros(BLOCKS)
+        np.add.at(strength, (at * BLOCKS) // len(r), 0.5 * score[chosen] ** 2)
+        step = change[mine].mean(1)
+        parameters = {"seconds": (_NAN, _NAN, _NAN)}
+        if name == "count_offset":
+            parameters = {"change": (float(step[np.abs(step).argmax()]), _NAN, _NAN)}
+        f = _finding(
+            session,
+            name,
+            range(19),
+            parameters,
+            None,
+            f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump "
+            + ("by the same counts" if name == "count_offset" else "between two rows"),
+            strength,
+            BLOCKS,
+            None if name == "lost_rows" else _less(np.sort(at / r.rate), step[np.argsort(at)]),
+        )
+        f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
+        f.p = len(chosen) / len(score)  # rows that stand alone as much
+        f.clues |= {
+            # up to a dozen times what is around it a place or two of every record jumps
+            "times": float(np.clip(np.max(score[chosen] / np.maximum(around[chosen], 1)), 12, 30)),
+            "places": at / r.rate,
+            "number": float(np.log(len(chosen))),
+            "electrodes": float(np.mean(np.abs(jump[chosen]) > 3)),
+            "score": float(np.log(score[chosen].max())),
+            "alike": float(name == "count_offset"),
+        }
+        found.append(f)
+    return found
+
+
+def _less(times, steps):
+    """Correction that takes steps (s,) [counts] at times (s,) [s] out of all electrodes."""
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    return lambda counts, at: counts - total[np.searchsorted(times, at + 1e-9)][:, None]

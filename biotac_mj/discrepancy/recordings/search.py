@@ -24,6 +24,7 @@ __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
 _FALSE = 0.05  # of the names of a report
+_ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -149,6 +150,10 @@ def _search(session, weak, named, bar):
                 refused.add(mine)
         if find is levels:
             settle(session)
+    for finding in session.findings:  # what an answer to the load and a level that changes have in common
+        if finding.id in ("drift", "gain", "flip"):
+            rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
+            finding.ties = tuple(dict.fromkeys((*finding.ties, *(i for i in rivals if i != finding.id))))
     for finding in lost(session):  # an exchange or a jump is none
         take(finding)
     bar.update()

@@ -33,18 +33,32 @@ class Tested:
 
     Attributes:
       worst, all: on the electrodes that lead, and on all; rows of the other half of the first 70 %.
-      value: of the parameter by the constants of either half. locked: (before, after) RMS on the locked rows
-        for the worst electrodes and for all; None where it was not asked.
+      value: of the parameter by the constants of either half; modulus: their mean Young's modulus [Pa].
+      locked: (before, after) RMS on the locked rows for the worst electrodes and for all; None where it was
+        not asked.
     """
 
     worst: Compared
     all: Compared
     value: tuple[float, ...]
+    modulus: float
     locked: dict | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
+class _Named:
+    """A model that is tried, in words."""
+
+    id: str
+    name: str
+    stage: str
+    parameter: str
+    unit: str
+    kind: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding(_Named):
     """A model that was tried on all sensors.
 
     Attributes:
@@ -54,12 +68,6 @@ class Finding:
         NAME", "nobody", or "unknown" where there is but one sensor.
     """
 
-    id: str
-    name: str
-    stage: str
-    parameter: str
-    unit: str
-    kind: str
     tested: tuple[Tested, ...]
     significant: tuple[bool, ...]
     whose: str
@@ -127,15 +135,9 @@ def _remembering(recording, rows, tau):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Model:
-    """A model that is tried: how it differs from the base (setup, response) and where its value is."""
+class _Model(_Named):
+    """How it differs from the base (setup, response) and where its value is."""
 
-    id: str
-    name: str
-    stage: str
-    parameter: str
-    unit: str
-    kind: str
     response: Response
     setup: Setup
     tau: float | None = None
@@ -207,7 +209,10 @@ def diagnose_simulated(
             new = judge(model.response, here, model.setup, None if model.kind == "has" else judged)
             small, large = (new, judged) if model.kind == "has" else (judged, new)
             value = tuple(model.value(c) for c in new.constants) if model.value else ()
-            tested[model.id].append(Tested(compare(small, large, worst), compare(small, large), value))
+            modulus = float(np.mean([c.modulus for c in new.constants]))
+            tested[model.id].append(
+                Tested(compare(small, large, worst), compare(small, large), value, modulus)
+            )
             bar.update()
     bar.close()
     findings = _findings(models, tested, sensors)
@@ -242,9 +247,8 @@ def _findings(models, tested, sensors):
             whose = "base model"
         else:
             whose = "sensor " + ", ".join(s.name for s, yes in zip(sensors, significant) if yes)
-        out.append(
-            Finding(m.id, m.name, m.stage, m.parameter, m.unit, m.kind, tuple(parts), significant, whose)
-        )
+        words = {f.name: getattr(m, f.name) for f in dataclasses.fields(_Named)}
+        out.append(Finding(**words, tested=tuple(parts), significant=significant, whose=whose))
     return sorted(out, key=lambda f: -min(t.all.closed for t in f.tested))
 
 

@@ -1,4 +1,5 @@
-"""What simulation in the loop found: simulated.json, a figure, and the summary for the terminal."""
+"""What simulation in the loop found: verdict.json and sensor_amended.yaml with the recording's own, a figure,
+and the summary for the terminal."""
 
 import json
 import pathlib
@@ -6,10 +7,13 @@ import pathlib
 import numpy as np
 
 from ...effects.effect import STAGES
+from ...effects.sensor_file import write_sensor_file
 from ...files import replacing
 from ..plain_values import plain_values
+from ..recordings.report import verdict_dict
+from ..recordings.search import RecordingDiagnosis
+from .amended import acting, amended_simulated, attached
 from .diagnosis import Finding, Simulated, names
-from .mechanisms import MECHANISMS
 
 __all__ = ["draw", "simulated_dict", "summary", "write_simulated"]
 
@@ -18,7 +22,7 @@ _TRIED = {"has": "without what the model has", "lacks": "with it", "fits": "a fi
 
 
 def simulated_dict(found: Simulated) -> dict:
-    """What simulated.json holds."""
+    """What verdict.json holds of the simulation."""
     by_id = {f.id: f for f in found.findings}
     return plain_values(
         {
@@ -64,7 +68,7 @@ def _finding(f: Finding, found: Simulated) -> dict:
             {"name": f.parameter, "unit": f.unit, "sensor": s.name, "value_by_halves": t.value}
             for s, t in zip(found.sensors, f.tested)
         ],
-        "attach": _attach(f, found),
+        "attach": _by_sensor(f, found),
         "channels": sorted({f"e{k + 1}" for s in found.sensors for k in s.worst}),
         "significant": dict(zip((s.name for s in found.sensors), f.significant)),
         "confirmed": all(t.locked["worst"][1] < t.locked["worst"][0] for t in f.tested)
@@ -85,12 +89,6 @@ def _finding(f: Finding, found: Simulated) -> dict:
             for s, t in zip(found.sensors, f.tested)
         },
     }
-
-
-def _attach(f, found):
-    """What `biotac_mj.attach` takes to have it, by sensor; None where no running sensor can."""
-    give = next((one.attach for one in MECHANISMS if one.id == f.id), None)
-    return give and {s.name: give(float(np.mean(t.value))) for s, t in zip(found.sensors, f.tested)}
 
 
 def summary(found: Simulated) -> str:
@@ -118,20 +116,34 @@ def summary(found: Simulated) -> str:
             if t.locked:
                 (a, b), (c, d) = t.locked["worst"], t.locked["all"]
                 lines.append(f"      locked rows: {a:.0f} -> {b:.0f}; {c:.0f} -> {d:.0f}")
-        if f.id in found.named and _attach(f, found):
+        if f.id in found.named and attached(f):
             lines += [
-                f"    a simulated {name}: attach(spec, **{one})" for name, one in _attach(f, found).items()
+                f"    a simulated {name}: attach(spec, **{one})" for name, one in _by_sensor(f, found).items()
             ]
+    acts = acting(found)
+    if acts:
+        lines.append(f"  in sensor_amended.yaml, as {found.sensors[0].name} has it: {acts.name}")
     return "\n".join(lines)
 
 
-def write_simulated(found: Simulated, folder: pathlib.Path | str) -> list:
-    """Writes simulated.json and simulated.png; returns the paths."""
+def _by_sensor(f, found):
+    given = attached(f)
+    return given and dict(zip((s.name for s in found.sensors), given))
+
+
+def write_simulated(found: Simulated, first: RecordingDiagnosis, folder: pathlib.Path | str) -> list:
+    """Writes verdict.json (the first recording's, its effects with those of the simulation, and under
+    "simulated" all that this found), sensor_amended.yaml (`attach(effects=)`) and simulated.png; returns the
+    paths."""
     folder = pathlib.Path(folder)
-    paths = [folder / "simulated.json", folder / "simulated.png"]
+    own, said = verdict_dict(first), simulated_dict(found)
+    effects = [*own["effects"], *said["effects"]]
+    verdict = own | {"verdict": f"{own['verdict']}; {found.verdict}", "effects": effects, "simulated": said}
+    paths = [folder / name for name in ("verdict.json", "sensor_amended.yaml", "simulated.png")]
     with replacing(paths[0]) as temporary:
-        temporary.write_text(json.dumps(simulated_dict(found), indent=1, allow_nan=False))
-    with replacing(paths[1]) as temporary:
+        temporary.write_text(json.dumps(verdict, indent=1, allow_nan=False))
+    write_sensor_file(paths[1], amended_simulated(found, first))
+    with replacing(paths[2]) as temporary:
         draw(found).savefig(temporary, dpi=110, format="png")
     return paths
 

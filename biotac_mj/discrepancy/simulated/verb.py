@@ -4,6 +4,7 @@ import pathlib
 
 from ...geometry.skins import load_skin
 from ..recordings.recording import Recording
+from ..recordings.search import RecordingDiagnosis, diagnose_recording
 from .diagnosis import Simulated, diagnose_simulated
 from .mechanisms import MECHANISMS, Mechanism, base_response, with_mechanisms
 from .report import summary, write_simulated
@@ -18,8 +19,10 @@ def diagnose_with_states(
     folder: pathlib.Path,
     quiet: bool = False,
     mechanisms: tuple[Mechanism, ...] = MECHANISMS,
+    first: RecordingDiagnosis | None = None,
 ) -> Simulated:
-    """Diagnoses recordings of flat presses against simulated states, prints and writes what it found.
+    """Diagnoses recordings of flat presses against simulated states, prints and writes what it found, beside
+    what `first` found in the first of them alone (None: it is diagnosed).
 
     Raises:
       ValueError: a recording without force, or with too few loaded rows.
@@ -33,6 +36,7 @@ def diagnose_with_states(
     base, straight, states = base_response(geometry, quiet)
     response = with_mechanisms(base, states, geometry, mechanisms, quiet)
     found = diagnose_simulated(recordings, response, straight, mechanisms, quiet)
+    first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
     print(summary(found))
-    print("  " + " ".join(str(f) for f in write_simulated(found, folder)))
+    print("  " + " ".join(str(f) for f in write_simulated(found, first, folder)))
     return found
