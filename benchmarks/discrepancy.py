@@ -9,7 +9,7 @@ Every case is drawn, measured by `discrepancy_generator` (synthetic) and sealed 
 its record); run again, it goes on where it stopped. Beside the verdicts stand the answers of rivals
 (`discrepancy_rivals`).
 `--jobs N` shares the cases among N processes, `--ray ADDRESS` among the machines of a Ray cluster
-(docs/cluster.md).
+(docs/howto/cluster.md).
 Kinds: none, single, outside, pair, wrong-base, and left-out, a single effect that is taken out of the
 catalogue, for calibration. Counts are for each effect with single and left-out, else for the kind. Fields
 of the plans are solved before the cases are shared out."""

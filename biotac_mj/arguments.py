@@ -68,7 +68,7 @@ def add_ray(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="of a Ray cluster that shares the work (docs/cluster.md); local: several processes here",
+        help="of a Ray cluster that shares the work (docs/howto/cluster.md); local: several processes here",
     )
 
 

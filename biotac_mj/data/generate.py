@@ -226,7 +226,7 @@ def generate(
       options: see GenerateOptions.
       workers: processes for film and readings; None takes the cores there are, 0 this process.
       progress: whether to show a bar.
-      ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for each batch, of one core, one GPU
+      ray: address of a Ray cluster, or "local": a task for each batch, of one core, one GPU
         where the device is one, and `workers` cores (none: 0).
 
     Raises:

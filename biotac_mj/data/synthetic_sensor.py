@@ -56,19 +56,19 @@ class SensorVariation:
 
     Attributes:
       youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. E: all fits to two pressed sensors
-        (docs/real_match.md, 0.47 to 1.36 MPa); nu: the default's and the least compressible tried there.
+        (docs/lab/real_match.md, 0.47 to 1.36 MPa); nu: the default's and the least compressible tried there.
       uneven: how the modulus rises along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
-      rest_pressure: of its liquid [Pa]: none to 0.0194 E (docs/real_match.md, Filling).
+      rest_pressure: of its liquid [Pa]: none to 0.0194 E (docs/lab/real_match.md, Filling).
       film, film_spread, film_length: what stays where the skin lies on the core [m], from place to place by
         so much in its logarithm: the catalogue's range, 20-100 um, in the mean and again from place to place.
       texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls that were fitted
-        to two sensors lie up to 0.29 mm off (docs/real_match.md, The tip); the length is chosen.
+        to two sensors lie up to 0.29 mm off (docs/lab/real_match.md, The tip); the length is chosen.
       excitation: (4, 2) of X1..X4, within 0.7 mm of the estimate (chosen: it is known to some millimetres at
         best).
       electrode_shift: (19, 3) [m] of the electrodes, all together by up to 1 mm along and across (the
         catalogue's `misalign`), and each by 0.3 mm (chosen).
       mixing: (19, 19) that the changes of ln Z are multiplied with: gains that scatter by 0.27 (0.25 to 0.29
-        in two sensors, docs/real_match.md, The tip), cross-talk of neighbours 0-0.2 within 2-6 mm, and far
+        in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and far
         coupling, a share of the mean (the catalogue's `crosstalk`).
       sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
       ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards

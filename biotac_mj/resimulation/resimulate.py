@@ -114,7 +114,7 @@ def resimulate(
       recording: with poses, or with force for fitted ones. options: see ResimulateOptions.
       workers: processes for film and readings; None takes the cores there are, 0 this process.
       progress: whether to show a bar.
-      ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for each shard, of one core, one GPU
+      ray: address of a Ray cluster, or "local": a task for each shard, of one core, one GPU
         where the device is one, and `workers` cores (None: 0). Touches are found in this process, on the CPU.
 
     Raises:

@@ -68,7 +68,7 @@ def train_all(
       config: LearningConfig. device: of torch. paper: False leaves out what is slow without a GPU: latent
         projection and PointNet++.
       only: names of our models to train; None takes all of FORWARD. limit: interactions to read.
-      progress: whether to show a bar. ray: address of a Ray cluster, or "local" (docs/cluster.md): a task for
+      progress: whether to show a bar. ray: address of a Ray cluster, or "local": a task for
         each split and seed, of one core, and one GPU where the device is one. All nodes read the set at its
         path.
     """
