@@ -26,6 +26,7 @@ TYPED = (
     "resimulation",
     "samples",
     "neighbours",
+    "cli",
 )
 
 

@@ -1,0 +1,110 @@
+"""The `biotac` command: one verb per job. The work of a verb lives in its folder and is loaded when the verb
+is used."""
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+from ..arguments import Parser
+from .diagnosing import add_diagnose
+from .fitting import add_calibrate, add_compare
+from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
+from .pressing import add_import_mesh, add_mount, add_press, add_samples, add_view
+from .sets import add_data, add_generate
+
+__all__ = [
+    "CONFIGURATIONS",
+    "INDENTERS",
+    "INTERACTIONS",
+    "MATERIALS",
+    "OBJECTS",
+    "SKINS",
+    "TIERS",
+    "main",
+    "parser",
+]
+
+
+def parser() -> Parser:
+    """The command line."""
+    from .. import __version__
+    from ..learning.verbs import add_verbs as add_learning
+    from ..recordings.verbs import add_verbs as add_recordings
+    from ..resimulation.verbs import add_verb as add_resimulation
+    from .common import add_verb
+
+    top = Parser(prog="biotac", description="A SynTouch BioTac fingertip in MuJoCo.")
+    top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    own = (
+        add_press,
+        add_samples,
+        add_view,
+        add_mount,
+        add_import_mesh,
+        add_calibrate,
+        add_compare,
+        add_diagnose,
+    )
+    for add in (*own, add_generate, add_data):
+        add(verbs)
+    for add in (add_recordings, add_resimulation, add_learning):
+        add(verbs, add_verb)
+    return top
+
+
+# what is said of errors of the system beside their own text
+_REMEDIES = {
+    errno.ENOSPC: "free some space on that disk, or choose another --out",
+    errno.EDQUOT: "free some of your quota, or choose another --out",
+    errno.EFBIG: "choose an --out where larger files may be",
+    errno.EROFS: "choose another --out",
+    errno.EACCES: "choose another place, or ask for the right to it",
+    errno.EPERM: "choose another place, or ask for the right to it",
+    errno.ENAMETOOLONG: "give a shorter name",
+}
+
+
+def _said(error) -> str:
+    """An error in one line: cause and remedy."""
+    if isinstance(error, OSError) and error.errno:
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"{where}{error.strerror}: {_REMEDIES.get(error.errno, 'check the path, then try again')}"
+    elif isinstance(error, MemoryError):
+        text = "this needs more memory than there is: ask for fewer steps, worlds or interactions at once"
+    else:
+        text = str(error)
+    return " ".join(text.split())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a verb; bad input is one line on stderr and exit code 2.
+
+    What nobody expected is one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows all.
+    """
+    try:
+        args = parser().parse_args(argv)
+        args.run(args)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, MemoryError) as error:
+        print(f"biotac: error: {_said(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("biotac: stopped", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if os.environ.get("BIOTAC_TRACEBACK"):
+            raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        print(
+            f"biotac: error: unexpected {type(error).__name__} in {os.path.basename(place.filename)}, line "
+            f"{place.lineno}: {_said(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
+            file=sys.stderr,
+        )
+        return 70
+    return 0

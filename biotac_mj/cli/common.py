@@ -1,0 +1,114 @@
+"""Arguments that several verbs share."""
+
+import argparse
+from collections.abc import Callable
+
+from ..arguments import SEED, device
+from .names import MATERIALS, SKINS, TIERS
+
+__all__ = ["add_options", "add_sensor", "add_skin", "add_verb", "choice", "of_sensor"]
+
+
+class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Defaults where they say something."""
+
+    def _get_help_string(self, action):
+        return action.help if action.default in (None, False, True) else super()._get_help_string(action)
+
+
+def add_verb(
+    verbs: argparse._SubParsersAction, name: str, run: Callable[[argparse.Namespace], None], text: str
+) -> argparse.ArgumentParser:
+    """A verb that calls run(args)."""
+    verb = verbs.add_parser(name, help=text, description=text, formatter_class=_Formatter)
+    verb.set_defaults(run=run)
+    return verb
+
+
+def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise") -> None:
+    """Adds the skin, its rubber, tier, device and the seed; seed: what it is of."""
+    verb.add_argument(
+        "--skin",
+        default="default",
+        help=f"mesh of the skin: {', '.join(SKINS)}, or a file made by `biotac import-mesh`",
+    )
+    verb.add_argument(
+        "--tier",
+        default="full",
+        choices=TIERS,
+        help="full finite elements, or the condensed skin for real time on one core",
+    )
+    verb.add_argument(
+        "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"
+    )
+    verb.add_argument(
+        "--liquid",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="liquid under the skin (default: the material's choice)",
+    )
+    verb.add_argument("--seed", type=SEED, default=0, help=seed)
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
+    add_options(verb)
+
+
+def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
+    """Adds whose sensor it is, and of what `touched` is made."""
+    verb.add_argument(
+        "--sensor",
+        type=choice,
+        metavar="NAME",
+        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random or JSON",
+    )
+    verb.add_argument(
+        "--randomise",
+        nargs="+",
+        metavar="EFFECT",
+        help="effects that are drawn: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
+    )
+    verb.add_argument(
+        "--effects",
+        metavar="FILE.yaml",
+        help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
+    )
+    for name, example in (("thermal", "steel"), ("texture", "cork")):
+        verb.add_argument(
+            f"--{name}",
+            nargs="+",
+            type=choice,
+            metavar="MATERIAL",
+            help=f"of what {touched}, as in {example}, or JSON; of several one is drawn (default: left out)",
+        )
+
+
+def choice(text: str) -> str | dict:
+    """A name, or JSON of a dict."""
+    import json
+
+    if text.endswith((".yaml", ".yml")):
+        raise argparse.ArgumentTypeError(f"{text!r} is a sensor file: give it as --effects {text}")
+    if not text.startswith("{"):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON ({error})") from error
+
+
+def of_sensor(args: argparse.Namespace) -> dict:
+    """Settings of a press or a set from the arguments of `add_sensor`."""
+    one = {name: getattr(args, name) for name in ("thermal", "texture")}
+    one = {name: v[0] if v and len(v) == 1 else v for name, v in one.items()}  # of several one is drawn
+    return {"sensor": args.sensor, "randomise": args.randomise, **one}
+
+
+def add_options(verb: argparse.ArgumentParser, name: str = "--options", of: str = "the skin") -> None:
+    """Adds further settings as JSON."""
+    verb.add_argument(
+        name,
+        metavar="JSON",
+        help=f"further settings of {of}, JSON or a file of it: "
+        '{"skin": {"contact_law": {"adhesion": 0.05}}, "modulus": "factors.npy"} (docs/features.md)',
+    )

@@ -1,0 +1,99 @@
+"""The verb `biotac diagnose`."""
+
+import argparse
+
+from ..arguments import check_device, device, output_folder, real
+from .common import add_options, add_verb
+from .names import TIERS
+
+__all__ = ["add_diagnose"]
+
+
+def add_diagnose(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "diagnose",
+        _diagnose,
+        "Name what the simulation misses in measured data; writes report.html and verdict.json.",
+    )
+    verb.add_argument(
+        "data",
+        nargs="?",
+        metavar="DATA",
+        help="HDF5 of measured trajectories, or a recording, with the object's poses or without "
+        "(docs/lab/discrepancy.md)",
+    )
+    verb.add_argument(
+        "--object", metavar="NAME", help="what touched in DATA, where it does not say, as sphere_7mm"
+    )
+    verb.add_argument(
+        "--repeatability",
+        type=real(1e-4, 5),
+        metavar="MM",
+        help="by which poses differ from trial to trial (default: 0.05)",
+    )
+    verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --sensor says)")
+    verb.add_argument(
+        "--sensor",
+        metavar="FILE.yaml",
+        help="the simulator that is compared with DATA (default: our own sensor)",
+    )
+    verb.add_argument(
+        "--electrodes",
+        metavar="FILE",
+        help="plain recording instead: text, 19 columns of raw counts, one row per sample",
+    )
+    verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
+    verb.add_argument(
+        "--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row"
+    )
+    verb.add_argument(
+        "--rate",
+        type=real(1e-3, 1e6),
+        default=None,
+        metavar="HZ",
+        help="rows per second (default: guessed from repeated rows, else 100)",
+    )
+    verb.add_argument(
+        "--simulate",
+        action="store_true",
+        help="flat presses with --force: fit each row's pose in simulated states (made the first time, in "
+        "minutes) and say in which stage of the model the rest disagrees",
+    )
+    verb.add_argument(
+        "--also",
+        nargs=2,
+        action="append",
+        metavar=("E", "F"),
+        help="electrodes and force of another sensor: with --simulate what both share is the base model's",
+    )
+    kept = (
+        "of the data, kept aside for the proof (default: "
+        "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
+    )
+    verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="SHARE", help=kept)
+    verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
+    verb.add_argument(
+        "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
+    )
+    add_options(verb)
+    verb.add_argument(
+        "--in-skin",
+        action="store_true",
+        help="constitutive effects inside the finite elements (full tier) in the proof",
+    )
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="of the full tier: cpu, or a CUDA device such as cuda:0"
+    )
+    files = output_folder("report.html", "verdict.json", "sensor_amended.yaml")
+    verb.add_argument("--out", type=files, default="out/diagnose", metavar="DIR", help="folder of the report")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _diagnose(args):
+    from ..discrepancy import verbs
+
+    if args.tier == "full":
+        check_device(args.device)
+    verbs.diagnose_verb(args)

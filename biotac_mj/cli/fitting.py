@@ -1,0 +1,178 @@
+"""The verbs `biotac calibrate` and `compare`."""
+
+import argparse
+
+from ..arguments import SEED, check_device, device, output_folder, real, whole
+from .common import add_options, add_verb
+from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
+
+__all__ = ["add_calibrate", "add_compare"]
+
+
+def add_calibrate(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "calibrate",
+        _calibrate,
+        "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.",
+    )
+    verb.add_argument(
+        "data",
+        nargs="?",
+        metavar="DATA",
+        help="CSV of the indentation (docs/lab/calibration.md), or skin.h5 of a press",
+    )
+    verb.add_argument(
+        "--synthetic",
+        action="store_true",
+        help="instead of DATA: our own skin of --truth pressed and slid, with --noise",
+    )
+    verb.add_argument(
+        "--truth", default="rubber", help="material of the synthetic skin; a preset, its liquid with it"
+    )
+    verb.add_argument(
+        "--truth-skin",
+        default="default",
+        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight",
+    )
+    verb.add_argument(
+        "--truth-liquid",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="(default: as the preset --truth has it)",
+    )
+    verb.add_argument(
+        "--noise",
+        type=real(0, 1e3),
+        default=0.01,
+        metavar="N",
+        help="of each synthetic force component, standard deviation",
+    )
+    verb.add_argument("--seed", type=SEED, default=0, help="of that noise")
+    verb.add_argument(
+        "--indenter", default=None, metavar="NAME", help=f"what pressed, needed with CSV: {INDENTER_HELP}"
+    )
+    verb.add_argument(
+        "--direction",
+        type=real(-1e9, 1e9),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="the indenter's tip points there (default: +y)",
+    )
+    verb.add_argument(
+        "--configuration", default="shell_with_core", choices=CONFIGURATIONS, help="what is fitted"
+    )
+    verb.add_argument(
+        "--skin", default="coarse", help=f"its mesh: {', '.join(SKINS)}, or a file; solids come as coarse"
+    )
+    verb.add_argument(
+        "--correct",
+        action="store_true",
+        help="correct the fit by the mesh refined: the material, not the mesh's stiffness",
+    )
+    verb.add_argument(
+        "--material",
+        default="paper",
+        help=f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json",
+    )
+    add_options(verb)
+    add_options(verb, "--truth-options", "the synthetic skin")
+    verb.add_argument(
+        "--liquid",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="liquid under the skin; matters for E and nu",
+    )
+    verb.add_argument(
+        "--fit",
+        nargs="+",
+        default=["E", "nu", "mu"],
+        metavar="NAME[:LOW:HIGH]",
+        help="parameters, with bounds if you like",
+    )
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
+    verb.add_argument(
+        "--out",
+        type=output_folder("calibration.json", "calibration.png", "synthetic.csv"),
+        default="out/calibrate",
+        metavar="DIR",
+        help="folder of calibration.json and calibration.png",
+    )
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _calibrate(args):
+    from ..calibration import verbs
+
+    check_device(args.device)
+    verbs.calibrate_verb(args)
+
+
+def add_compare(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "compare",
+        _compare,
+        "Compare the paper's four configurations with a reference over many indentations.",
+    )
+    verb.add_argument(
+        "--configurations",
+        nargs="+",
+        default=list(CONFIGURATIONS),
+        choices=CONFIGURATIONS,
+        metavar="NAME",
+        help="which",
+    )
+    verb.add_argument(
+        "--data",
+        nargs="+",
+        metavar="INDENTER=FILE",
+        help="measured indentations, not our stand-in; the first calibrates",
+    )
+    verb.add_argument(
+        "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help="which"
+    )
+    verb.add_argument(
+        "--count", type=whole(1, 10_000), default=1, help="random indentations for each indenter"
+    )
+    verb.add_argument("--seed", type=SEED, default=0, help="of the indentations")
+    verb.add_argument(
+        "--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it"
+    )
+    verb.add_argument("--reference-skin", default="coarse", help="mesh of the stand-in")
+    verb.add_argument(
+        "--reference-element",
+        default="quadratic",
+        choices=("linear", "quadratic"),
+        help="elements of the stand-in",
+    )
+    verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
+    verb.add_argument(
+        "--material",
+        help="given to all configurations, preset or a material's or calibration's .json (default: "
+        "each is calibrated first)",
+    )
+    add_options(verb)
+    add_options(verb, "--reference-options", "the stand-in")
+    verb.add_argument(
+        "--liquid", action=argparse.BooleanOptionalAction, default=False, help="liquid in the shells"
+    )
+    verb.add_argument(
+        "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
+    )
+    files = output_folder("compare.json", "compare.kept")
+    verb.add_argument(
+        "--out", type=files, default="out/compare", metavar="DIR", help="folder of compare.json"
+    )
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _compare(args):
+    from ..calibration import verbs
+
+    check_device(args.device)
+    verbs.compare_verb(args)

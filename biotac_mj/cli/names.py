@@ -1,0 +1,36 @@
+"""Names that the help shows without loading what defines them (tests hold them together)."""
+
+__all__ = [
+    "INDENTER_HELP",
+    "LOCATION_HELP",
+    "INDENTERS",
+    "TIERS",
+    "MATERIALS",
+    "SKINS",
+    "PEGS",
+    "OBJECTS",
+    "INTERACTIONS",
+    "CONFIGURATIONS",
+]
+
+INDENTERS = (
+    "sphere_3-5mm sphere_7mm sphere_14mm cylinder_short_3-5mm cylinder_short_7mm cylinder_long_7mm "
+    "cube_14mm ring_7mm"
+).split()
+TIERS = ("full", "condensed")
+MATERIALS = ("default", "paper", "rubber", "ansys", "calibrated")
+SKINS = ("coarse", "default", "fine")
+PEGS = "peg_round_4mm peg_round_8mm peg_square_5mm peg_square_10mm peg_hexagon_8mm peg_triangle_8mm".split()
+OBJECTS = (*INDENTERS, *PEGS, "table_surface", "table_edge", "table_corner")
+INTERACTIONS = ("press", "slide", "twist", "tap")
+CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "solid")
+INDENTER_HELP = (
+    f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's "
+    "sphere, capsule, cylinder, "
+    "ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres"
+)
+LOCATION_HELP = (
+    "where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X "
+    "Y Z, moved to the nearest point "
+    "of the skin. BioTac frame: tip at -x, pad at -y, nail at +y"
+)

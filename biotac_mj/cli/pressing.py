@@ -1,0 +1,282 @@
+"""The verbs `biotac press`, `view`, `samples`, `mount` and `import-mesh`."""
+
+import argparse
+
+from ..arguments import SEED, check_device, output_file, output_folder, real, whole
+from ..files import check_output_file
+from .common import add_sensor, add_skin, add_verb, of_sensor
+from .names import INDENTER_HELP, LOCATION_HELP
+
+__all__ = ["add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
+
+
+def add_press(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "press",
+        _press,
+        "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.",
+    )
+    verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=INDENTER_HELP)
+    verb.add_argument(
+        "--location", type=real(-1e3, 1e3), nargs="+", default=[-12.0], metavar="MM", help=LOCATION_HELP
+    )
+    verb.add_argument(
+        "--direction",
+        type=real(-1e9, 1e9),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="of the press (default: inward normal of the skin there)",
+    )
+    verb.add_argument("--depth", type=real(), default=2.4, metavar="MM", help="travel from first touch")
+    verb.add_argument(
+        "--slide", type=real(), default=0.0, metavar="MM", help="travel along the skin after the press"
+    )
+    verb.add_argument(
+        "--slide-direction",
+        type=real(-1e9, 1e9),
+        nargs=3,
+        default=[1.0, 0.0, 0.0],
+        metavar=("X", "Y", "Z"),
+        help="of the slide",
+    )
+    verb.add_argument("--speed", type=real(), default=10.0, metavar="MM/S", help="of press and slide")
+    verb.add_argument(
+        "--hold", type=real(), default=20.0, metavar="MS", help="rest at the end of press and slide"
+    )
+    verb.add_argument("--timestep", type=real(), default=4.0, metavar="MS", help="of MuJoCo")
+    ways = verb.add_mutually_exclusive_group()
+    ways.add_argument(
+        "--one-way",
+        dest="two_way",
+        action="store_false",
+        default=False,
+        help="the indenter's path is prescribed (default)",
+    )
+    ways.add_argument(
+        "--two-way",
+        dest="two_way",
+        action="store_true",
+        default=False,
+        help="a servo with mass pushes the indenter and gives way",
+    )
+    verb.add_argument(
+        "--mu",
+        type=real(0, 100),
+        default=None,
+        help="friction between skin and indenter (default: the material's)",
+    )
+    add_skin(verb)
+    add_sensor(verb, "the indenter is")
+    files = output_folder("readings.csv", "skin.h5", "press.png")
+    verb.add_argument("--out", type=files, default="out/press", metavar="DIR", help="folder of the results")
+    verb.add_argument(
+        "--render",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="MuJoCo's render in press.png; "
+        "without it, or without a GL library, matplotlib draws the surfaces",
+    )
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _press(args):
+    import math
+    import pathlib
+
+    from ..press import PressOptions, press, render, report
+    from ..press.record import write_readings, write_skin
+
+    location = [1e-3 * v for v in args.location]
+    if len(location) < 3:
+        location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
+    settings = dict(
+        indenter=args.indenter,
+        location=tuple(location),
+        direction=args.direction and tuple(args.direction),
+        depth=1e-3 * args.depth,
+        slide=1e-3 * args.slide,
+        slide_direction=tuple(args.slide_direction),
+        material=args.material,
+        liquid=args.liquid,
+        skin=args.skin,
+        tier=args.tier,
+        timestep=1e-3 * args.timestep,
+        speed=1e-3 * args.speed,
+        hold=1e-3 * args.hold,
+        two_way=args.two_way,
+        friction=args.mu,
+        seed=args.seed,
+        device=args.device,
+        options=args.options,
+        **of_sensor(args),
+    )
+    if args.effects:
+        from ..effects.amended import amend_settings
+
+        settings = amend_settings(settings, PressOptions, args.effects)
+    options = PressOptions(**settings)
+    check_device(args.device)
+    record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
+    out = pathlib.Path(args.out)
+    files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
+    write_readings(record, files[0])
+    write_skin(record, files[1])
+    report.write_picture(record, files[2], picture)
+    if args.render and picture is None:
+        print(
+            "no GL library works here: "
+            "press.png shows the surfaces drawn by matplotlib (libosmesa6 or libegl1 would do)"
+        )
+    print(report.table(record, files))
+
+
+def add_samples(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "samples",
+        _samples,
+        "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+    )
+    verb.add_argument("out", type=output_folder(), metavar="DIR", help="folder to make")
+    verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _samples(args):
+    from ..samples import OBJECT, make_samples
+
+    electrodes, forces, log, made = make_samples(args.out, args.seed, not args.quiet)
+    print("synthetic, made by the simulation. Next:")
+    print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
+    print(f"  biotac diagnose {log} --object {OBJECT}  # some minutes: the skin is solved again and again")
+    print(f"  biotac train {made} --no-paper --seeds 0 --splits trajectory")
+
+
+def add_view(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "view",
+        _view,
+        "Open MuJoCo's viewer on a BioTac and a ball to press it with: "
+        "double-click the ball, then drag with ctrl and right button.",
+    )
+    add_skin(verb)
+    verb.add_argument(
+        "--render",
+        type=output_file(),
+        metavar="FILE",
+        help="write a picture of the ball lying on the pad instead of opening a window",
+    )
+    verb.add_argument("--seconds", type=real(0, 60), default=0.3, help="how long to simulate before --render")
+    verb.add_argument(
+        "--hand",
+        metavar="FILE",
+        help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead",
+    )
+    verb.add_argument(
+        "--web",
+        action="store_true",
+        help="a page in the browser with skin, electrodes and traces (extra web)",
+    )
+    verb.add_argument(
+        "--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation"
+    )
+    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
+
+
+def _view(args):
+    from ..view import view
+
+    check_device(args.device)
+    view(
+        skin=args.skin,
+        tier=args.tier,
+        material=args.material,
+        liquid=args.liquid,
+        seed=args.seed,
+        device=args.device,
+        render=args.render,
+        seconds=args.seconds,
+        hand=args.hand,
+        web=args.web,
+        recording=args.recording,
+        port=args.port,
+        options=args.options,
+    )
+
+
+def add_mount(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "mount",
+        _mount,
+        "Find where a BioTac goes on a hand's link, for attach_to_hand(mount=FILE), and draw it.",
+    )
+    verb.add_argument("hand", metavar="HAND.xml", help="MJCF of the hand")
+    verb.add_argument(
+        "--body", nargs="+", required=True, metavar="NAME", help="the links with the fingertips"
+    )
+    for name, text in (
+        ("tip", "where the fingertip points in the link's frame (default: its longest way)"),
+        ("pad", "where the pad looks there (default: where its joint bends it to)"),
+        ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
+    ):
+        verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)
+    verb.add_argument(
+        "--replaces",
+        nargs="*",
+        metavar="GEOM",
+        help="geoms that the BioTac stands for (default: all of the link)",
+    )
+    verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
+    verb.add_argument("--picture", type=output_file(), metavar="PNG", help="the link before and after")
+
+
+def _mount(args):
+    from ..tasks.mounting import mount_verb
+
+    mount_verb(args)
+
+
+def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
+    )
+    verb.add_argument("path", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file")
+    verb.add_argument(
+        "--out",
+        metavar="FILE.npz",
+        help="where to store it (default: PATH's name with .npz, in the current folder)",
+    )
+
+
+def _import_mesh(args):
+    import pathlib
+
+    from ..geometry import import_mesh
+    from ..geometry.card import skin_numbers
+
+    source = pathlib.Path(args.path)
+    out = pathlib.Path(args.out or f"{source.resolve().stem}.npz")
+    if out.suffix != ".npz":
+        raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
+    check_output_file(out)
+    geometry = import_mesh(source)
+    numbers = skin_numbers(geometry)
+    units = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
+    low, high = numbers.pop("box")
+    gaps = numbers.pop("gaps")
+    for name, value in numbers.items():
+        unit = next((u for key, u in units.items() if key in name), "")
+        print(f"  {name:<56}{value if isinstance(value, int) else f'{value:.3f}':>10} {unit}")
+    for axis, a, b in zip("xyz", low, high):
+        print(f"  {'box ' + axis:<56}{a:>10.3f} .. {b:.3f} mm")
+    print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
+    geometry.save(out)
+    print(f"  stored in {out}: use it with --skin {out}")

@@ -1,0 +1,148 @@
+"""The verbs `biotac generate`, `import-data` and `export-data`."""
+
+import argparse
+
+from ..arguments import SEED, add_ray, check_device, output_folder, real, whole
+from .common import add_sensor, add_skin, add_verb
+from .names import INTERACTIONS, OBJECTS
+
+__all__ = ["add_generate", "add_data"]
+
+
+def add_generate(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "generate",
+        _generate,
+        "Make a synthetic data set of random interactions; goes on where it was interrupted.",
+    )
+    verb.add_argument("--count", type=whole(1, 10_000_000), default=2600, help="interactions")
+    verb.add_argument("--steps", type=whole(8, 2000), default=20, help="time steps of each")
+    verb.add_argument("--rate", type=real(1e-3, 1e6), default=20.0, metavar="HZ", help="of the time steps")
+    verb.add_argument(
+        "--labelled",
+        type=whole(0, 10_000_000),
+        help="of them, how many get the synthetic measured sensor's counts too (default: 359)",
+    )
+    verb.add_argument(
+        "--recordings",
+        type=whole(0, 10_000_000),
+        default=0,
+        help="further interactions of which only the synthetic sensor's counts are kept",
+    )
+    verb.add_argument(
+        "--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS, metavar="NAME", help="what touches"
+    )
+    verb.add_argument(
+        "--kinds",
+        nargs="+",
+        default=list(INTERACTIONS),
+        choices=INTERACTIONS,
+        metavar="KIND",
+        help="how it moves",
+    )
+    verb.add_argument(
+        "--element",
+        choices=("linear", "quadratic"),
+        help="of the skin (default: the material's, or the mesh's)",
+    )
+    verb.add_argument(
+        "--batch",
+        type=whole(1, 100_000),
+        default=160,
+        help="worlds at most that are solved together; a shard holds one batch",
+    )
+    verb.add_argument(
+        "--measured-batch",
+        type=whole(1, 100_000),
+        default=90,
+        help="the same where the synthetic measured sensor takes part",
+    )
+    verb.add_argument("--measured-seed", type=SEED, default=0, help="number of the synthetic measured sensor")
+    verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
+    verb.add_argument(
+        "--workers",
+        type=whole(0, 1024),
+        help="processes that compute electrode readings (default: one per core)",
+    )
+    verb.add_argument(
+        "--vary",
+        metavar="JSON",
+        help="drawn anew for each interaction, JSON or a file of it: "
+        '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
+    )
+    add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
+    add_sensor(verb, "the objects are")
+    verb.add_argument(
+        "--out",
+        type=output_folder("generate.json"),
+        default="out/set",
+        metavar="DIR",
+        help="folder of the set",
+    )
+    add_ray(verb)
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _generate(args):
+    from ..data import verbs
+
+    if args.ray is None:  # a cluster has its own devices
+        check_device(args.device)
+    verbs.generate_verb(args)
+
+
+def add_data(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    from ..recordings.verbs import add_load_arguments
+
+    verb = add_verb(
+        verbs,
+        "import-data",
+        _import_data,
+        "Read recordings of real sensors, whatever `biotac import` reads, into a set.",
+    )
+    verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
+    verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
+    verb.add_argument(
+        "--block",
+        type=real(1e-3, 1e9),
+        metavar="S",
+        help="cut into interactions of this length (they end at gaps of half a second in any case)",
+    )
+    verb.add_argument(
+        "--objects", nargs="+", metavar="NAME", help="NVIDIA's files: names of indenter types 0, 1, ..."
+    )
+    add_load_arguments(verb)
+    verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
+    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
+    verb = add_verb(
+        verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
+    )
+    verb.add_argument("set", metavar="SET", help="folder of shards")
+    verb.add_argument(
+        "--measured",
+        action="store_true",
+        help="measured counts, of interactions that have them, not simulated ones",
+    )
+    verb.add_argument(
+        "--rate",
+        type=real(0.1, 1e4),
+        metavar="HZ",
+        help="of frames, which hold the nearest rows (default: the set's)",
+    )
+    verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _import_data(args):
+    from ..data import verbs
+
+    verbs.import_verb(args)
+
+
+def _export_data(args):
+    from ..data import verbs
+
+    verbs.export_verb(args)
