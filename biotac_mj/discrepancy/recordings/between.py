@@ -333,6 +333,8 @@ def find_between(session: Session) -> list[Finding]:
         without, options = view.errors(chain).mean(1), []
         least = _REMAINDER * (null - without.mean())
         for effect in effects:
+            if not tried[effect.id]:  # in so short a recording
+                continue
             theta, score, _ = best(effect, chain)
             g = gain(effect, theta, score, chain, without)
             if sign_flip(g) < _P and g.mean() > max(least, 0):
@@ -355,7 +357,8 @@ def _finding(session, view, one, rest, best, gain, null):
     g = gain(effect, theta, score, rest, without)
     ties = ["creep"] if effect.id == "relax" else []  # a plateau takes longer than these holds
     for other in BETWEEN:
-        if other is not effect and other not in [known for known, _ in rest]:
+        known = [one for one, _ in rest]
+        if other is not effect and other not in known and other.tried(view.rate, len(view.rows) / view.rate):
             rival, said, _ = best(other, rest)
             lead = said - score
             close = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)

@@ -150,6 +150,7 @@ def _within(x, span, known):
     """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out, for
     a step within one is a change of the sensor and not of the load, and those with holes (m, c) while enough
     are left."""
+    span = min(span, len(x))  # a part may be shorter than a window
     k = len(x) // span
     cells = x[: k * span].reshape(k, span, -1)
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, span), 2))[0]
