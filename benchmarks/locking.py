@@ -41,6 +41,7 @@ __all__ = ["cook_reference", "cook_tip", "main", "patch_force", "sphere_growth"]
 
 MATERIALS = {"paper": (1.55223093e6, 0.31645428), "rubber": (2.8e5, 0.45), "ansys": (2.8e5, 0.4999)}
 PATCH_CENTER, PATCH_SIZE, PATCH_MOTION = -10e-3, 1e-3, 1e-4  # [m]
+_MEGA = 1e6
 
 
 def discretise(geometry, element, material, project=None):
@@ -161,16 +162,16 @@ def patch_force(geometry, element, material):
 
 def cook_tip(cells, element, nu):
     """Cook's membrane as a plane strain slab of cells x cells x 1: how far the corner (48, 60) moves up under
-    a load of 1, E 1."""
+    a load of 1 and E 1: both a million times that, since E is in Pa."""
     thickness = 48 / cells
     vert, elem = box([np.linspace(0, 1, cells + 1)] * 2 + [[0, thickness]])
     flat = vert[:, 0].copy()
     vert[:, 0], vert[:, 1] = 48 * flat, 44 * flat + vert[:, 1] * (44 - 28 * flat)
     geometry, stiffness = discretise(
-        skin(vert, elem, [0], boundary(elem)), element, Material("linear", 1.0, nu)
+        skin(vert, elem, [0], boundary(elem)), element, Material("linear", _MEGA, nu)
     )
     load = np.zeros((geometry.nvert, 3))
-    load[:, 1] = nodal_areas(geometry.vert, faces_on(geometry.vert, geometry.outer_face, 0, 48)) / 16
+    load[:, 1] = _MEGA * nodal_areas(geometry.vert, faces_on(geometry.vert, geometry.outer_face, 0, 48)) / 16
     moves = np.repeat(geometry.vert[:, :1] > 1e-9, 3, axis=1)
     moves[:, 2] = False
     u = solve(stiffness, load.ravel(), np.flatnonzero(moves.ravel()))
@@ -190,12 +191,12 @@ def cook_reference(nu, cells=48):
     mesh = skfem.MeshTri(np.stack([48 * x, 44 * x + y * (44 - 28 * x)]), mesh.t)
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
     pressure = basis.with_element(skfem.ElementTriP1())
-    material = Material("linear", 1.0, nu)
+    material = Material("linear", _MEGA, nu)
     a = skfem.BilinearForm(lambda u, v, w: 2 * material.mu * ddot(sym_grad(u), sym_grad(v))).assemble(basis)
     b = skfem.BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, pressure)
     c = skfem.BilinearForm(lambda p, q, w: -p * q / material.lame).assemble(pressure)
     right = skfem.FacetBasis(mesh, basis.elem, facets=mesh.facets_satisfying(lambda x: abs(x[0] - 48) < 1e-9))
-    load = skfem.LinearForm(lambda v, w: v[1] / 16).assemble(right)
+    load = skfem.LinearForm(lambda v, w: _MEGA * v[1] / 16).assemble(right)
     held = basis.get_dofs(lambda x: abs(x[0]) < 1e-9).all()
     solution = skfem.solve(
         *skfem.condense(bmat([[a, b.T], [b, c]], "csr"), np.concatenate([load, np.zeros(pressure.N)]), D=held)

@@ -263,7 +263,7 @@ def test_error_texts(way, shell, tmp_path):
     with pytest.raises(ValueError, match="has no force"):
         calibrate(shell, TRUTH, way)
     with pytest.raises(ValueError, match="starts at .* outside"):
-        calibrate(shell, TRUTH, dataclasses.replace(way, force=way.force + 1), ["E:10:20"])
+        calibrate(shell, TRUTH, dataclasses.replace(way, force=way.force + 1), ["E:1000:2000"])
     with pytest.raises(ValueError, match="fewer"):
         covariance(np.ones((5, 3, 2)), np.ones((5, 3)))
     with pytest.raises(FileNotFoundError, match="no material"):

@@ -249,16 +249,17 @@ def test_a_hand_in_a_batch_presses_as_the_single_one():
         pin.add_geom(size=[4e-3, 0, 0])  # without a name
         return attach_to_hand(spec, mounts(), skin="coarse", **settings), spec.compile()
 
-    def place(data, core):
+    def place(data, core, k):  # contact comes in small steps: a jump into it may find another balance
         body = data.body(core)
-        return body.xpos + body.xmat.reshape(3, 3) @ [-12e-3, -11.6e-3, 0]
+        return body.xpos + body.xmat.reshape(3, 3) @ [-12e-3, -12.4e-3 + 1e-4 * k, 0]
 
     handles, model = build()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    data.mocap_pos[0] = place(data, handles["a"].body)
-    expected = []
-    for _ in range(8):
+    start, expected = mujoco.MjData(model), []
+    mujoco.mj_forward(model, start)
+    for k in range(12):
+        data.mocap_pos[0] = place(start, handles["a"].body, k)
         mujoco.mj_step(model, data)
         expected.append([handles[f].read(data, "contact_force")[:3] for f in ("a", "b")])
     expected = np.array(expected)
@@ -267,11 +268,10 @@ def test_a_hand_in_a_batch_presses_as_the_single_one():
     mujoco.mj_forward(mjm, mjd)
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
     both = [batch.attach(mjm, m, d, prefix=p, skin="coarse", readings=False) for p in prefixes.values()]
-    mocap = d.mocap_pos.numpy()
-    mocap[0, 0] = place(mjd, f"{prefixes['a']}core")
-    d.mocap_pos.assign(mocap)
-    found = []
-    for _ in range(8):
+    found, mocap = [], d.mocap_pos.numpy().copy()
+    for k in range(12):
+        mocap[0, 0] = place(mjd, f"{prefixes['a']}core", k)
+        d.mocap_pos.assign(mocap)
         mjw.step(m, d)
         rows = [
             d.sensordata.numpy()[:, mjm.sensor(f"{p}contact_force").adr[0] :][:, :3].copy()
@@ -280,6 +280,6 @@ def test_a_hand_in_a_batch_presses_as_the_single_one():
         found.append(rows)
     found = np.moveaxis(np.array(found), 2, 0)
     peak = np.abs(expected).max()
-    assert peak > 0.05 and not expected[:, 1].any() and not found[1].any()
+    assert peak > 0.03 and not expected[:, 1].any() and not found[1].any()
     np.testing.assert_allclose(found[0], expected, atol=5e-3 * peak)
     assert not both[1].rest.any.numpy()[0]

@@ -548,7 +548,7 @@ def test_balls_fall_on_skins_that_share_a_solver():
             settings = dict(skin="coarse", geoms=["ball0", "ball1"], tier="condensed", readings="none")
             handles.append(biotac_mj.attach(spec, body=f"finger{i}", prefix=f"b{i}_", quat=quat, **settings))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("biotac_mj.coupling.fem._CLEAR", clear)
+            patch.setattr("biotac_mj.coupling.fem.CLEAR", clear)
             model = spec.compile()
             data = mujoco.MjData(model)
             force = []

@@ -29,6 +29,7 @@ CLEAR = 1e-3
 # error
 _RESTS = 1e-8, 1.0
 _SHORT = 5e-4  # [m] a way to the skin of which friction may know all, as it does in batches
+_REACH = 0.02  # [m] from the BioTac's frame to its skin
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
@@ -260,7 +261,7 @@ class FemStepper:
         is none of its friction's."""
         last = self.came_to(state)
         if self._part(state, "started")[0] and self._search.clear(*last, self._reach):
-            if np.abs(geom_pos - last[0]).max() < _SHORT:
+            if _travel(*last, geom_pos, geom_mat) < _SHORT:
                 return last
             return self._search.last_clear(*last, geom_pos, geom_mat, self._reach)
         return self._search.outside(geom_pos, geom_mat, self._reach), geom_mat
@@ -333,6 +334,14 @@ class FemStepper:
             self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
         if self._material.remembers:
             self._part(state, "memory")[:] = d.memory.state()
+
+
+def _travel(pos0, mat0, pos, mat):
+    """How far geoms carry what of them is at the skin, from poses (n, 3), (n, 3, 3) to others [m]: the frame
+    of a large one may lie far away, and moves far where it turns a little."""
+    turn = mat @ np.swapaxes(mat0, 1, 2)
+    shift = np.linalg.norm(pos - (turn @ pos0[:, :, None])[:, :, 0], axis=1)
+    return (shift + _REACH * np.linalg.norm(turn - np.eye(3), axis=(1, 2))).max(initial=0.0)
 
 
 def rest_geometry(config: Config, geometry: SkinGeometry) -> SkinGeometry:

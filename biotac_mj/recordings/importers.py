@@ -121,7 +121,8 @@ def _read(path, role, rate, objects) -> list[Part] | list[Recording]:
     try:
         return _read_any(path, role, rate, objects)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a read that fails does not say of what
+        if error.errno and not error.filename:  # a read that fails does not say of what
+            error.filename = str(path)
         raise
 
 
