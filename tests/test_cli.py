@@ -124,3 +124,14 @@ def test_import_mesh_prints_a_table_and_stores_a_skin(shared, capsys, tmp_path):
     from biotac_mj.geometry import load_skin
 
     assert load_skin(out).nvert == 4246
+
+
+def test_what_a_verb_needs_and_is_not_there_is_named():
+    """One line with the extra that brings it."""
+    code = (
+        "import sys; sys.modules['torch'] = None; from biotac_mj.cli import main; "
+        "sys.exit(main(['predict', 'm.safetensors', 'x.txt', '--out', 'y.csv']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "biotac: error: this verb needs torch: pip install 'biotac-mj[learning]'" in done.stderr

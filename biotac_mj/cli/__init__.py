@@ -79,6 +79,30 @@ def _said(error) -> str:
     return " ".join(text.split())
 
 
+# packages that verbs load when they are used, and the extra that brings each
+_EXTRAS = dict.fromkeys(("torch", "safetensors"), "learning") | {
+    "dm_control": "control",
+    "gymnasium": "gymnasium",
+    "mujoco_warp": "batch",
+    "pyarrow": "lerobot",
+    "rosbags": "ros",
+    "skfem": "data",
+    "viser": "web",
+}
+
+
+def _unexpected(error: Exception) -> int:
+    if os.environ.get("BIOTAC_TRACEBACK"):
+        raise error
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    print(
+        f"biotac: error: unexpected {type(error).__name__} in {os.path.basename(place.filename)}, line "
+        f"{place.lineno}: {_said(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
+        file=sys.stderr,
+    )
+    return 70
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a verb; bad input is one line on stderr and exit code 2.
 
@@ -94,17 +118,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MemoryError) as error:
         print(f"biotac: error: {_said(error)}", file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            return _unexpected(error)
+        print(
+            f"biotac: error: this verb needs {error.name}: pip install 'biotac-mj[{extra}]'", file=sys.stderr
+        )
+        return 2
     except KeyboardInterrupt:
         print("biotac: stopped", file=sys.stderr)
         return 130
     except Exception as error:
-        if os.environ.get("BIOTAC_TRACEBACK"):
-            raise
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        print(
-            f"biotac: error: unexpected {type(error).__name__} in {os.path.basename(place.filename)}, line "
-            f"{place.lineno}: {_said(error)[:200]}; BIOTAC_TRACEBACK=1 shows all of it, please report it",
-            file=sys.stderr,
-        )
-        return 70
+        return _unexpected(error)
     return 0

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..threads import single_thread
 from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
@@ -359,7 +360,8 @@ class SkinData:
         shape = (geoms.ngroup, self.nworld)
         out = wp.zeros(shape, dtype=wp.spatial_matrixd, device=self.model.device)
         if geoms.ngroup:
-            self.preconditioner.measure_tangents(Launcher(self.model.device), geoms, self.x, out)
+            with single_thread():
+                self.preconditioner.measure_tangents(Launcher(self.model.device), geoms, self.x, out)
         return _leading(out)
 
     def stress(self) -> tuple[np.ndarray, np.ndarray]:

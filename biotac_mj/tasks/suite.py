@@ -80,7 +80,12 @@ def environment(
 def _domain(name):
     if name not in DOMAINS:
         raise ValueError(f"no domain {name!r}: choose one of {', '.join(DOMAINS)}")
-    return importlib.import_module(f".{name}", __package__)
+    try:
+        return importlib.import_module(f".{name}", __package__)
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("dm_control"):
+            raise
+        raise ModuleNotFoundError(f"{error}: pip install 'biotac-mj[control]'", name=error.name) from error
 
 
 def tasks() -> list[tuple[str, str]]:

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.linalg import lu_factor, lu_solve
 
+from ...threads import single_thread
 from ..newton.worlds import BALANCED, Worlds
 from ..program import Launcher
 from ..types import DOUBLE
@@ -48,7 +49,8 @@ class SparseFactor:
         elimination: Elimination | None = None,
     ):
         self.elimination = elimination or Elimination(stiffness, vert[free])
-        self._solver = SupernodalFactor(stiffness, self.elimination, free)
+        with single_thread():  # its fronts are small: more threads wait for each other
+            self._solver = SupernodalFactor(stiffness, self.elimination, free)
         self.size = stiffness.shape[0]
         self._free = free
         self._index = np.full(len(vert), -1)
