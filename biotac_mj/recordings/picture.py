@@ -103,7 +103,7 @@ def _map(axis, time, recording):
     value = np.insert(value, gap + 1, np.nan, axis=0)
     reach = np.nanpercentile(np.abs(value), 99.5) or 1.0
     picture = axis.pcolormesh(
-        edge, np.arange(0.5, 20), value.T, cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True
+        edge, np.arange(0.5, 20), value.T, cmap="RdBu", vmin=-reach, vmax=reach, rasterized=True
     )
     axis.set(yticks=[1, 5, 10, 15, 19], ylim=(19.5, 0.5))
     axis.set_ylabel("electrode")

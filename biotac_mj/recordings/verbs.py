@@ -1,6 +1,7 @@
 """The verbs `biotac import`, `export`, `show` and `record`: their arguments here, their work beside it."""
 
 import argparse
+import os
 from collections.abc import Callable
 
 from ..arguments import output_file, real, whole
@@ -8,6 +9,12 @@ from ..arguments import output_file, real, whole
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
 __all__ = ["add_load_arguments", "add_verbs", "load_given"]
+
+
+def _new_folder(text):
+    if os.path.exists(text):
+        raise argparse.ArgumentTypeError(f"{text} is there already: give the name of a new folder")
+    return output_file()(text)
 
 
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
@@ -33,7 +40,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
     bag.add_argument("--ros1", type=output_file(), metavar="OUT.bag", help="a bag of ROS 1")
-    bag.add_argument("--ros2", type=output_file(), metavar="OUT", help="a bag of ROS 2: a folder to make")
+    bag.add_argument("--ros2", type=_new_folder, metavar="OUT", help="a bag of ROS 2: a folder to make")
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
     v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac import` wrote or reads")
