@@ -181,7 +181,7 @@ def table(record: PressRecord, files: tuple | list = ()) -> str:
         ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
         ("PDC", f"{record.counts[record.deepest, 19] - record.counts[0, 19]:+.0f} counts"),
         ("steps", f"{len(record.time)} saved, {int(record.nonconverged[-1])} did not converge"),
-        ("wall time", f"{record.seconds:.2f} s"),
+        ("steps took", f"{record.seconds:.2f} s"),
         *[("wrote" if not i else "", str(file)) for i, file in enumerate(files)],
     ]
     return "\n".join(f"  {name:<12}{value}" for name, value in rows)

@@ -45,6 +45,9 @@ def guess_mount(spec: mujoco.MjSpec, body: str, **given: object) -> Mount:
     if "tip" not in given:
         reach = np.concatenate([points.max(0), -points.min(0)])
         given["tip"] = _plain(np.concatenate([np.eye(3), -np.eye(3)])[reach.argmax()])
+    for name in ("tip", "pad"):
+        if name in given and not np.linalg.norm(given[name]) > 0:
+            raise ValueError(f"{name} is {list(given[name])}: give a direction of the link's frame")
     tip = np.asarray(given["tip"], float) / np.linalg.norm(given["tip"])
     if "pad" not in given:
         bends = np.cross(frame.T @ _axis(model, data, here.id), tip)

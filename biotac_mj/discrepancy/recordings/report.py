@@ -139,6 +139,9 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
             f"  not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the "
             "moment, or no running sensor has it"
         )
+    lines.append(
+        "  sensor_amended.yaml has calibrated rubber, as real sensors were matched with: softer than default"
+    )
     lines.append(f"  left: {d.rest.text}")
     lines += [f"  cannot be known: {n}" for n in d.notes[1:]]
     return "\n".join(lines)
