@@ -344,7 +344,7 @@ def test_recording_from_topics(tmp_path, monkeypatch, ros):
         stamp = types.SimpleNamespace(
             secs=5, nsecs=10_000_000 * len(sent), sec=5, nanosec=10_000_000 * len(sent)
         )
-        data = [message(pdc_data=1500, electrode_data=np.full(19, sent[-1]))]
+        data = [message(pdc_data=1500, electrode_data=np.full(19, min(sent[-1], 4095)))]
         return message(header=message(stamp=stamp), bt_data=data)
 
     def module(name, **names):
