@@ -16,6 +16,7 @@ import spring_skin
 
 import biotac_mj
 from biotac_mj.coupling import SkinResult, attach, register_stepper, structs
+from biotac_mj.coupling.instance import Setup
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -94,6 +95,30 @@ def test_views_show_what_mujoco_holds():
             compared += 1
         assert view.nv == model.nv if real is model else view.time == data.time
     assert compared > 400
+
+
+def test_a_reset_writes_the_whole_state():
+    """MuJoCo does not know of contact exclusions when it asks for the state's size, and clears no memory."""
+    spec = mujoco.MjSpec()
+    for i in range(2):
+        body = spec.worldbody.add_body(name=f"ball{i}", pos=[0.1 * i, 0, 0.1])
+        body.add_freejoint()
+        body.add_geom(size=[0.01, 0, 0], mass=0.01)
+    spec.worldbody.add_body(name="finger", pos=[0, 0, 0.5])
+    handle = attach(spec, body="finger", skin=spring_skin.pad_geometry(), stepper="springs", readings="sum")
+    spec.add_exclude(bodyname1=handle.body, bodyname2="ball1")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    view = structs.ModelView(model._address)
+    assert view.plugin_statenum[0] > Setup(view, 0).nstate
+    states = []
+    for garbage in (np.nan, 7.0):
+        data.plugin_state[:] = garbage
+        mujoco.mj_resetData(model, data)
+        states.append(data.plugin_state.copy())
+    np.testing.assert_array_equal(*states)
+    assert np.isfinite(states).all()
+    mujoco.mj_step(model, data)
 
 
 def test_each_biotac_reads_its_own_ball(model):

@@ -168,8 +168,10 @@ def state_size(model: ModelView, index: int) -> int:
 def reset_state(model: ModelView, address: int, index: int) -> None:
     """Writes the rest state at an address, as mj_resetData asks."""
     setup = Setup(model, index)
-    buffer = (ctypes.c_double * setup.nstate).from_address(address)
-    setup.reset(np.frombuffer(buffer, np.float64))
+    buffer = (ctypes.c_double * int(model.plugin_statenum[index])).from_address(address)
+    state = np.frombuffer(buffer, np.float64)
+    state[setup.nstate :] = 0.0  # of geoms that a contact exclusion keeps away: MuJoCo leaves there what was
+    setup.reset(state)
 
 
 class Instance:
@@ -200,7 +202,7 @@ class Instance:
                 f"the model holds {size} numbers of BioTac state where {setup.nstate} are needed: "
                 "compile it again from its XML or MjSpec"
             )
-        self._state = slice(start, start + size)
+        self._state = slice(start, start + setup.nstate)
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved = {}
         self._error, self._outcome = False, _ALONE
