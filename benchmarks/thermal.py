@@ -13,6 +13,7 @@ import dataclasses
 import json
 import pathlib
 import re
+import sys
 import time
 
 import numpy as np
@@ -84,37 +85,64 @@ class Trace:
         return float(self.tdc[-3:].mean())
 
 
-def read(folder: str | pathlib.Path) -> list[Trace]:
-    """All traces of a folder.
+def read(folder: str | pathlib.Path) -> tuple[list[Trace], dict[str, str]]:
+    """All traces of a folder, and why others are left out, by file and finger.
 
     Raises:
-      FileNotFoundError: it has no recordings.
+      FileNotFoundError: it has no recordings that can be used.
     """
-    traces = []
+    traces, left_out = [], {}
     for path in sorted(pathlib.Path(folder).glob("*_HOLD.mat")):
         name, trial = re.fullmatch(r"(.+?)(?:_\d+)?_(\d+)_HOLD", path.stem).groups()
-        data = scipy.io.loadmat(path)
+        try:
+            material_of(name)
+            data = scipy.io.loadmat(path)
+        except Exception as error:  # a file's reader raises whatever it likes
+            left_out[path.name] = str(error) or type(error).__name__
+            continue
         for finger in (0, 1):
-            counts = np.array([data[f"F{finger}{channel}"].ravel() for channel in ("tdc", "tac")], float)
-            temperature = channels.temperature_from_counts(counts[0])
-            start = float(np.median(temperature[:10]))
-            pick = np.arange(_EVERY // 2 - 1, counts.shape[1], _EVERY)
-            traces.append(
-                Trace(
-                    name=name,
-                    trial=int(trial),
-                    finger=finger,
-                    time=pick / _RATE,
-                    tdc=temperature[pick] - start,
-                    tac=counts[1, pick],
-                    start=start,
-                    force=float(abs(np.median(data["JEff"]))),
-                    counts=counts,
-                )
-            )
+            try:
+                traces.append(_trace(data, name, int(trial), finger))
+            except ValueError as error:
+                left_out[f"{path.name} F{finger}"] = str(error)
+    lengths = [len(t.time) for t in traces]
+    usual = max(lengths, key=lengths.count, default=0)
+    for t in [t for t in traces if len(t.time) != usual]:
+        left_out[f"{t.name} {t.trial} F{t.finger}"] = f"{len(t.time)} samples where most have {usual}"
+    traces = [t for t in traces if len(t.time) == usual]
     if not traces:
-        raise FileNotFoundError(f"{folder} has no *_HOLD.mat: pass the folder of the recordings as --data")
-    return traces
+        why = "; ".join(f"{k}: {v}" for k, v in left_out.items()) or "no *_HOLD.mat"
+        raise FileNotFoundError(f"{folder} has no recording of a hold that can be used ({why})")
+    return traces, left_out
+
+
+def _trace(data, name, trial, finger):
+    missing = [key for key in (f"F{finger}tdc", f"F{finger}tac", "JEff") if np.size(data.get(key, ())) == 0]
+    if missing:
+        raise ValueError(f"it has no {' and no '.join(missing)}")
+    counts = [np.ravel(data[f"F{finger}{channel}"]) for channel in ("tdc", "tac")]
+    if len({len(c) for c in counts}) > 1 or len(counts[0]) < _RATE:
+        raise ValueError(f"TDC and TAC have {len(counts[0])} and {len(counts[1])} samples: a second at least")
+    counts = np.array(counts, float)
+    if not (np.isfinite(counts).all() and np.isfinite(np.asarray(data["JEff"], float)).all()):
+        raise ValueError("samples are not finite")
+    for which, channel in zip(("TDC", "TAC"), counts):
+        if np.mean((channel <= 0) | (channel >= channels.FULL_SCALE)) > 0.05:
+            raise ValueError(f"{which} is at an end of its 12 bits")
+    temperature = channels.temperature_from_counts(counts[0])
+    start = float(np.median(temperature[:10]))
+    pick = np.arange(_EVERY // 2 - 1, counts.shape[1], _EVERY)
+    return Trace(
+        name=name,
+        trial=trial,
+        finger=finger,
+        time=pick / _RATE,
+        tdc=temperature[pick] - start,
+        tac=counts[1, pick],
+        start=start,
+        force=float(abs(np.median(data["JEff"]))),
+        counts=counts,
+    )
 
 
 def tac_corner(traces: list[Trace], corner: float) -> float:
@@ -223,19 +251,20 @@ def report(traces: list[Trace], change: np.ndarray, tac: np.ndarray) -> dict:
         mine = [i for i, t in enumerate(traces) if t.name == name and not t.train]  # the predicted ones
         if not mine:
             continue
-        fingers = [[i for i in mine if traces[i].finger == f] for f in (0, 1)]
+        fingers = {f: [i for i in mine if traces[i].finger == f] for f in (0, 1)}
+        fingers = {f: chosen for f, chosen in fingers.items() if chosen}
         real = np.array([traces[i].change for i in mine])
         error = np.array([change[i] - traces[i].tdc for i in range(len(traces))])
-        mean_error = np.array([error[chosen].mean(0) for chosen in fingers])
+        mean_error = {f: error[chosen].mean(0) for f, chosen in fingers.items()}
         entry = {
             "dT10_real_mean": real.mean(),
-            "dT10_real_std": real.std(ddof=1),
+            "dT10_real_std": real.std(ddof=1) if len(real) > 1 else 0.0,
             "dT10_model": change[mine, -3:].mean(),
             # of each finger's mean curve, and of every trial by itself, with the spread of the trials in it
-            "rms_rel": np.sqrt((mean_error**2).mean()) / abs(real.mean()),
+            "rms_rel": np.sqrt(np.mean([e**2 for e in mean_error.values()])) / abs(real.mean()),
             "rms_rel_each_trial": np.sqrt((error[mine] ** 2).mean()) / abs(real.mean()),
         }
-        for f, chosen in enumerate(fingers):
+        for f, chosen in fingers.items():
             own = np.mean([traces[i].change for i in chosen])
             entry |= {
                 f"dT10_real_mean_f{f}": own,
@@ -307,7 +336,12 @@ def main():
     parser.add_argument("--json")
     parser.add_argument("--figure")
     args = parser.parse_args()
-    traces = read(args.data)
+    try:
+        traces, left_out = read(args.data)
+    except FileNotFoundError as error:
+        parser.error(str(error))
+    for which, why in left_out.items():
+        print(f"left out: {which}: {why}", file=sys.stderr)
     corners = {f"{corner:g} Hz": tac_corner(traces, corner) for corner in CORNERS}
     corner = CORNERS[0]
     train = [t for t in traces if t.train]
@@ -316,11 +350,11 @@ def main():
     else:
         values, interval, gain = _FITTED, {}, np.array(_TAC)
     change, tac = predict(values, gain, traces, corner)
-    result = report(traces, change, tac)
+    result = report(traces, change, tac) | {"left_out": left_out}
     sensor = HeatParameters(
         **{k: v for k, v in values.items() if k in HeatParameters.__dataclass_fields__ and k != "area"}
     )
-    start = [np.mean([t.start for t in traces if t.finger == f]) for f in (0, 1)]
+    start = [np.mean([t.start for t in traces if t.finger == f]) for f in sorted({t.finger for t in traces})]
     result["fitted"] = {
         "values": values,
         "interval_95": interval,

@@ -20,6 +20,7 @@ import gzip
 import json
 import pathlib
 import re
+import sys
 import time
 
 import mujoco
@@ -50,6 +51,7 @@ _BLOCK = 88  # samples of PAC in 40 ms, which a log holds without gaps
 _RESTING = 6.0  # [counts] RMS of a block of a sensor that nothing touches, and [counts] off the common level
 _PITCH = 1e-3  # [m] of the ridged plate
 _BAND = 3.0  # [dB]
+_FEWEST = 40  # rows of a recorded slide: two windows of `energy`
 _SEEDS = 4  # draws of a roughness whose energies are averaged
 _PLATE = np.array([-9e-3, -13.3e-3, 0.0])
 
@@ -154,16 +156,31 @@ class Slide:
     [N]."""
 
     def __init__(self, folder: pathlib.Path, name: str):
-        bio, velocity, wrench = (_table(folder, f"{name}_{part}") for part in ("bio", "cv", "cw"))
+        bio, velocity, wrench = (
+            _table(folder, f"{name}_{part}", columns)
+            for part, columns in (("bio", 4 + NPAC), ("cv", 4), ("cw", 4))
+        )
         self.pac = unfold(bio[:, 4 : 4 + NPAC].ravel())
         self.speed = _smooth(bio[:, 0], velocity)
         self.force = _smooth(bio[:, 0], wrench)
 
 
-def _table(folder, name):
-    path = next(folder.glob(f"{name}.csv*"))
+def _table(folder, name, columns):
+    """Raises ValueError where a recording has no such table, or one with gaps: PAC would jump there."""
+    path = next(folder.glob(f"{name}.csv*"), None)
+    if path is None:
+        raise ValueError(f"there is no {name}.csv")
     with _open(path) as file:
-        return np.genfromtxt(file, delimiter=",", skip_header=1)
+        lines = file.read().splitlines()[1:]
+    if lines and lines[-1].count(",") < lines[0].count(","):
+        lines.pop()  # cut where recording ended
+    try:
+        table = np.array([[float(x) for x in line.split(",")[:columns]] for line in lines])
+    except ValueError as error:
+        raise ValueError(f"{path.name} has a row that is cut or no number ({error})") from error
+    if len(table) < _FEWEST or table.shape[1] < columns or not np.isfinite(table).all():
+        raise ValueError(f"{path.name}: give {_FEWEST} rows or more of {columns} finite columns")
+    return table
 
 
 def _smooth(at, rows):
@@ -233,11 +250,19 @@ def slides(folder: pathlib.Path, skin: str) -> dict:
     if (folder / "MATERIALS.txt").exists():
         names = dict(l.split(" ", 1) for l in (folder / "MATERIALS.txt").read_text().splitlines() if l)
     found = sorted({re.sub(r"_1_bio.*", "", p.name) for p in folder.glob("*_1_bio.csv*")})
-    press, quiet = FlatPress(skin), floor_energy()
-    out = {"energy_error_db": {}, "roughness": {}, "energy_db": {}, "trials_differ_db": {}}
+    read, left_out = {}, {}
     for name in found:
-        label = names.get(name, name)
-        trials = [Slide(folder, f"{name}_{t}") for t in (1, 2)]
+        try:
+            read[names.get(name, name)] = [Slide(folder, f"{name}_{t}") for t in (1, 2)]
+        except ValueError as error:
+            left_out[name] = str(error)
+            print(f"left out: {name}: {error}", file=sys.stderr)
+    out = {"energy_error_db": {}, "roughness": {}, "energy_db": {}, "trials_differ_db": {}}
+    out["left_out"] = left_out
+    if not read:
+        return out
+    press, quiet = FlatPress(skin), floor_energy()
+    for label, trials in read.items():
         recorded = [energy(t.pac) for t in trials]
         unit = [np.mean([energy(press.slide(t, 1e-6, k)) for k in range(_SEEDS)], axis=0) for t in trials]
 
@@ -266,7 +291,7 @@ def slides(folder: pathlib.Path, skin: str) -> dict:
     first, second = np.argsort(loud[:, 0]), np.argsort(loud[:, 1])
     n = len(loud)
     pairs = [(loud[i, 0] < loud[j, 0]) == (loud[i, 1] < loud[j, 1]) for i in range(n) for j in range(i)]
-    out |= {"order_right": bool((first == second).all()), "pairs_in_order": float(np.mean(pairs))}
+    out |= {"order_right": bool((first == second).all()), "pairs_in_order": float(np.mean(pairs or [True]))}
     out["worst_energy_error_db"] = float(np.abs(list(out["energy_error_db"].values())).max())
     return out
 

@@ -1,11 +1,13 @@
 """Sensors that differ: presets, draws from their spread, effects that a running sensor has."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 import warp as wp
 
+from biotac_mj.coupling.config import Config
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import Run
 from biotac_mj.effects.sensing import DeadTaxels
@@ -199,3 +201,20 @@ def test_worlds_of_a_batch_are_single_sensors():
             wanted = one.needs_impedance(states[w], i * DT, DT)
             one.advance(states[w], i * DT, DT, z[w] if wanted else None, p[w])
         np.testing.assert_allclose(batch.state.numpy(), states, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "field", [{"rest": None}, {"mixing": 5}, {"pdc_rest": True}, {"pdc_gain": 1e300}, {"relaxation": [2, 1]},
+              {"relaxation": [-1, 1]}, {"warm_share": [-1] * 19}],
+)  # fmt: skip
+def test_a_number_that_cannot_be_is_named(field):
+    with pytest.raises(ValueError, match=next(iter(field))):
+        read_sensor(field)
+
+
+def test_numbers_of_numpy_are_numbers():
+    sensor = {"pdc_rest": np.float32(900), "rest": np.full(19, 2000)}
+    options = json.loads(Config(options={"readings": {"sensor": sensor}}).strings()["options"])
+    assert read_sensor(options["readings"]["sensor"]).pdc_rest == 900
+    with pytest.raises(ValueError, match="holds <object"):
+        Config(options={"readings": {"sensor": object()}}).strings()

@@ -39,7 +39,7 @@ LAYERS = {
     "samples": "coupling plugin press.indenter data resimulation recordings effects sensor geometry files",
     "biotac_mj": "plugin",
 }
-ABOVE_ALL = {"cli"}
+ABOVE_ALL = {"cli", "__main__"}
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,12 @@ def integer(what: str, value: object, least: int = -(2**31), most: int = 2**31 -
     return int(value)
 
 
+def _plain(value):
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise ValueError(f"a BioTac's setting holds {value!r}: give numbers, texts, lists and dicts")
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of one BioTac.
@@ -133,8 +139,8 @@ class Config:
         object.__setattr__(self, name, value)
 
     def strings(self) -> dict:
-        """Attribute name -> JSON text; `parse` reads it back."""
-        return {f.name: json.dumps(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        """Attribute name -> JSON text, NumPy's numbers and arrays as plain ones; `parse` reads it back."""
+        return {f.name: json.dumps(getattr(self, f.name), default=_plain) for f in dataclasses.fields(self)}
 
     @classmethod
     def parse(cls, read: Callable[[str], str]) -> "Config":

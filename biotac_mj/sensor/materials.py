@@ -64,7 +64,7 @@ _TABLE = """
 steel             | 16.0   7900   490   INC | stainless, stainless steel
 carbon steel      | 52     7850   470   INC | mild steel, tool steel | screwdriver, wrench
 iron              | 55     7200   460   INC | cast iron
-aluminium         | 167    2700   900   INC | aluminum | can, foil
+aluminium         | 167    2700   900   INC | aluminum, alu | can, foil
 copper            | 390    8930   385   INC |
 brass             | 110    8530   380   INC | bronze
 zinc              | 112    7140   390   INC | zamak | die cast
@@ -78,41 +78,44 @@ nickel            | 90     8900   440   INC |
 metal             | 50     7800   480   INC | metallic | keys, coin
 steel wool        | 0.09   150    490   MAK | scourer, wire wool
 acrylic           | 0.19   1190   1450  CRC | pmma, plexiglas, plexiglass, perspex
-polycarbonate     | 0.20   1200   1200  ISO | pc
-abs               | 0.17   1050   1400  MAK |  | lego
-polyethylene      | 0.40   950    1900  ISO | pe, hdpe | cutting board, bottle, tupperware, shampoo, dispenser
+polycarbonate     | 0.20   1200   1200  ISO | pc | goggles
+abs               | 0.17   1050   1400  MAK | toy brick | lego
+polyethylene | 0.4 950 1900 ISO | hdpe, ldpe, pe, water bottle | cutting board, bottle, shampoo, dispenser
 polypropylene     | 0.22   910    1800  ISO | pp | placemat
 pvc               | 0.17   1390   900   ISO | vinyl, tarp, tarpaulin
 polystyrene       | 0.16   1050   1300  ISO | ps
 nylon             | 0.25   1150   1600  ISO | polyamide
 acetal            | 0.30   1410   1400  ISO | pom, delrin
 ptfe              | 0.25   2200   1000  ISO | teflon
-pet               | 0.20   1380   1150  MAK | mylar, polyester film
+pet               | 0.20   1380   1150  MAK | mylar, polyester film, petg
+pla               | 0.13   1240   1800  MAK | polylactide
+polyurethane      | 0.25   1200   1800  ISO | pu
 epoxy             | 0.20   1200   1400  ISO | resin
 plastic           | 0.20   1100   1450  ISO |  | container, case, box, toothpaste tube, laptop, tape
-glass             | 1.0    2500   750   ISO |  | window, jar
-ceramic           | 1.5    2300   840   ISO | porcelain, stoneware | mug, cup, plate, tile
+glass             | 1.0    2500   750   ISO | pyrex | window, jar, mirror, nail polish
+ceramic | 1.5 2300 840 ISO | porcelain, stoneware, coffee mug, coffee cup | mug, cup, plate, tile
 brick             | 0.8    1800   840   ISO | clay brick, terracotta
 concrete          | 1.4    2200   880   INC | cement, mortar
 stone             | 2.5    2600   900   ISO | rock, natural stone, pebble
+asphalt           | 0.70   2100   1000  ISO | tarmac
 granite           | 2.8    2630   775   INC |
 marble            | 2.8    2680   830   INC | limestone
 slate             | 2.2    2400   1000  ISO |
 gypsum            | 0.25   900    1000  ISO | plaster, drywall, chalk
-wood              | 0.16   600    1700  ISO | wooden, lumber | pencil, plank
-oak               | 0.18   700    1700  ISO | hardwood, beech, maple, walnut, ash
+wood              | 0.16   600    1700  ISO | wooden, lumber | pencil, plank, bark, brush
+oak               | 0.18   700    1700  ISO | hardwood, beech, maple, walnut, ash, birch, mahogany
 pine              | 0.13   480    1700  ISO | softwood, spruce, fir, cedar
 balsa             | 0.055  140    1700  INC |
-bamboo            | 0.17   700    1700  MAK |
+bamboo            | 0.17   700    1700  MAK | sushi mat
 plywood           | 0.13   500    1600  ISO |
 fiberboard        | 0.14   700    1700  ISO | mdf, fibreboard, chipboard, particle board, hardboard
 cork              | 0.045  160    1800  ISO | corkboard | coaster
 layered cork      | 0.065  250    1800  ISO | agglomerated cork
-paper             | 0.12   800    1350  INC |  | notebook, book, notepad, envelope, index cards, magazine
+paper | 0.12 800 1350 INC | sandpaper, card stock | notebook, book, notepad, envelope, index cards, magazine
 cardboard         | 0.065  250    1400  MAK | carton, paperboard, corrugated
 tissue            | 0.05   120    1350  MAK | toilet paper, napkin, paper towel | kitchen roll
-leather           | 0.16   900    1500  ISO |  | wallet, shoe, purse
-rubber            | 0.16   1100   1600  INC | hard rubber, tyre, tire | eraser, basketball, ball, shelf liner
+leather           | 0.16   900    1500  ISO | suede | wallet, shoe, purse
+rubber | 0.16 1100 1600 INC | hard rubber, tyre, tire, latex | eraser, basketball, ball, shelf liner, gum
 silicone          | 0.25   1150   1250  MAK | silicone block, silly putty, putty
 neoprene          | 0.055  170    1900  MAK | koozie | wetsuit, mouse pad
 gel               | 0.55   1050   3900  CHO | gel pack, hydrogel
@@ -122,13 +125,13 @@ hard foam         | 0.033  45     1450  ISO | xps, rigid foam, insulation board
 styrofoam         | 0.036  25     1450  ISO | expanded polystyrene, eps, polystyrene foam
 polyethylene foam | 0.045  35     1900  MAK | pool noodle, eva, eva foam, pe foam | yoga mat
 bubble wrap       | 0.04   20     1900  MAK | bubble envelope, cushioned envelope
-sponge            | 0.045  35     1450  MAK | car sponge, bath sponge, loofah, polyurethane sponge
-cellulose sponge  | 0.05   70     1350  MAK | kitchen sponge, dish sponge, scrubber
+sponge            | 0.045  35     1450  MAK | car sponge, bath sponge, loofah, polyurethane sponge, bath puff
+cellulose sponge  | 0.05   70     1350  MAK | kitchen sponge, dish sponge, scrubber, scouring pad
 memory foam       | 0.04   50     1450  MAK |
-cotton            | 0.06   300    1300  MOR | fabric, cloth, textile, dishcloth, denim, canvas | shirt, jeans
-terry cloth       | 0.05   200    1300  MOR | towel, bath cloth, washcloth
+cotton | 0.06 300 1300 MOR | fabric, cloth, textile, dishcloth, denim, canvas, linen | shirt, jeans, mitt
+terry cloth       | 0.05   200    1300  MOR | towel, bath cloth, washcloth | sock
 satin             | 0.07   400    1350  MOR | silk, polyester | pillowcase
-wool              | 0.045  150    1350  MOR | fleece, yarn | sweater, scarf
+wool              | 0.045  150    1350  MOR | fleece, yarn, pom pom | sweater, scarf
 felt              | 0.05   200    1350  MOR | velvet
 fur               | 0.04   80     1350  MOR | plush, stuffed, teddy, furry
 carpet            | 0.06   200    1300  ISO | coir, coco liner | rug, doormat

@@ -47,6 +47,7 @@ __all__ = [
 # [1/C] of ln Z: all electrodes answer the liquid's temperature by -6.4 to -7.8 % per degree in five sensors
 PER_DEGREE = 0.071
 MOST_LATENCY = 0.11  # [s] eleven frames
+_HUGE = 1e9  # of any number of a sensor: beyond it sums of counts are no longer numbers
 _EYE = tuple(map(tuple, np.eye(NELECTRODE).tolist()))
 # Scatter of an electrode's gain: 3 to 15 % (`effects.sensing.Gain`); no recording has the state beside it.
 _GAIN = 0.1
@@ -107,9 +108,9 @@ class Sensor:
         shapes |= {"warm_share": (19,), "drift": np.shape(self.drift) and (19,)}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is None:
+            if value is None and field.default is None:
                 continue
-            if field.name in ("mixing", "warm_share") and not len(value):
+            if field.default == () and np.size(value) == 0 and value is not None:
                 object.__setattr__(self, field.name, ())
                 continue
             try:
@@ -117,9 +118,11 @@ class Sensor:
             except (TypeError, ValueError):
                 number = np.array(np.nan)
             wanted = shapes.get(field.name, ())
-            if number.shape != wanted or not np.isfinite(number).all():
+            huge = not (np.abs(number) < _HUGE).all()  # also NaN
+            if number.shape != wanted or huge or isinstance(value, (bool, np.bool_)):
                 raise ValueError(
-                    f"{field.name} of a sensor is {value!r}: give {wanted or 'a number'}, finite"
+                    f"{field.name} of a sensor is {value!r}: give {wanted or 'a number'}, finite and no more "
+                    f"than {_HUGE:g}"
                 )
             plain = number.tolist()
             plain = tuple(map(tuple, plain)) if number.ndim == 2 else tuple(plain) if wanted else plain
@@ -141,6 +144,10 @@ class Sensor:
         ]
         if not 0 <= self.pac_colour < 1:
             raise ValueError(f"pac_colour of a sensor is {self.pac_colour}: give 0 or more, less than 1")
+        if not 0 <= self.relaxation[0] <= 1 or min(self.warm_share, default=0) < 0:
+            raise ValueError(
+                "relaxation of a sensor is a share up to 1 and a time, no warm_share is negative"
+            )
         if min(least) < 0 or min(self.warm_time, self.relaxation[1]) <= 0:
             raise ValueError("noise and loss of a sensor are not negative, and its times are positive [s]")
         share, knee = self.saturation
