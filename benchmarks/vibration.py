@@ -302,7 +302,7 @@ def slides(folder: pathlib.Path, skin: str) -> dict:
 def _pac_of_step(handle, data, before, after):
     """Counts of the PAC slots after `before` up to `after`."""
     frame = handle.read(data, "pac")
-    return [frame[k % SLOTS_PER_FRAME // 2] for k in range(before + 1, after + 1) if k % 2 == 0]
+    return [frame[k % SLOTS_PER_FRAME // 2] for k in range(before, after) if k % 2 == 0]
 
 
 def _slots(seconds):

@@ -50,7 +50,7 @@ def test_every_electrode_is_sampled_at_its_slot(dt):
     acquisition, state = started(noise=False)
     rate = np.linspace(1e4, 4e4, 19)
     run(acquisition, state, dt, 0.14, lambda t: (REST + rate * t, 0.0, channels.REST_TEMPERATURE))
-    slot = 2 * np.arange(19) + 1
+    slot = 2 * np.arange(19) + 2
     last = slot + SLOTS_PER_FRAME * np.floor(
         (round(0.14 / dt) * dt * SLOT_RATE + 1e-6 - slot) / SLOTS_PER_FRAME
     )
@@ -61,7 +61,7 @@ def test_every_electrode_is_sampled_at_its_slot(dt):
 def test_pdc_step_response():
     """A ramp of 1 ns, then level: a step; PDC's slot sees 1 - exp(-2 pi 1040 t)."""
     acquisition, state = started(noise=False)
-    slot_time = 39 / SLOT_RATE
+    slot_time = 40 / SLOT_RATE
     for delay in (1e-4, 2e-4, 4e-4):
         acquisition.reset(state, REST)
         start = slot_time - delay
@@ -151,12 +151,11 @@ def test_noise_is_that_of_numpys_philox(seed):
     """One counter for each slot of 4.4 kHz, two of its four words through Box and Muller's formula."""
     acquisition, state = started(seed=seed)
     electrode = channels.counts_from_impedance(REST)
-    hiss = None
+    hiss = 0.0
     for frame in range(-3, 40):
         acquisition.advance(state, frame * 0.01, 0.01, REST)
-        raw = np.random.Philox(key=seed, counter=frame * SLOTS_PER_FRAME % 2**64).random_raw(4 * 44)
+        raw = np.random.Philox(key=seed, counter=(frame * SLOTS_PER_FRAME + 1) % 2**64).random_raw(4 * 44)
         u, v = ((raw.reshape(-1, 4)[:, :2] >> np.uint64(11)) + 0.5).T * 2.0**-53
-        # the last slot of the step is the next frame's first, PAC's
         normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
         expected = np.rint(electrode + channels.electrode_noise(electrode) * normal[1:38:2])
         readings = acquisition.readings(state)
@@ -164,10 +163,9 @@ def test_noise_is_that_of_numpys_philox(seed):
         assert readings["pdc"] == np.rint(2000 + Sensor().pdc_noise * normal[39])
         coloured = []
         for white in channels.PAC_NOISE * normal[::2]:
-            # the first slot of all came before the first step
-            hiss = 0.0 if hiss is None else channels.PAC_COLOUR * hiss + white
+            hiss = channels.PAC_COLOUR * hiss + white
             coloured.append(hiss)
-        assert np.array_equal(readings["pac"][1:], np.rint(4095 / 2 + np.array(coloured[1:])))
+        assert np.array_equal(readings["pac"], np.rint(4095 / 2 + np.array(coloured)))
 
 
 def test_pac_at_rest_has_the_measured_spectrum():
@@ -176,7 +174,7 @@ def test_pac_at_rest_has_the_measured_spectrum():
     pac = []
     for frame in range(3000):
         acquisition.advance(state, frame * 0.01, 0.01, REST)
-        pac.append(np.roll(acquisition.readings(state)["pac"], -1))  # the first is the next frame's already
+        pac.append(acquisition.readings(state)["pac"])
     pac = np.ravel(pac) - 4095 / 2
     a = channels.PAC_COLOUR
     assert pac.std() == pytest.approx(np.sqrt(channels.PAC_NOISE**2 / (1 - a * a) + 1 / 12), rel=0.02)
@@ -205,7 +203,7 @@ def test_one_film_solution_per_frame():
         assert sum(asked) == 14
     acquisition, state = started(film_every_step=True)
     assert all(acquisition.needs_impedance(state, i * 2e-3, 2e-3) for i in range(4))
-    assert not acquisition.needs_impedance(state, 39 / SLOT_RATE, 1e-3)  # pdc, tac, tdc and pac only
+    assert not acquisition.needs_impedance(state, 40 / SLOT_RATE, 1e-3)  # pdc, tac, tdc and pac only
     assert sum(acquisition.needs_impedance(state, i * 1e-4, 1e-4) for i in range(100)) == 19
 
 

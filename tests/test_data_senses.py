@@ -93,7 +93,7 @@ def test_order_of_the_samples():
     for dt in (0.013, 0.01, 0.0213):
         acquisition.advance(state, time, dt, rest, 1e6 * (time + dt))
         time += dt
-        last = np.floor(time * SLOT_RATE / 2 + 1e-6)
+        last = (np.floor(time * SLOT_RATE + 1e-6) - 1) // 2
         pac = in_order(np.arange(22), time)
         assert pac[-1] == last % 22 and (np.diff(pac) % 22 == 1).all()
 

@@ -63,7 +63,7 @@ def record(model, data, handle, path):
         assert handle.read(data, "status")[0] == 1
         slot = int(np.floor((i + 1) * model.opt.timestep * SLOT_RATE + 1e-6))
         frame = handle.read(data, "pac")
-        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last + 1, slot + 1) if k % 2 == 0]
+        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last, slot) if k % 2 == 0]
         last = slot
     return np.array(pac)
 
@@ -124,7 +124,7 @@ def test_rubbing_over_ridges(pad, speed, rate):
     between = ~on & (number > periods)  # below lies what is left of the way in
     amplitude = lines[1 : top + 1]
     assert amplitude[periods - 1] > 5
-    assert amplitude[on].max() > 20
+    assert amplitude[on].max() > 18
     assert np.median(amplitude[on]) > 5 * np.median(amplitude[between])
     assert (amplitude[on] ** 2).sum() > 30 * (amplitude[between] ** 2).sum()
 
@@ -143,7 +143,7 @@ def test_vibration_through_steps(frequency, dt):
         acquisition.advance(state, i * dt, dt, None, amplitude * np.sin(2 * np.pi * frequency * (i + 1) * dt))
         slot = int(np.floor((i + 1) * dt * SLOT_RATE + 1e-6))
         frame = acquisition.readings(state)["pac"]
-        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last + 1, slot + 1) if k % 2 == 0]
+        pac += [frame[k % SLOTS_PER_FRAME // 2] for k in range(last, slot) if k % 2 == 0]
         last = slot
     pac = np.array(pac)[-int(0.1 * RATE) :] - channels.counts_from_pac(0.0)
     phase = np.exp(-2j * np.pi * frequency * np.arange(len(pac)) / RATE)
@@ -151,3 +151,25 @@ def test_vibration_through_steps(frequency, dt):
     s, low, high = 2j * np.pi * frequency, 2 * np.pi * 1040, 2 * np.pi * 10
     band = abs(s * low / ((s + low) * (s + high)))
     assert measured == pytest.approx(amplitude * band * np.sinc(frequency * dt) ** 2, rel=0.02)
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_a_smooth_plate_that_slides_is_not_heard(tier):
+    """Single samples begin and cease to touch at the rim; the shorter the step, the louder that would be."""
+    dt = 1e-3
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = dt, np.zeros(3)
+    plate = spec.worldbody.add_body(name="plate", mocap=True, pos=[-9e-3, -13.3e-3, 0])
+    plate.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.06, 0.005, 0.03], friction=[0.3, 0, 0])
+    handle = biotac_mj.attach(
+        spec, body="world", skin="coarse", tier=tier, coupling="one-way", friction=0.3, textures={},
+        sensor={"pac_noise": 0},
+    )  # fmt: skip
+    model = spec.compile()
+    data, heard = mujoco.MjData(model), []
+    for k in range(200):
+        data.mocap_pos[0] = [-9e-3 + 5e-5 * max(0, k - 60), -13.3e-3 + 1.2e-3 * min(1, (k + 1) / 50), 0]
+        mujoco.mj_step(model, data)
+        if k > 150 and k % 10 == 9:
+            heard.append(handle.read(data, "pac"))
+    assert np.diff(np.ravel(heard)).std() < 3  # what is left of the way in is slow

@@ -72,7 +72,7 @@ def test_readings_follow_a_press(geometry, film):
     assert np.array_equal(rows["electrodes"][0], channels.REST_COUNTS["1"])
     assert np.all(np.diff(rows["electrodes"][1:, E17]) < 0)
     # PDC's last slot, less the low-pass filter's delay on a ramp
-    last = 0.09 + 39 / SLOT_RATE - 1 / (2 * np.pi * 1040)
+    last = 0.09 + 40 / SLOT_RATE - 1 / (2 * np.pi * 1040)
     assert channels.pressure_from_counts(rows["pdc"][-1]) == pytest.approx(5e3 * last / 0.1, abs=20)
     assert np.all(rows["tdc"] == rows["tdc"][0])
 

@@ -91,6 +91,7 @@ class CondensedStepper(FemStepper):
             residual=out.error,
             measured=out.measured,
             reached=out.reached,
+            load=out.load,
         )
 
     def resting(self, state: np.ndarray) -> bool:

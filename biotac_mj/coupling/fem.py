@@ -196,6 +196,7 @@ class FemStepper:
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
+            load=d.contact_load(),
         )
 
     # --- a skin at rest  ---

@@ -65,6 +65,7 @@ class SkinResult:
       reached: share of the touching bodies' motion in this step at which all this holds: 1 where it
         converged.
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
+      load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
@@ -79,6 +80,7 @@ class SkinResult:
     measured: bool = True
     reached: float = 1.0
     pose: tuple | None = None
+    load: np.ndarray | None = None
 
 
 class SkinStepper(Protocol):

@@ -48,7 +48,8 @@ class Shaking:
 
         A body's force acts on the samples that it touches, along itself; a height is a motion along it too,
         and what it makes the tangent of the step. The speed of slip is that at which what holds the samples
-        in friction moves over the body, on average.
+        in friction moves over the body, on average. Samples count by their forces: one that begins or ceases
+        to touch has none, and is not heard as a knock.
 
         Args:
           before: the skin's state. result: of the step. dt: its length [s].
@@ -66,18 +67,17 @@ class Shaking:
         way, known = self._moved(self._stepper.contact_rows(before), rows, sample)
         for g in np.bincount(group).nonzero()[0]:
             force, mine = -result.wrench[g, :3], (group == g).nonzero()[0]
-            size = math.sqrt(force @ force)
-            if size == 0:
+            size, load = math.sqrt(force @ force), result.load[mine]
+            if size == 0 or not load.any():
                 continue
-            along, count = force / size, np.bincount(face[mine])
-            at = count.nonzero()[0]
-            count = count[at].astype(np.float32)
-            heard = (count @ self._faces.take(at, 0) / len(mine)).reshape(-1, 3) @ along
-            area[g] = count @ share[at]
+            along, weight = force / size, np.bincount(face[mine], load / load.sum())
+            at = weight.nonzero()[0]
+            heard = (weight[at].astype(np.float32) @ self._faces.take(at, 0)).reshape(-1, 3) @ along
+            area[g] = share[face[mine]].sum()
             drive += size * heard[:-1]
             gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
-            also = known[mine]
-            mean = also @ way[mine] / max(also.sum(), 1.0)
+            also = known[mine] * load
+            mean = also @ way[mine] / (also.sum() or 1.0)
             slip[g] = math.sqrt(mean @ mean) / dt
         return drive, gain, slip, area
 

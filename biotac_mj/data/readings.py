@@ -87,7 +87,7 @@ class Touch:
 
 def in_order(pac: np.ndarray, time: float) -> np.ndarray:
     """(22,) samples of the frame's slots as they were taken, the last one at or before time [s]."""
-    slot = int(np.floor(time * SLOT_RATE + 1e-6)) % SLOTS_PER_FRAME
+    slot = (int(np.floor(time * SLOT_RATE + 1e-6)) - 1) % SLOTS_PER_FRAME
     return np.roll(pac, -1 - slot // 2)
 
 

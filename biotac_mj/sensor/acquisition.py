@@ -5,9 +5,10 @@ One frame is 10 ms = 44 slots at 4.4 kHz, 0.227 ms apart. Even slots are PAC (22
 odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Source of rates: SynTouch manual; which
 channel has which slot is not published: CHOSEN as above.
 
-Slot k lies at time k / 4400 s, so what is sampled when depends on the time alone, never on the time step. All
-memory lies in state vectors of NSTATE numbers; noise is made of numpy's Philox 4x64 with one counter block
-per slot, a function of (seed, slot), so a replay from a saved state is bit-equal.
+Slot k = 1, 2, ... lies at time k / 4400 s: what is sampled when depends on the time alone, never on the
+time step, and what is read at a multiple of 10 ms is one whole frame, in the order in which it was taken.
+All memory lies in state vectors of NSTATE numbers; noise is made of numpy's Philox 4x64 with one counter
+block per slot, a function of (seed, slot), so a replay from a saved state is bit-equal.
 
 `Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
 their device; both launch the kernels below."""
@@ -109,7 +110,7 @@ def slots_until(time: real):
 @wp.func
 def _position(slot: wp.int64):
     """Of a slot in its frame; time may be negative."""
-    position = wp.int32(slot % _FRAME)
+    position = wp.int32((slot - wp.int64(1)) % _FRAME)
     return wp.where(position < 0, position + SLOTS_PER_FRAME, position)
 
 
@@ -237,7 +238,7 @@ def _late(state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts:
         state[w, past] = value
     behind = state[w, _LATENCY] / real(_PERIOD)
     if behind > real(0.0):
-        frame = wp.int32(slot / _FRAME) % _FRAMES + _FRAMES
+        frame = wp.int32((slot - wp.int64(1)) / _FRAME) % _FRAMES + _FRAMES
         state[w, past + (1 + frame % _FRAMES) * NELECTRODE] = value
         whole = wp.int32(behind)
         part = behind - real(whole)

@@ -423,6 +423,11 @@ class SkinData:
         sample = np.flatnonzero(geom >= 0)
         return np.column_stack([sample, geom[sample], self.outer.anchor.numpy()[sample, 0]])
 
+    def contact_load(self) -> np.ndarray:
+        """(n,) size of the force on each of `contacts` [N]."""
+        force = self.outer.sample_force.numpy()[self.outer.anchor_geom.numpy()[:, 0] >= 0, 0]
+        return np.linalg.norm(force, axis=1)
+
 
 def _refuse_other_kinds(materials, own, options):
     """Worlds share the code that is compiled: what they have beyond the law differs in numbers alone."""

@@ -20,8 +20,8 @@ vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 _CHUNK = 96  # faces that one thread sums
-# of a chunk's sums: samples, area, samples that touched before, their anchors' way
-_COUNT, _AREA, _KNOWN, _WAY = range(4)
+# of a chunk's sums: force on samples, area, force on samples that touched before, their anchors' way times it
+_LOAD, _AREA, _KNOWN, _WAY = range(4)
 
 
 def faces_of(modes: SkinModes, face: np.ndarray, nvert: int) -> np.ndarray:
@@ -45,12 +45,14 @@ def sum_chunks(
     anchor: wp.array2d(dtype=vec3),
     geom_last: wp.array2d(dtype=int),
     anchor_last: wp.array2d(dtype=vec3),
+    force: wp.array2d(dtype=vec3),
     # Out:
     sum_out: wp.array3d(dtype=vec6),
     heard_out: wp.array4d(dtype=vec3),
 ):
     """Of a chunk of faces: `sum_out` [group, chunk, world] by the threads of row 0, and what each row of
-    modes hears of unit forces on the samples [row, group, chunk, world]."""
+    modes hears of the samples, as if the sizes of their forces had one direction [row, group, chunk, world].
+    One that begins or ceases to touch has no force, and is not heard as a knock."""
     m, c, w = wp.tid()
     for g in range(sum_out.shape[0]):
         heard_out[m, g, c, w] = vec3()
@@ -63,15 +65,16 @@ def sum_chunks(
                 k = geom[i, w]
                 if k >= 0:
                     g = group[k]
+                    load = wp.length(force[i, w])
                     if heard.shape[0] > 0:
-                        heard_out[m, g, c, w] = heard_out[m, g, c, w] + heard[m, f]
+                        heard_out[m, g, c, w] = heard_out[m, g, c, w] + load * heard[m, f]
                     if m == 0:
                         one = vec6()
-                        one[_COUNT] = real(1.0)
+                        one[_LOAD] = load
                         one[_AREA] = area[f] / real(nsample)
                         if geom_last[i, w] == k:
-                            one[_KNOWN] = real(1.0)
-                            way = anchor[i, w] - anchor_last[i, w]
+                            one[_KNOWN] = load
+                            way = load * (anchor[i, w] - anchor_last[i, w])
                             for a in range(3):
                                 one[_WAY + a] = way[a]
                         sum_out[g, c, w] = sum_out[g, c, w] + one
@@ -104,7 +107,9 @@ def feel_bodies(
         force = -vec3(wrench[g, w][0], wrench[g, w][1], wrench[g, w][2])
         size = wp.length(force)
         if m == 0:
-            way = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2]) / wp.max(total[_KNOWN], real(1.0))
+            way = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2])
+            if total[_KNOWN] > real(0.0):
+                way = way / total[_KNOWN]
             area_out[w, g] = total[_AREA]
             force_out[w, g] = size
             slip_out[w, g] = real(0.0)
@@ -112,13 +117,13 @@ def feel_bodies(
                 slip_out[w, g] = wp.length(way) / dt[w]
         if gain_out.shape[2] > 0:
             gain = real(0.0)
-            if total[_COUNT] > real(0.0) and size > real(0.0):
+            if total[_LOAD] > real(0.0) and size > real(0.0):
                 along = force / size
                 stiff = real(0.0)
                 for a in range(3):
                     for b in range(3):
                         stiff += along[a] * tangent[g, w][a, b] * along[b]
-                one = wp.dot(mean, along) / total[_COUNT]
+                one = wp.dot(mean, along) / total[_LOAD]
                 drive += size * one
                 gain = stiff * one
             gain_out[w, g, m] = gain
@@ -176,7 +181,7 @@ class Touched:
         d, nworld = self._data, self._data.nworld
         outer, shape = d.outer, (self._rows, self._sums.shape[1], nworld)
         inputs = [len(d.model.sample), d.model.outer.area, self._group, self._heard, outer.kept]
-        inputs += [outer.anchor_geom, outer.anchor, self._geom, self._anchor]
+        inputs += [outer.anchor_geom, outer.anchor, self._geom, self._anchor, outer.sample_force]
         wp.launch(sum_chunks, shape, inputs, [self._sums, self._heard_sums], device=self.device)
         inputs = [d.dt, wrench, tangent, self._sums, self._heard_sums]
         outputs = [self.area, self.force, self.slip, self.drive, self.gain]

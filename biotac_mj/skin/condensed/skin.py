@@ -341,7 +341,7 @@ class CondensedSkin:
         )
         n = self.geoms.ngroup
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
-        return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0)
+        return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0, np.zeros(0))
 
     def displacement(self, memory: Memory) -> np.ndarray:
         """(nvert, 3) of a memory [m]."""

@@ -13,7 +13,7 @@ __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 
 MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
-_TOLERANCE = 1e-3  # of the residual in the energy norm, as in the full FEM
+_TOLERANCE = 1e-4  # of the residual in the energy norm: the error of single steps is heard as chatter
 _MAX_NEWTON, _PASSES = 30, 4
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
 _NEAR, _SLOW = 0.03, 8  # error below which contact's exact stiffness is taken, where a step is slow from here
@@ -80,8 +80,9 @@ class Memory:
 @dataclasses.dataclass
 class Outcome:
     """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6,
-    6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured; and the
-    share of the geoms' motion at which this holds, 1 where the step converged."""
+    6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured; the size
+    of the force (k,) on each of the memory's contacts; and the share of the geoms' motion at which this
+    holds, 1 where the step converged."""
 
     memory: Memory
     wrench: np.ndarray
@@ -92,6 +93,7 @@ class Outcome:
     converged: bool
     iterations: int
     error: float
+    load: np.ndarray
     reached: float = 1.0
 
     def sound(self) -> bool:
@@ -371,11 +373,12 @@ class Step:
 
     def outcome(self) -> Outcome:
         s = self.skin
-        wrench, contacts = np.zeros((s.geoms.ngroup, 6)), np.zeros((0, 5))
+        wrench, contacts, size = np.zeros((s.geoms.ngroup, 6)), np.zeros((0, 5)), np.zeros(0)
         tangent = np.zeros((s.geoms.ngroup, 6, 6))
         if len(self.outer):
             contacts = s.faces.contacts()
         if len(contacts):
+            size = np.linalg.norm(s.faces.sample_forces(), axis=1)
             load, share = s.faces.loads()
             # what Newton's last step changed, to first order; the samples' forces are those of the stiff law
             # after it
@@ -413,6 +416,7 @@ class Step:
             self.converged,
             self.iterations,
             self.error,
+            size,
         )
 
     def _change(self):
