@@ -75,14 +75,16 @@ class SparseFactor:
         depend on the order of requests."""
         local = self._index[nodes]
         out = np.empty((len(nodes), 3, self.size), np.float32)
-        for cluster in np.unique(self._cluster[local]):
+        mine = self._cluster[local]
+        order = np.argsort(mine, kind="stable")
+        for here in np.split(order, np.flatnonzero(np.diff(mine[order])) + 1) if len(order) else ():
+            cluster = int(mine[here[0]])
             if cluster not in self._rows:
                 members = self._free[self._cluster_nodes[cluster]]
                 unit = np.zeros((len(self._index), len(members), 3, 3))
                 unit[members, np.arange(len(members))] = np.eye(3)
                 rows = self._solver.solve(unit.reshape(len(unit), -1, 3))[self._free]
                 self._rows[cluster] = np.moveaxis(rows, 1, 0).astype(np.float32).reshape(-1, 3, self.size)
-            here = self._cluster[local] == cluster
             out[here] = self._rows[cluster][self._member[local[here]]]
         return out.reshape(-1, self.size)
 
