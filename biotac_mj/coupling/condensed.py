@@ -47,7 +47,7 @@ class CondensedStepper(FemStepper):
     @functools.cached_property
     def _skin(self):
         two_way = self._config.coupling == "two-way"
-        return CondensedSkin(self._model, self._geom_set, patience=_PATIENCE if two_way else 1.0)
+        return CondensedSkin(self._model, self._geom_set, patience=_PATIENCE if two_way else 2.5)
 
     @property
     def _search(self):

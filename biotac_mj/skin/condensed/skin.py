@@ -118,7 +118,7 @@ class CondensedSkin:
       ValueError: what the tier cannot do, see `refusals`.
     """
 
-    def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 1.0):
+    def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 2.5):
         refuse(model.rubber_options, model.options, model.has_liquid, model.device.is_cuda)
         self.model, self.geoms, self.patience = model, geoms, patience
         self.correction = correction(model.material.law)
