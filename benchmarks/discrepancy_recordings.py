@@ -17,6 +17,7 @@ import time
 import numpy as np
 import recordings_foreign as first
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
+import recordings_foreign_third as third
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
@@ -395,7 +396,7 @@ def authors_left_out(rows: list, named: float) -> list:
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind", "mixed", "second"), default="practice")
+    args.add_argument("--half", choices=("practice", "blind", "mixed", "second", "third"), default="practice")
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
@@ -415,10 +416,13 @@ def main(argv=None):
         rows = [r for name in args.left_out for r in json.loads(pathlib.Path(name).read_text())["cases"]]
         print(table(authors_left_out(rows, NAMED)))
         return
+    from biotac_mj.discrepancy.recordings.recording import MIN_ROWS
+
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
     done = {tuple(r["key"]) for r in rows}
-    generator, half = (foreign, ()) if args.half == "second" else (first, (args.half,))
+    generator = {"second": foreign, "third": third}.get(args.half, first)
+    half = (args.half,) if generator is first else ()
     sources = generator.bases(args.data, *half)
     cases = generator.plan(*half, *map(int, args.counts.split(",")))
     # in mixed order, so that a run that was stopped holds some of each
@@ -427,7 +431,9 @@ def main(argv=None):
         if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
             continue
         case, clean = generator.make(*half, sources, base, effects, seed)
-        rows.append({"key": key, **judge(case, clean)})
+        if len(case.counts) < MIN_ROWS:  # refused
+            continue
+        rows.append({"key": key, "by": generator.__name__, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))
