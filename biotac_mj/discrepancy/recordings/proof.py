@@ -13,6 +13,7 @@ from .session import Session
 
 __all__ = ["prove", "views"]
 
+_ENOUGH = 1500  # rows, in which what was found in the others would be found again
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
 
@@ -141,6 +142,9 @@ def _again(session, without, finding):
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
     ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
+    # where nothing is found in a few rows, they say nothing
+    if not found and (~session.fit).sum() * session.fresh < _ENOUGH:
+        return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]
     floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
     late = found[0].parameters[name][0] if found else _NEUTRAL[finding.id]

@@ -123,8 +123,9 @@ def _held(session):
     on = held[start]
     if on.any():
         runs = length[on]
-        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs
-        usual = np.bincount(runs).argmax() + 1
+        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
+        each = [runs[(start[on] * BLOCKS // n) == b] for b in range(BLOCKS)]
+        usual = int(np.quantile([np.bincount(r).argmax() if len(r) else 0 for r in each], 0.25)) + 1
         long = on & (length > usual)
         mask = np.zeros(n, bool)
         for s, k in zip(start[long], length[long]):
