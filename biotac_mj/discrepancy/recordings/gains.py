@@ -85,7 +85,7 @@ def _windows(m):
 def _fitted(m, session, i, k):
     """Regression of electrode k, and its windows (w,) bool after its jumps that explain most, or None."""
     _, moment, floor, middle = _windows(m)
-    fit = _Regression(moment, i, floor, _changed(edges(session)[k], middle), True)
+    fit = _Regression(moment, i, floor, _changed(edges(session).get(k, ()), middle), True)
     return fit, fit.late
 
 
