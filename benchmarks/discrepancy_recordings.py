@@ -259,9 +259,9 @@ CLUES = {
     "step": {"times": 1, "score": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
-    "pairs": {"rest": 1, "factor": -1},
-    "common": {"factor": 1, "rest": -1, "louder": 1},
-    "size": {"factor": 1, "counts": 1},
+    "pairs": {"rest": 1, "louder": -1},
+    "common": {"factor": 1, "rest": -1},
+    "size": {"factor": 1, "counts": 1, "stands": 1, "blocks": 1},
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "size": 1, "blocks": 1, "explained": 1},
 }
@@ -285,7 +285,7 @@ DOUBT, FAR = 1.0, 1.5  # names on either side, and how far: standard deviations 
 RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
 SPREAD = 0.5  # of a family's rate about the others', in log odds, before it is seen
 LEAST = 0.25  # spread of a clue of what is left
-TOP = 0.25  # share of the names, the surest, whose rate no confidence may exceed
+TOP = 0.5  # share of the names, the surest, whose rate no confidence may exceed
 
 
 def _standard(cases, signs):

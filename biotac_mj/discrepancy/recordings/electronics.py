@@ -29,6 +29,10 @@ _FACTOR = 3.0
 _PAIRS = 0.25
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
+# of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
+_QUIET = 0.4
+# logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
+_STEPS = -0.5
 
 
 def _differences(session, order=3):
@@ -101,7 +105,8 @@ def coloured(session: Session) -> Finding | None:
     even = np.median(np.median(step, axis=1) + 0.25, axis=0) / np.median(
         np.sqrt((step**2).mean(1)) + 0.25, axis=0
     )
-    if p > 0.01 or pole < 0.05:
+    quiet, even = float(np.median(quiet[alive])), float(np.log(np.median(even[alive])))
+    if p > 0.01 or pole < 0.05 or quiet < _QUIET or even < _STEPS:
         return None
     rate = session.recording.rate * session.fresh
     tau, low, high = (
@@ -121,8 +126,8 @@ def coloured(session: Session) -> Finding | None:
             "pole": pole,
             "ratio": value,
             "least": float(ratio.min()),
-            "quiet": float(np.median(quiet[alive])),
-            "even": float(np.log(np.median(even[alive]))),
+            "quiet": quiet,
+            "even": even,
         },
     )
 
@@ -435,7 +440,7 @@ def _without_common(x, sd):
 def noisy(session: Session) -> list[Finding]:
     """Electrodes whose noise is larger than the law says that the others follow."""
     d, _ = _differences(session)
-    units = int(np.clip(len(d) // 24, 0, 4 * BLOCKS))
+    units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
     if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
         return []
     k = len(d) // units

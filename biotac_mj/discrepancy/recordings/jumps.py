@@ -12,6 +12,7 @@ __all__ = ["Edge", "edges", "jumped"]
 
 _LINE = 6  # rows of a line
 _STAYS = 30  # rows after which it is still there
+_HELD = 3  # rows from one that is read to the next, at most
 _CLEAR = 6.0  # of the noise, at least
 # times what happens on the electrode's own rows around: at most 5.6 in real recordings, of what stays
 _TIMES = 6.0
@@ -52,8 +53,11 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     found: dict[int, list[Edge]] = {}
     for i, k in zip(*np.nonzero(peak)):
         at = i + h
-        if masked[max(at - h, 0) : at + h, k].any():  # it came back from where it measured nothing
+        # it came back from where it measured nothing, or the load has moved on while rows were held
+        if masked[max(at - h, 0) : at + h, k].any() or rows[at] - rows[at - 1] > _HELD:
             continue
+        if not np.ptp(x[at - h : at, k]) or not np.ptp(x[at : at + h, k]):
+            continue  # it stands still there: stuck
         level = [np.median(x[max(at - _STAYS, 0) : at - 1, k]), np.median(x[at + 1 : at + _STAYS, k])]
         if 0.5 < (level[1] - level[0]) / step[i, k] < 1.6:
             edge = Edge(rows[at] / r.rate, float(step[i, k]), float(times[i, k]), float(alone[i, k]))
@@ -88,7 +92,7 @@ def jumped(session: Session) -> list[Finding]:
                 float(sum(np.log(e.times) ** 2 for e in mine)),
                 float(np.prod([len(session.counts) ** -0.5 / e.times for e in mine])),
                 float(at[0]),
-                float(session.recording.time[-1]),
+                float(at[-1] if abs(last) < 0.3 * largest else session.recording.time[-1]),
                 note=f"from one row to the next it jumps, alone of all: {places}",
                 clues={
                     "edge": float(np.log(max(e.times for e in mine))),
