@@ -25,6 +25,7 @@ _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
 # channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
 _FACTOR = 3.0
+_WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
 # sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
 _PAIRS = 0.25
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
@@ -321,6 +322,10 @@ def correlated(session: Session) -> Finding | None:
         "louder": louder,
         "loaded": float(session.loaded),
     }
+    if (
+        _peak(np.nan_to_num(cells[:, :, alive]) / sd[alive]) > _WAVE
+    ):  # a wave, each electrode at its own phase
+        return None
     p = sign_flip(others)
     if p < 0.01 and others.mean() > max(_PAIRS, 0.25 * common.mean()):
         K, parameters = _coupling(mean, alive, sd, 4 * error)
@@ -360,6 +365,18 @@ def correlated(session: Session) -> Finding | None:
             correct=_without_common(x.reshape(-1, number), sd) if number == 19 else None,
         )
     return None
+
+
+def _peak(cells):
+    """How far the spectrum of what fifth differences (windows, rows, channels) have in common stands out at
+    one frequency above its median: a noise has no such, a wave has."""
+    rows = cells.shape[1]
+    together = cells.reshape(-1, cells.shape[2])
+    share = np.linalg.eigh(together.T @ together)[1][:, -1]
+    power = (np.abs(np.fft.rfft((cells @ share) * np.hanning(rows), axis=1)) ** 2).mean(0)
+    f = np.fft.rfftfreq(rows)
+    power = (power / np.maximum(2 - 2 * np.cos(2 * np.pi * f), 1e-9) ** 5)[f > 0.15]
+    return float(power.max() / np.median(power))
 
 
 def _with_temperature(session, d, rows):
@@ -451,7 +468,6 @@ def noisy(session: Session) -> list[Finding]:
     law = electrode_noise(np.median(session.counts[session.fit], axis=0))
     ratio = np.log(np.maximum(level, 0.3) / law)
     ratio -= np.median(ratio, axis=1, keepdims=True)
-    ratio -= np.minimum(np.median(ratio, axis=0), 0)  # calm ones become as noisy as the law at most
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
     found = []

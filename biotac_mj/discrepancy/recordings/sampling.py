@@ -81,8 +81,8 @@ def quantised(session: Session) -> list[Finding]:
     if not len(coarse) or 1 < len(coarse) < 0.5 * told.sum():  # levels that lie far apart look alike
         return []
     q = float(np.median(step[coarse]))
-    # of codes visited by chance every q-th would be one of these
-    strength = [np.log(q) * sum(len(np.unique(b[:, k])) - 1 for k in coarse) for b in blocks]
+    # of codes that noise takes it to by chance every q-th would be one of these
+    strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
     channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
     return [
         _finding(
