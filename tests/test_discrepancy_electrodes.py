@@ -27,13 +27,13 @@ def test_a_jump_of_one_electrode_is_found_in_a_few_seconds(back):
     counts, _, rng = pressed(3, 14)
     counts = noisy(counts, rng)
     when = slice(400, 1000 if back else None)
-    counts[when, 6] += 150
+    counts[when, 6] += 300
     found = jumped(session(counts))
     assert [f.channels for f in found] == [(6,)]
     assert abs(found[0].start - 4.0) < 0.02
     left = found[0].correct(counts, np.arange(len(counts)) / RATE)[when, 6] - counts[when, 6]
-    assert np.median(left) == pytest.approx(-150, abs=15)
-    assert abs(found[0].parameters["change"][0] - 150) < 15
+    assert np.median(left) == pytest.approx(-300, abs=15)
+    assert abs(found[0].parameters["change"][0] - 300) < 15
     assert "drift" in ids(diagnose_recording(Recording(counts, rate=RATE)))
 
 

@@ -25,6 +25,7 @@ _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
 # channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
 _FACTOR = 3.0
+_LOUDER = 0.5  # than the law, as a logarithm: what touches do within rows is in the noise
 _WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
 # sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
 _PAIRS = 0.25
@@ -327,7 +328,7 @@ def correlated(session: Session) -> Finding | None:
     ):  # a wave, each electrode at its own phase
         return None
     p = sign_flip(others)
-    if p < 0.01 and others.mean() > max(_PAIRS, 0.25 * common.mean()):
+    if p < 0.01 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
         K, parameters = _coupling(mean, alive, sd, 4 * error)
         matrix = np.linalg.inv(np.eye(19) + K)
         centre = np.median(session.counts[session.fit], axis=0)

@@ -60,7 +60,9 @@ def edges(session: Session) -> dict[int, list[Edge]]:
             continue  # it stands still there: stuck
         level = [np.median(x[max(at - _STAYS, 0) : at - 1, k]), np.median(x[at + 1 : at + _STAYS, k])]
         if 0.5 < (level[1] - level[0]) / step[i, k] < 1.6:
-            edge = Edge(rows[at] / r.rate, float(step[i, k]), float(times[i, k]), float(alone[i, k]))
+            height, rough = level[1] - level[0], 2 * noise[k] * np.sqrt(2 * (end**2).sum())
+            height = height if abs(height - step[i, k]) < rough else step[i, k]  # nothing moves
+            edge = Edge(rows[at] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
             found.setdefault(int(k), []).append(edge)
     return {k: e for k, e in found.items() if len(e) <= _MOST}
 

@@ -146,7 +146,8 @@ def _search(session, weak, named, bar):
             if finding is None:
                 break
             mine = (None,) if len(finding.channels) > 12 else finding.channels
-            again = find is gains and any(f.channels == finding.channels for f in session.findings)
+            same = [f for f in session.findings if f.channels == finding.channels]
+            again = any(find is gains or "edge" in f.clues for f in same)
             if again or _more_of_the_same(session, finding) or not take(finding):
                 refused.add(mine)
         if find is gains:
