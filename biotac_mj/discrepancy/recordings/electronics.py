@@ -418,7 +418,7 @@ def _coupling(pair, alive, sd, least):
     near = {length: np.exp(-distance / length) for length in (2.0, 4.0, 6.0)}
     alike = {length: float(np.corrcoef(k, half)[0, 1]) for length, k in near.items()}
     best = max(alike, key=alike.get)
-    if alike[best] > 0.5:
+    if alike[best] > 0.8:
         k = near[best]
         return K, (float(k @ half / (k @ k) * k.max()), best)
     return K, (float(half[np.abs(half).argmax()]),)
