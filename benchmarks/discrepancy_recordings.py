@@ -1,11 +1,13 @@
 """Recordings of real sensors with hidden effects: what `biotac diagnose --electrodes` names.
 
     python benchmarks/discrepancy_recordings.py DATA --half practice --json out/practice.json
-    python benchmarks/discrepancy_recordings.py --fit out/practice.json out/mixed.json
+    python benchmarks/discrepancy_recordings.py --fit out/mixed.json out/second.json out/third.json
+    python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
-pieces of either half and further forms. The other half is run once, afterwards (--half blind), and so are a
-second author's recordings (--half second, `recordings_foreign_second.py`). A run goes on where its JSON ends.
+pieces of either half and further forms. Other authors' recordings: --half second, --half third
+(`recordings_foreign_second.py`, `recordings_foreign_third.py`; --counts of the latter: rounds). --left-out
+names each author's by weights fitted on the others' alone. A run goes on where its JSON ends.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import time
 import numpy as np
 import recordings_foreign as first
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
+import recordings_foreign_third as third
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
@@ -242,31 +245,47 @@ def table(rows: list) -> str:
 
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
-    "shared": {"nats": 1, "size": 1, "lead": 1},
-    "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1},
-    "one": {"nats": 1, "size": 1, "turns": -1, "lead": 1, "stands": 1},
-    "answer": {"nats": 1, "spread": -1, "factor": 1},
-    "order": {"nats": 1, "ratio": 1},
+    "shared": {"nats": 1, "size": 1, "lead": 1, "uneven": -1, "seconds": 1},
+    "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1, "uneven": -1},
+    "one": {"nats": 1, "size": 1, "turns": -1, "lead": 1, "stands": 1, "apart": 1},
+    "jump": {"edge": 1, "alone": 1},
+    "answer": {"nats": 1, "spread": -1, "factor": 1, "sharp": 1},
+    "order": {"nats": 1, "ratio": 1, "left": -1},
     "samples": {"nats": 1},
     "single": {"nats": 1, "alone": 1},
     "still": {"nats": 1, "share": 1},
     "limit": {"nats": 1, "blocks": 1, "share": 1, "runs": 1},
-    "lost": {"times": 1, "score": 1},
+    "lost": {"times": 1, "score": 1, "electrodes": 1},
     "step": {"times": 1, "score": 1},
     "line": {"score": 1, "amplitude": 1},
-    "colour": {"ratio": 1},
-    "pairs": {"share": 1, "kappa": 1, "t": 1},
-    "common": {"factor": 1},
-    "size": {"factor": 1, "counts": 1},
+    "colour": {"ratio": 1, "quiet": 1, "even": 1},
+    "pairs": {"rest": 1, "louder": -1, "loaded": -1},
+    "common": {"factor": 1, "rest": -1},
+    "size": {"factor": 1, "counts": 1, "stands": 1, "blocks": 1},
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "size": 1, "blocks": 1, "explained": 1},
-    "left_loaded": {"fast1": 1, "level1": 1},
-    "left_unloaded": {"counts1": 1, "level3": 1, "stands": 1},
+}
+# of what is left: each may be what no name fits
+LEFT = {
+    "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again"),
+    "left_unloaded": (
+        "counts1",
+        "level3",
+        "stands",
+        "rhythm",
+        "rhythm1",
+        "sharp",
+        "sharp1",
+        "low1",
+        "low6",
+        "again",
+    ),
 }
 DOUBT, FAR = 1.0, 1.5  # names on either side, and how far: standard deviations of every clue
 RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
 SPREAD = 0.5  # of a family's rate about the others', in log odds, before it is seen
-TOP = 0.25  # share of the names, the surest, whose rate no confidence may exceed
+LEAST = 0.25  # spread of a clue of what is left
+TOP = 0.5  # share of the names, the surest, whose rate no confidence may exceed
 
 
 def _standard(cases, signs):
@@ -306,11 +325,6 @@ def _left_out(cases, signs, key):
     return out
 
 
-def _author(row):
-    """Whose recording it is."""
-    return row["base"] in {base.split()[0] for base in foreign.NATURAL if base not in first.NATURAL}
-
-
 def _nameable(row):
     """What was found and the part kept aside does not contradict."""
     return [*row["named"], *(n for n in row["weak"] if not n["contradicted"])]
@@ -322,21 +336,14 @@ def fit(rows: list) -> dict:
     the scores s of names left out (Platt); and the rate of the surest, which none exceeds."""
     from scipy.optimize import minimize
 
-    out, score, family, y = {}, [], [], []
+    out, score, family, y, own = {}, [], [], [], []
     for name, signs in CLUES.items():
         mine = [
-            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "by": _author(r)}
+            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "by": r["by"]}
             for r in rows
             for n in _nameable(r)
             if n["family"] == name
         ]
-        if name.startswith("left"):  # effects without a name, against recordings without an effect
-            mine = [
-                {"clues": r["rest"], "right": "outside" if r["truth"] else None}
-                for r in rows
-                if r["loaded"] == (name == "left_loaded")
-                and (not r["truth"] or set(r["truth"]) & foreign.OUTSIDE)
-            ]
         if not mine:
             continue
         w = _logistic(mine, signs)
@@ -346,12 +353,12 @@ def fit(rows: list) -> dict:
             "cases": len(mine),
             "right": sum(n["right"] is not None for n in mine),
         }
-        if not name.startswith("left"):
-            for key in ("form", "by"):
-                score += np.clip(_left_out(mine, signs, key), -6, 6).tolist()
-                family += [name] * len(mine)
-                y += [n["right"] is not None for n in mine]
-    names = [n for n in out if not n.startswith("left")]
+        for key in ("form", "by"):
+            score += np.clip(_left_out(mine, signs, key), -6, 6).tolist()
+            family += [name] * len(mine)
+            y += [n["right"] is not None for n in mine]
+            own += [n["right"] != "natural" for n in mine]
+    names = list(out)
     score, y = np.array(score), np.array(y, float)
     which = np.array([names.index(f) for f in family])
 
@@ -363,46 +370,61 @@ def fit(rows: list) -> dict:
     bounds = [(0.2, 1.0), *[(None, None)] * (1 + len(names))]
     w = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
     said = w[0] * score + w[1] + w[2:][which]
-    named = said > 0
-    top = said >= np.quantile(said[named], 1 - TOP)
-    for name, own in zip(names, w[2:]):
+    # what a sensor has by itself is told surely, and says nothing of the forms of others
+    named = (said > 0) & np.array(own)
+    top = named & (said >= np.quantile(said[named], 1 - TOP))
+    for name, more in zip(names, w[2:]):
         known = out[name]
-        known["intercept"] = float(w[0] * known["intercept"] + w[1] + own)
+        known["intercept"] = float(w[0] * known["intercept"] + w[1] + more)
         known["weights"] = {k: float(w[0] * v) for k, v in known["weights"].items()}
     out["most"] = float((y[top].sum() + 1) / (top.sum() + 2))
-    return out
+    return out | {
+        name: _usual([r for r in rows if r["loaded"] == (name == "left_loaded")], LEFT[name]) for name in LEFT
+    }
 
 
-def authors_left_out(rows: list, named: float) -> list:
-    """Rows as they would be named, from the evidence they hold, with a confidence whose weights come from
-    the other author's recordings alone."""
-    from biotac_mj.discrepancy.recordings.confidence import probability
+def _usual(rows, clues):
+    """What is usual of recordings without an effect: clue -> (median, spread of the upper side), and how far
+    the most unusual clue of each lies."""
+    from biotac_mj.discrepancy.recordings.confidence import beyond
+
+    x = np.array([[r["rest"][k] for k in clues] for r in rows if not r["truth"]])
+    middle, high = np.quantile(x, [0.5, 0.9], axis=0)
+    usual = np.column_stack([middle, np.maximum((high - middle) / 1.28, LEAST)])
+    far = [max(beyond(v, *u) for v, u in zip(row, usual)) for row in x]
+    return {"usual": dict(zip(clues, usual.tolist())), "others": sorted(far)}
+
+
+def authors_left_out(rows: list, named: float, unknown: float) -> list:
+    """Rows as they would be named and called unknown, from the evidence they hold, with confidences whose
+    weights come from the other authors' recordings alone."""
+    from biotac_mj.discrepancy.recordings.confidence import probability, unusual
 
     out = []
-    for author in (False, True):
-        weights = fit([r for r in rows if _author(r) != author])
-        for r in (r for r in rows if _author(r) == author):
+    for author in dict.fromkeys(r["by"] for r in rows):
+        weights = fit([r for r in rows if r["by"] != author])
+        for r in (r for r in rows if r["by"] == author):
             said = [
                 n | {"confidence": min(probability(n["family"], n["clues"], weights), weights["most"])}
                 for n in _nameable(r)
                 if n["family"] in weights
             ]
             names = [{"channels": ["e1"] * 19} | n for n in said if n["confidence"] >= named]
-            out.append(r | {"named": names})
+            out.append(r | {"named": names, "unknown": unusual(r["rest"], r["loaded"], weights) <= unknown})
     return out
 
 
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind", "mixed", "second"), default="practice")
+    args.add_argument("--half", choices=("practice", "blind", "mixed", "second", "third"), default="practice")
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
-    args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the other's weights")
+    args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
@@ -411,14 +433,21 @@ def main(argv=None):
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED
+        from biotac_mj.discrepancy.recordings.rest import UNKNOWN
 
         rows = [r for name in args.left_out for r in json.loads(pathlib.Path(name).read_text())["cases"]]
-        print(table(authors_left_out(rows, NAMED)))
+        rows = authors_left_out(rows, NAMED, UNKNOWN)
+        for author in dict.fromkeys(r["by"] for r in rows):
+            print(author, table([r for r in rows if r["by"] == author]), sep="\n", end="\n\n")
+        print("all", table(rows), sep="\n")
         return
+    from biotac_mj.discrepancy.recordings.recording import MIN_ROWS
+
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
     done = {tuple(r["key"]) for r in rows}
-    generator, half = (foreign, ()) if args.half == "second" else (first, (args.half,))
+    generator = {"second": foreign, "third": third}.get(args.half, first)
+    half = (args.half,) if generator is first else ()
     sources = generator.bases(args.data, *half)
     cases = generator.plan(*half, *map(int, args.counts.split(",")))
     # in mixed order, so that a run that was stopped holds some of each
@@ -427,7 +456,9 @@ def main(argv=None):
         if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
             continue
         case, clean = generator.make(*half, sources, base, effects, seed)
-        rows.append({"key": key, **judge(case, clean)})
+        if len(case.counts) < MIN_ROWS:  # refused
+            continue
+        rows.append({"key": key, "by": generator.__name__, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))

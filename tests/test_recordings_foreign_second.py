@@ -114,3 +114,12 @@ def test_a_change_that_cannot_be_seen_is_an_error(second, sources, monkeypatch):
         ValueError, match=r"no draw of \('hum',\) can be seen on 'press': give it another base"
     ):
         second.make(sources, "press", ("hum",), 0)
+
+
+def test_the_third_author_shares_a_case_and_nothing_else(second):
+    text = (BENCHMARKS / "recordings_foreign_third.py").read_text()
+    assert "biotac_mj" not in text and "recordings_foreign_second" not in text
+    third = importlib.import_module("recordings_foreign_third")
+    cases = third.plan(2)
+    assert len(cases) == len(set(cases)) == 220 and cases[:110] == third.plan()
+    assert {e for _, effects, _ in cases for e in effects} == set(third.EFFECTS) <= set(second.ACCEPTED)

@@ -8,12 +8,13 @@ import pathlib
 
 from .findings import Finding
 
-__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "probability"]
+__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "beyond", "family", "probability", "unusual"]
 
 FAMILIES = {
     "shared": ("warmup", "thermal"),
     "supply": ("fluidloss", "count_offset", "count_gain"),
     "one": ("drift",),
+    "jump": ("drift",),
     "answer": ("gain", "flip"),
     "order": ("swap",),
     "samples": ("freeze", "quantise"),
@@ -29,8 +30,9 @@ FAMILIES = {
     "late": ("latency",),
     "memory": ("relax", "hyster"),
 }
-# confidence from which a finding is named: nine of ten are right by weights of the other author alone
-NAMED = 0.74
+# confidence from which a finding is named: nine of ten are right by weights of the other authors alone
+NAMED = 0.7
+_FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 
@@ -41,6 +43,8 @@ def family(finding: Finding) -> str:
         return "late" if finding.id == "latency" else "memory"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
+    if "edge" in finding.clues:
+        return "jump"
     if "spread" in finding.clues:  # one that no longer answers is told as a gain is
         return "answer"
     return next(name for name, ids in FAMILIES.items() if finding.id in ids)
@@ -54,6 +58,20 @@ def clues(finding: Finding) -> dict:
 def confidence(finding: Finding) -> float:
     """Probability that the name is right, at most the rate of the surest ones seen."""
     return min(probability(family(finding), clues(finding)), _WEIGHTS["most"])
+
+
+def unusual(given: dict, loaded: bool, weights: dict = _WEIGHTS) -> float:
+    """p of the clues of what is left (`rest.py`): the share of practice recordings without an effect of which
+    some clue lies as far above what is usual."""
+    known = weights["left_loaded" if loaded else "left_unloaded"]
+    far = max(beyond(given.get(k, 0.0), *usual) for k, usual in known["usual"].items())
+    others = known["others"]
+    return (1 + sum(o >= far for o in others)) / (1 + len(others))
+
+
+def beyond(value: float, middle: float, spread: float) -> float:
+    """How far above what is usual, in spreads."""
+    return min(max((value - middle) / spread, 0.0), _FAR)
 
 
 def probability(family: str, given: dict, weights: dict = _WEIGHTS) -> float:

@@ -25,8 +25,16 @@ _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
 # channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
 _FACTOR = 3.0
+_LOUDER = 0.5  # than the law, as a logarithm: what touches do within rows is in the noise
+_WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
+# sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
+_PAIRS = 0.25
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
+# of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
+_QUIET = 0.4
+# logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
+_STEPS = -0.5
 
 
 def _differences(session, order=3):
@@ -91,7 +99,16 @@ def coloured(session: Session) -> Finding | None:
     )
     p, value = sign_flip(ratio), float(np.median(ratio))
     pole = _pole(value, bands)
-    if p > 0.01 or pole < 0.05:
+    # a filter takes noise away, where a wave adds some and values that are held keep theirs, in steps
+    law = electrode_noise(np.median(x, axis=0))
+    quiet = np.log(law * np.sqrt((window**2).sum()) / np.sqrt(np.maximum(high.mean(0), 0.01 * floor)))
+    step = np.abs(np.diff(x, axis=0))
+    step = step[: len(step) // 24 * 24].reshape(-1, 24, 19)
+    even = np.median(np.median(step, axis=1) + 0.25, axis=0) / np.median(
+        np.sqrt((step**2).mean(1)) + 0.25, axis=0
+    )
+    quiet, even = float(np.median(quiet[alive])), float(np.log(np.median(even[alive])))
+    if p > 0.01 or pole < 0.05 or quiet < _QUIET or even < _STEPS:
         return None
     rate = session.recording.rate * session.fresh
     tau, low, high = (
@@ -107,7 +124,13 @@ def coloured(session: Session) -> Finding | None:
         0.0,
         session.recording.time[-1],
         note=f"the noise is {np.exp(value):.1f} times stronger at a quarter of the rate than at half of it",
-        clues={"pole": pole, "ratio": value, "least": float(ratio.min())},
+        clues={
+            "pole": pole,
+            "ratio": value,
+            "least": float(ratio.min()),
+            "quiet": quiet,
+            "even": even,
+        },
     )
 
 
@@ -182,7 +205,8 @@ def _line(session):
     floor = np.median(power[f > 0.3 * rate], axis=0)
     # the load's band ends where the spectrum comes down to the floor
     smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="nearest")
-    above = np.flatnonzero(np.median(smooth / floor, axis=1) > 3)
+    wide = median_filter(power, (2 * max(10, size // 40) + 1, 1), mode="nearest")  # a line is no band
+    above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
     low = max(1.15 * band, 8 * rate / size, 2.0)
     inside = (f > low) & (f < 0.49 * rate)
@@ -282,66 +306,78 @@ def correlated(session: Session) -> Finding | None:
         power = np.maximum((y**2).sum(0), 1e-9)
         value.append((y.T @ y / np.sqrt(np.outer(power, power)))[pairs])
     value = np.nan_to_num(np.array(value))  # (blocks, pairs)
-    mean = value.mean(0)
-    common = float(np.median(mean))
-    best = None
-    for name, K in _neighbours().items():
-        k = K[np.ix_(alive, alive)][pairs]
-        c = k - k.mean()
-        by_block = value @ c / (c @ c)
-        share = float(
-            (mean - mean.mean()) @ c / np.sqrt((c @ c) * max(((mean - mean.mean()) ** 2).sum(), 1e-12))
-        )
-        t = by_block.mean() / max(by_block.std(ddof=1) / np.sqrt(BLOCKS), 1e-9)
-        if best is None or share > best[1]:
-            level, slope = np.linalg.lstsq(np.column_stack([np.ones(len(k)), k]), mean, rcond=None)[0]
-            best = name, share, by_block, t, slope**2 * (k @ k) > level**2 * len(k)
-    name, share, by_block, t, near = best
+    number, mean = len(alive), value.mean(0)
+    common, others = np.empty(BLOCKS), np.empty(BLOCKS)  # what one factor explains, what is left of pairs
+    for b in range(BLOCKS):
+        by = value[np.arange(BLOCKS) != b].mean(0)
+        one = _factor(by, number)[pairs]
+        common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
     size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
-    last = session.recording.time[-1]
-    p = sign_flip(by_block)
-    coupling = float(np.median(by_block)) / 2
-    noise = 1 / np.sqrt(size)
-    if near and p < 0.01 and 2 * coupling > 0.03 and share > 0.3:
-        K = _neighbours()[name]
-        matrix = np.linalg.inv(np.eye(19) + coupling * K)
+    error, last = 1 / np.sqrt(size), session.recording.time[-1]
+    louder = float(
+        np.median(np.log(sd / electrode_noise(np.median(session.counts[session.fit], axis=0)))[alive])
+    )
+    clues = {
+        "factor": float(np.log(max(common.mean(), 0.01))),
+        "rest": float(np.log(max(others.mean(), 0.01))),
+        "louder": louder,
+        "loaded": float(session.loaded),
+    }
+    if (
+        _peak(np.nan_to_num(cells[:, :, alive]) / sd[alive]) > _WAVE
+    ):  # a wave, each electrode at its own phase
+        return None
+    p = sign_flip(others)
+    if p < 0.01 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
+        K, parameters = _coupling(mean, alive, sd, 4 * error)
+        matrix = np.linalg.inv(np.eye(19) + K)
         centre = np.median(session.counts[session.fit], axis=0)
-        parameters = {"kappa": (coupling, coupling - noise, coupling + noise)}
-        if name.startswith("distance"):
-            parameters["length"] = (float(name.split()[1]), _NAN, _NAN)
-        ties = ("common_noise",) if common > coupling else ()
+        most = int(np.abs(mean).argmax())
         return Finding(
             "crosstalk",
             tuple(range(19)),
-            parameters,
-            float(size * len(pairs[0]) * coupling**2),
+            {"kappa": (parameters[0], parameters[0] - error, parameters[0] + error)}
+            | ({"length": (parameters[1], _NAN, _NAN)} if len(parameters) > 1 else {}),
+            float(size * others.sum()),
             p,
             0.0,
             last,
-            note=f"noise of neighbours ({name}) is correlated by {2 * coupling:.2f}; "
-            "a sensor's is independent",
-            ties=ties,
-            clues={"kappa": float(np.log(coupling)), "share": share, "t": float(np.log(max(t, 1.0)))},
+            note=f"noise of some electrodes is correlated, of e{alive[pairs[0][most]] + 1} and "
+            f"e{alive[pairs[1][most]] + 1} by {mean[most]:.2f}; a sensor's is independent",
+            ties=("common_noise",) if common.mean() > others.mean() else (),
+            clues=clues,
             correct=lambda counts, at: centre + (counts - centre) @ matrix.T,
         )
-    factor = np.array([_together(value[np.arange(BLOCKS) != b].mean(0), value[b]) for b in range(BLOCKS)])
-    p, size_of = sign_flip(factor), float(factor.mean())
-    if p < 0.01 and size_of > 0.02 * len(alive):
-        common = size_of / len(alive)
+    p = sign_flip(common)
+    size_of = float(np.sqrt(max(2 * common.mean(), 0)))  # of n channels that are all alike: n
+    if p < 0.01 and size_of > 0.02 * number:
+        share = size_of / number
         return Finding(
             "common_noise",
             tuple(range(19)),
-            {"correlation": (common, common - noise, common + noise)},
-            float(size * len(pairs[0]) * common**2 / 2),
+            {"correlation": (share, share - error, share + error)},
+            float(size * common.sum() / 2),
             p,
             0.0,
             last,
             ties=("crosstalk",) if size_of < _FACTOR else (),
             note=f"noise has a part in common, as much as {1 + size_of:.1f} electrodes have alone",
-            clues={"factor": float(np.log(size_of)), "loaded": float(session.loaded)},
-            correct=_without_common(x.reshape(-1, len(alive)), sd) if len(alive) == 19 else None,
+            clues=clues,
+            correct=_without_common(x.reshape(-1, number), sd) if number == 19 else None,
         )
     return None
+
+
+def _peak(cells):
+    """How far the spectrum of what fifth differences (windows, rows, channels) have in common stands out at
+    one frequency above its median: a noise has no such, a wave has."""
+    rows = cells.shape[1]
+    together = cells.reshape(-1, cells.shape[2])
+    share = np.linalg.eigh(together.T @ together)[1][:, -1]
+    power = (np.abs(np.fft.rfft((cells @ share) * np.hanning(rows), axis=1)) ** 2).mean(0)
+    f = np.fft.rfftfreq(rows)
+    power = (power / np.maximum(2 - 2 * np.cos(2 * np.pi * f), 1e-9) ** 5)[f > 0.15]
+    return float(power.max() / np.median(power))
 
 
 def _with_temperature(session, d, rows):
@@ -354,17 +390,38 @@ def _with_temperature(session, d, rows):
     return bool(both.std(1).min() > 0 and abs(np.corrcoef(both)[0, 1]) > 0.5)
 
 
-def _together(others, mine):
-    """What one factor explains of correlations (pairs,) of a block, its shares taken from other blocks: the
-    largest eigenvalue without the channels' own, so much that some channels need not have it."""
-    number = int((1 + np.sqrt(1 + 8 * len(mine))) / 2)
-    pairs = np.triu_indices(number, 1)
-    both = np.zeros((2, number, number))
-    for out, c in zip(both, (others, mine)):
-        out[pairs] = c
-    both += both.transpose(0, 2, 1)
-    share = np.linalg.eigh(both[0])[1][:, -1]
-    return float(share @ both[1] @ share)
+def _factor(pair, number):
+    """(number, number) correlations that one factor explains of those of pairs (pairs,), each channel with a
+    share of its own: principal factor."""
+    whole = np.zeros((number, number))
+    whole[np.triu_indices(number, 1)] = pair
+    whole += whole.T
+    own = np.full(number, 0.3)
+    for _ in range(15):
+        size, axes = np.linalg.eigh(whole + np.diag(own))
+        share = axes[:, -1] * np.sqrt(max(size[-1], 0.0))
+        own = np.clip(share**2, 0, 0.98)
+    return np.outer(share, share)
+
+
+def _coupling(pair, alive, sd, least):
+    """(19, 19) of a symmetric cross-talk by correlations of pairs (pairs,) of the channels `alive`, those
+    below `least` nothing; and its size, with the length [mm] if neighbours have it."""
+    K = np.zeros((19, 19))
+    pairs = np.triu_indices(len(alive), 1)
+    i, j = alive[pairs[0]], alive[pairs[1]]
+    K[i, j] = np.where(np.abs(pair) > least, pair, 0) * sd[i] * sd[j] / (sd[i] ** 2 + sd[j] ** 2)
+    K += K.T
+    half = K[np.triu_indices(19, 1)]
+    p = electrode_positions()
+    distance = np.linalg.norm(p[:, None] - p[None], axis=2)[np.triu_indices(19, 1)]
+    near = {length: np.exp(-distance / length) for length in (2.0, 4.0, 6.0)}
+    alike = {length: float(np.corrcoef(k, half)[0, 1]) for length, k in near.items()}
+    best = max(alike, key=alike.get)
+    if alike[best] > 0.8:
+        k = near[best]
+        return K, (float(k @ half / (k @ k) * k.max()), best)
+    return K, (float(half[np.abs(half).argmax()]),)
 
 
 def _without_common(x, sd):
@@ -395,38 +452,30 @@ def _without_common(x, sd):
     return correct
 
 
-def _neighbours():
-    p = electrode_positions()
-    d = np.linalg.norm(p[:, None] - p[None], axis=2)
-    out = {f"distance {length:g} mm": np.exp(-d / length) * (1 - np.eye(19)) for length in (2, 4, 6)}
-    out = {name: K / K.max() for name, K in out.items()}
-    out["order"] = (np.abs(np.subtract.outer(np.arange(19), np.arange(19))) == 1).astype(float)
-    return out
-
-
 # --- size
 
 
 def noisy(session: Session) -> list[Finding]:
     """Electrodes whose noise is larger than the law says that the others follow."""
     d, _ = _differences(session)
-    k = len(d) // BLOCKS
-    if k < 20 or any(f.id == "quantise" for f in session.findings):
+    units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
+    if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
         return []
-    cells = np.abs(d[: k * BLOCKS].reshape(BLOCKS, k, 19))
+    k = len(d) // units
+    cells = np.abs(d[: k * units].reshape(units, k, 19))
     cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
     # a quarter of the samples moves least: no load in them
     level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
     law = electrode_noise(np.median(session.counts[session.fit], axis=0))
     ratio = np.log(np.maximum(level, 0.3) / law)
     ratio -= np.median(ratio, axis=1, keepdims=True)
-    own = np.median(ratio, axis=0)
+    own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
     found = []
     for e in np.argsort(-own)[:4]:
-        if not own[e] > max(np.log(1.6), 3 * spread) or np.median(level[:, e]) < _LEAST:
+        if not own[e] > max(np.log(1.6), 3 * spread) or np.quantile(level[:, e], 0.85) < _LEAST:
             continue
-        excess = ratio[:, e] - np.log(1.3)
+        excess = ratio[:, e] - np.quantile(ratio, 0.7, axis=1)
         p = sign_flip(excess)
         if p > 0.01:
             continue
@@ -436,7 +485,7 @@ def noisy(session: Session) -> list[Finding]:
                 "noise",
                 (int(e),),
                 {"factor": (factor, *np.exp(np.quantile(ratio[:, e], [0.1, 0.9])))},
-                float(k * BLOCKS * own[e] ** 2),
+                float(k * units * own[e] ** 2),
                 p,
                 0.0,
                 session.recording.time[-1],
@@ -445,7 +494,7 @@ def noisy(session: Session) -> list[Finding]:
                     "factor": float(own[e]),
                     "stands": float(own[e] / spread),
                     "blocks": float(np.mean(excess > 0)),
-                    "counts": float(np.log(np.median(level[:, e]))),
+                    "counts": float(np.log(np.quantile(level[:, e], 0.85))),
                 },
             )
         )

@@ -7,12 +7,14 @@ from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..evidence import sign_flip
 from .courses import BLOCKS
 from .findings import Finding
+from .jumps import edges
 from .session import Session
 
-__all__ = ["gains"]
+__all__ = ["gains", "undecided"]
 
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
+_LIVELY = 3.0  # [counts] within windows, of half of the electrodes: with less there is nothing to answer
 _DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
 _WINDOW = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
 _SPLITS = 28  # times tried
@@ -25,26 +27,25 @@ def gains(session: Session, refused: set) -> Finding | None:
     Within windows an electrode is what the others say (a regression), and c times that from a time s on: c,
     s and the regression are fitted together on the windows' moments. A window counts by the logarithm of
     its misfit, so that none decides alone; all is judged on blocks left out."""
-    m = session.model()
-    if (
-        m.dimensions < 2 or m.time[m.inside][-1] < BLOCKS
-    ):  # a block of less than a second holds no load change
+    m, sharp = session.model(), edges(session)
+    # a block of less than a second holds no load change: only when it changed is known then
+    blind = m.dimensions < 2 or m.time[m.inside][-1] < BLOCKS
+    if blind and not sharp or not m.inside.sum() > 64 or np.median(m.activity * m.slope) < _LIVELY:
         return None
     whole = m.whole[m.inside]
-    span = max(4, int(min(_WINDOW / m.period, len(whole) // 32)))
-    w = len(whole) // span
-    cells = whole[: w * span].reshape(w, span, -1)
-    cells = cells - cells.mean(1, keepdims=True)
-    moment = np.einsum("wsi,wsj->wij", cells, cells)
+    span, moment, floor, middle = _windows(m)
+    w = len(moment)
     block = np.arange(w) * BLOCKS // w
-    floor = np.concatenate([m.noise**2, np.full(whole.shape[1] - len(m.used), 0.02)]) * span
-    fits = [_Regression(moment, i, floor) for i in range(len(m.used))]
-    order = sorted(range(len(fits)), key=lambda i: -fits[i].nats)
+    fits = {}
+    for i, k in enumerate(m.used):
+        if not blind or k in sharp:
+            fits[i] = _Regression(moment, i, floor, _changed(sharp.get(int(k), ()), middle), blind)
+    order = sorted(fits, key=lambda i: -fits[i].nats)
     for i in order[:4]:
         fit, k = fits[i], int(m.used[i])
         if (k,) in refused or fit.nats < 4:
             continue
-        late = np.arange(w) >= fit.split
+        late = fit.late
         gain, factors = np.empty(w), []  # by window: all but a few may lie before the change
         for b in range(block[-1] + 1):
             mine, rest = block == b, block != b
@@ -58,21 +59,64 @@ def gains(session: Session, refused: set) -> Finding | None:
         spread = float(np.std(factors) * np.sqrt(len(factors) - 1))  # jackknife
         gain = np.bincount(block, gain)
         _, beta = fit.changed(~late, late)
-        onset = _onset(m, whole, i, beta, c, span, fit.split)
+        when, edge = fit.when, 0.0
+        if when is None:
+            when = _onset(m, whole, i, beta, c, span, int(np.argmax(late))), np.inf
+        else:
+            edge = float(np.log(max(e.times for e in sharp[k])))
         if abs(c) < _DEAD:
-            return _dead(session, k, onset, gain, p)
-        return _gain_finding(session, k, i, c, spread, onset, gain, p)
+            return _dead(session, k, when[0], gain, p)
+        return _gain_finding(session, k, i, c, spread, when, gain, p, edge)
     return None
 
 
+def _windows(m):
+    """Rows of a window, moments (w, q, q) of their changes, floor (q,) of a window's noise, middles
+    (w,) [s]."""
+    whole = m.whole[m.inside]
+    span = max(4, int(min(_WINDOW / m.period, len(whole) // 32)))
+    w = len(whole) // span
+    cells = whole[: w * span].reshape(w, span, -1)
+    cells = cells - cells.mean(1, keepdims=True)
+    floor = np.concatenate([m.noise**2, np.full(whole.shape[1] - len(m.used), 0.02)]) * span
+    return span, np.einsum("wsi,wsj->wij", cells, cells), floor, m.time[: w * span].reshape(w, span).mean(1)
+
+
+def _fitted(m, session, i, k):
+    """Regression of electrode k, and its windows (w,) bool after its jumps that explain most, or None."""
+    _, moment, floor, middle = _windows(m)
+    fit = _Regression(moment, i, floor, _changed(edges(session).get(k, ()), middle), True)
+    return fit, fit.late
+
+
+def undecided(session: Session, k: int) -> tuple:
+    """What the jumps of electrode k may be besides a level that has changed: what it makes of the load
+    afterwards, as far as the rows fitted say."""
+    m = session.model()
+    if k not in m.used or np.median(m.activity * m.slope) < _LIVELY:
+        return ()  # nothing moves: an offset, and a gain that nobody sees
+    fit, late = _fitted(m, session, int(np.flatnonzero(m.used == k)[0]), k)
+    if late is None:
+        return ("gain", "flip")
+    c, beta = fit.changed(~late, late)
+    said = np.einsum("wij,i,j->w", fit.G[late], beta, beta)
+    each = (fit.g[late] @ beta) / np.maximum(said, 1e-12)
+    error = np.sqrt(np.average((each - c) ** 2, weights=said) / len(each)) + 0.05
+    if abs(c - 1) < 2 * error + 1 - np.exp(-_CURVED):
+        return () if error < 0.2 else ("gain",) if error < 0.5 else ("gain", "flip")
+    return ("gain",) if c > 0 else ("flip",)
+
+
 class _Regression:
-    """Column i on all others, from moments of windows (w, q, q); floor (q,) of a window's noise.
+    """Column i on all others, from moments of windows (w, q, q); floor (q,) of a window's noise; sides: what
+    may be changed, by jumps (`_changed`), and unless blind all from any window on.
 
     Attributes:
-      split: first window after the change; nats: what a factor from there on gains.
+      late: (w,) bool, windows after the change; when: (from, until) [s] where jumps say it, else None; nats:
+        what a factor there gains.
     """
 
-    def __init__(self, moment, i, floor):
+    def __init__(self, moment, i, floor, sides, blind):
         o = np.delete(np.arange(moment.shape[1]), i)
         self.G, self.g, self.y = moment[:, o][:, :, o], moment[:, o, i], moment[:, i, i]
         self.ridge, self.least = np.diag(floor[o]), floor[i]
@@ -85,13 +129,13 @@ class _Regression:
             self.weight = self.least / (square + self.least)
         plain = self.cost(self.plain(everything)).sum()
         splits = np.unique(np.linspace(max(2, 0.06 * w), 0.94 * w - 1, _SPLITS).astype(int))
-        costs = []
-        for s in splits:
-            late = np.arange(w) >= s
+        tried = [*sides, *([] if blind else ((np.arange(w) >= split, None) for split in splits))]
+        self.nats, self.late, self.when = -np.inf, None, None
+        for late, when in tried:
             c, beta = self.changed(~late, late)
-            costs.append(self.cost(beta)[~late].sum() + self.cost(c * beta)[late].sum())
-        best = int(np.argmin(costs))
-        self.split, self.nats = int(splits[best]), plain - costs[best]
+            nats = plain - self.cost(beta)[~late].sum() - self.cost(c * beta)[late].sum()
+            if nats > self.nats:
+                self.nats, self.late, self.when = nats, late, when
 
     def _sum(self, rows):
         v = self.weight[rows]
@@ -125,6 +169,15 @@ class _Regression:
     def cost(self, beta, rows=slice(None)):
         """(w,) half the logarithm of the misfit."""
         return 0.5 * np.log1p(self.square(beta, rows) / self.least)
+
+
+def _changed(mine, middle):
+    """What may be changed by an electrode's jumps, all from the first on or up to where it jumps back:
+    windows (w,) bool by their middles [s], and (from, until) [s]."""
+    back = [e.time for e in mine[1:] if e.step * mine[0].step < 0]
+    whens = [(mine[0].time, until) for until in (*back, np.inf)] if mine else []
+    sides = [((middle > when[0]) & (middle < when[1]), when) for when in whens]
+    return [side for side in sides if 2 <= side[0].sum() <= len(middle) - 2]
 
 
 def _onset(m, whole, i, beta, c, span, split):
@@ -162,13 +215,14 @@ def _dead(session, k, onset, gain, p):
     )
 
 
-def _gain_finding(session, k, i, c, spread, onset, gain, p):
+def _gain_finding(session, k, i, c, spread, when, gain, p, edge):
+    onset, until = when
     m, time = session.model(), session.recording.time
     middle = float(m.mean[i])
     holder = {"offset": 0.0}
 
     def correct(counts, at):
-        out, late = counts.copy(), at > onset
+        out, late = counts.copy(), (at >= onset) & (at < until)
         z = log_impedance(counts[late, k])
         out[late, k] = counts_from_log_impedance(middle + (z - middle - holder["offset"]) / c)
         return out
@@ -182,11 +236,12 @@ def _gain_finding(session, k, i, c, spread, onset, gain, p):
         float(gain.sum()),
         p,
         onset,
-        time[-1],
+        min(until, time[-1]),
         note=f"from {onset:.1f} s on it answers the load {c:.2f} times as before",
         clues={
             "nats": float(gain.mean()),
             "factor": float(abs(np.log(max(abs(c), 0.02)))) if c > 0 else 2.0,
+            "sharp": edge,
             "blocks": float(np.mean(gain > 0)),
             "seconds": float(np.log(m.time[m.inside][-1])),
             "spread": float(np.log(min(spread / abs(1 - c), 2.0) + 0.01)),
@@ -199,7 +254,7 @@ def _gain_finding(session, k, i, c, spread, onset, gain, p):
     m = again.model()
     if k in m.used:
         level, at = m.levels(m.alone()[:, int(np.flatnonzero(m.used == k)[0])])
-        late = at > onset
+        late = (at > onset) & (at < until)
         if late.any() and (~late).any():
             near = np.argsort(np.abs(at - onset))[: max(8, len(at) // 3)]
             late_near = late & np.isin(np.arange(len(at)), near)

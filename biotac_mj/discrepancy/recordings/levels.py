@@ -21,6 +21,8 @@ _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
+# logarithm of times the next electrode that one wanders, where load and drift are not parted: 0.6 at most
+_APART = 0.9
 _NAN = float("nan")
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
@@ -50,8 +52,8 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
-        if k is not None and course.kind == "smooth" and not m.parted:
-            continue  # in so short a time an electrode creeps with the load as well
+        if k is not None and course.kind == "smooth" and not m.parted and _stands(m, k)[1] < _APART:
+            continue  # in so short a time an electrode creeps with the load as well, but others do, too
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)
@@ -88,17 +90,19 @@ def _single(session, course, k, options):
         note=f"{'a step' if course.kind == 'step' else 'a course over time'} of "
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
-        | {"lead": float(np.clip(np.log(lead), -1, 5)), "stands": _stands(m, i), "course": course},
+        | dict(zip(("stands", "apart"), _stands(m, k)))
+        | {"lead": float(np.clip(np.log(lead), -1, 5)), "course": course},
         correct=correct,
     )
 
 
-def _stands(m, i):
-    """Logarithm of how much more the levels of electrode i wander about their mean than those of the
-    others, in counts."""
+def _stands(m, k):
+    """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
+    in counts: than their median, than the next of them."""
     level, _ = m.levels(m.alone())
-    size = level.std(0) * m.slope + 0.3
-    return float(np.log(size[i] / np.median(np.delete(size, i))))
+    size = np.log(level.std(0) * m.slope + 0.3)
+    mine, others = size[m.used == k][0], size[m.used != k]
+    return float(mine - np.median(others)), float(mine - others.max())
 
 
 def settle(session: Session) -> None:
@@ -176,6 +180,8 @@ def _shared(session, course, options):
         clues=_clues(session, course, size, float((m.activity * m.slope).mean()))
         | {
             "lead": float(np.log(_energy_of_all(options) / max(others, 1e-9))),
+            "uneven": _uneven(m, course),
+            "seconds": float(np.log(session.fit.sum() / session.recording.rate)),
             "course": course,
             "share": share,
         },
@@ -183,6 +189,18 @@ def _shared(session, course, options):
     )
     _name_shared(session, finding, course, change)
     return finding
+
+
+def _uneven(m, course):
+    """Logarithm of how much electrodes differ in a course, against its median: a warm-up's are alike, a
+    touch's are not; 0.2 under load, which hides it."""
+    if m.dimensions:
+        return float(np.log(0.2))
+    level, time = m.levels(m.value)
+    y = course(time)
+    each = level.T @ (y - y.mean())
+    spread = 1.4826 * np.median(np.abs(each - np.median(each)))
+    return float(np.log(np.clip(spread / max(abs(np.median(each)), 1e-12), 0.05, 5)))
 
 
 def _energy_of_all(options: list) -> float:

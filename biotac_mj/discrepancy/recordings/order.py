@@ -1,5 +1,7 @@
 """Exchanged channels: which carry each other's signal on one side of a time."""
 
+import itertools
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -11,6 +13,7 @@ from .session import Session
 __all__ = ["exchanged"]
 
 _MOST = 8  # channels
+_PARTS = 9  # of the rows fitted, between whose edges channels may be exchanged
 _EARNED = 0.95  # of the misfit left by an exchange at most
 
 
@@ -22,37 +25,43 @@ def exchanged(session: Session) -> Finding | None:
     x, number = (m.value + m.mean)[m.inside], len(m.used)
     if not m.dimensions:  # what all do alike, a warm-up, is no order
         x = x - m.shared(np.ones(number))[m.inside][:, None]
-    n, best = len(x), None
+    n, best, straight = len(x), None, np.arange(number)
     if m.dimensions and m.time[m.inside][-1] < BLOCKS:
         return None
-    for cut in np.unique(np.linspace(0.08 * n, 0.92 * n, 22).astype(int)):
-        late = cut > n / 2
-        gap = max(2, n // 44)
-        normal, other = (x[: cut - gap], x[cut + gap :]) if late else (x[cut + gap :], x[: cut - gap])
-        if len(other) < 10 or len(normal) < 2 * number:
+    edges = np.unique(np.linspace(0, n, _PARTS + 1).astype(int))
+    gap = max(2, n // 44)
+    for first, last in itertools.combinations(edges, 2):
+        inside = np.arange(first + (gap if first else 0), last - (gap if last < n else 0))
+        outside = np.r_[: max(first - gap, 0), min(last + gap, n) : n]
+        if len(inside) < max(10, n // 12) or len(outside) < max(2 * number, len(inside)):
             continue
-        mean, P = _usual(m, normal)
-        order, cost = _reorder(other, mean, P)
-        if (order != np.arange(number)).any():
-            ratio = np.log(cost[0] / cost[1])
-            if best is None or ratio * len(other) > best[0]:
-                best = ratio * len(other), cut, late, order, mean, P, normal, other
+        mean, P = _usual(m, x[outside])
+        order, cost = _reorder(x[inside], mean, P)
+        if (order != straight).any():
+            ratio = np.log(cost[0] / cost[1]) * len(inside)
+            if best is None or ratio > best[0]:
+                best = ratio, order, mean, P
     if best is None:
         return None
-    _, cut, late, order, mean, P, normal, other = best
+    _, order, mean, P = best
 
     def misfit(rows, by):
         d = rows[:, by] - mean
         return ((d @ P) * d).sum(1) / number
 
-    straight = np.arange(number)
-    # the row at which exchanging turns from worse to better, and what lies on its side
-    cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
-    total = np.cumsum(cost)
-    edge = int(np.argmin(total) if late else np.argmax(total))
-    normal, other = (x[:edge], x[edge + 1 :]) if late else (x[edge + 1 :], x[:edge])
-    if min(len(normal), len(other)) < 10:
-        return None
+    for again in range(3):  # the rows between which exchanging makes most better, and then what is normal
+        cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
+        first, last = _span(np.concatenate([[0.0], np.cumsum(cost)]))
+        where = np.zeros(n, bool)
+        where[first:last] = True
+        normal, other = x[~where], x[where]
+        if len(normal) < max(10, number) or len(other) < 10:
+            return None
+        if again < 2:
+            mean, P = _usual(m, normal)
+            order = _reorder(other, mean, P)[0]
+            if (order == straight).all():
+                return None
     order = _needed(order, normal, other, mean, P)
     moved = np.flatnonzero(order != straight)
     if not 0 < len(moved) <= _MOST:
@@ -65,26 +74,28 @@ def exchanged(session: Session) -> Finding | None:
     p = sign_flip(gain)
     if p > 0.01:
         return None
-    onset = float(m.time[edge] + m.period / 2)
-    # which side is right nothing says: the channels were in order first
-    order = order if late else np.argsort(order)
+    time, last_time = m.time[m.inside], session.recording.time[-1]
+    begins, ends = float(time[first] - m.period / 2), float(time[last - 1] + m.period / 2)
+    if first == 0 and last < n:  # which side is right nothing says: the channels were in order first
+        order, begins = np.argsort(order), ends
+    if last == n or first == 0:
+        ends = float(last_time)
     channels, source = m.used[moved], m.used[order[moved]]
-    last = session.recording.time[-1]
 
     def correct(counts, at):
         out = counts.copy()
-        rows = at > onset
+        rows = (at > begins) & (at <= ends)
         out[np.ix_(rows, channels)] = counts[np.ix_(rows, source)]
         return out
 
     return Finding(
         "swap",
         tuple(int(k) for k in channels),
-        {"onset": (onset, onset - m.period, onset + m.period)},
+        {"onset": (begins, begins - m.period, begins + m.period)},
         float(gain.sum()),
         p,
-        onset,
-        float(last),
+        begins,
+        ends,
         note=" ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
         clues={
             "nats": float(gain.mean()) / number,
@@ -96,6 +107,17 @@ def exchanged(session: Session) -> Finding | None:
         },
         correct=correct,
     )
+
+
+def _span(total):
+    """First and last row between which a sum (n + 1,) grows most, a side that hardly changes it included."""
+    low = np.minimum.accumulate(total)
+    last = int(np.argmax(total - low))
+    first = int(np.argmin(total[: last + 1]))
+    grown = total[last] - total[first]
+    first = 0 if total[first] - total[0] > -0.02 * grown else first
+    last = len(total) - 1 if total[last] - total[-1] < 0.02 * grown else last
+    return first, last
 
 
 def _needed(order, normal, other, mean, P):

@@ -13,6 +13,7 @@ from .session import Session
 
 __all__ = ["prove", "views"]
 
+_ENOUGH = 1500  # rows, in which what was found in the others would be found again
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
 
@@ -28,8 +29,8 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = by(session, without, finding)
     elif finding.id in _NEUTRAL:
         before, after, floor, unit, name = _again(session, without, finding)
-    elif finding.correct is None or "places" in finding.clues:  # nothing to take out, or it is over by then
-        return
+    elif finding.correct is None or "places" in finding.clues or finding.end < _aside_from(session):
+        return  # nothing to take out, or it is over by then
     else:
         before, after, floor, unit, name = _counts(session, without, finding)
     if not np.isfinite(before):
@@ -53,7 +54,12 @@ def prove(session: Session, finding: Finding) -> None:
 def _aside(session):
     """Model of the session, and which of its bins were kept aside."""
     m = session.model()
-    return m, m.time > session.recording.time[session.fit][-1]
+    return m, m.time > _aside_from(session)
+
+
+def _aside_from(session):
+    """[s] of the last row fitted."""
+    return session.recording.time[session.fit][-1]
 
 
 def _counts(session, without, finding):
@@ -81,7 +87,7 @@ def _counts(session, without, finding):
         else "electrode against what the others say"
     )
     before, early_before, after, early_after = out
-    if np.isfinite(after):
+    if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
         finding.verified = after < before or early_after < early_before
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
 
@@ -141,8 +147,13 @@ def _again(session, without, finding):
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
     ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
+    # where nothing is found in a few rows, they say nothing
+    if not found and (~session.fit).sum() * session.fresh < _ENOUGH:
+        return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]
     floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
+    if found:  # whatever its size
+        finding.verified = True
     late = found[0].parameters[name][0] if found else _NEUTRAL[finding.id]
     text = f"{name}: its distance from none, and from what was fitted"
     return abs(late - _NEUTRAL[finding.id]), abs(late - value), floor, unit, text

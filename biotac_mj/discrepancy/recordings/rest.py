@@ -4,27 +4,30 @@ earlier blocks, say it should."""
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
 
-from .confidence import probability
+from ..noise import noise_level
+from .confidence import unusual
 from .findings import Finding
 from .recording import MIN_ROWS
 from .session import Session
 
-__all__ = ["Rest", "rest"]
+__all__ = ["UNKNOWN", "Rest", "rest"]
 
-_UNKNOWN = 0.33
+UNKNOWN = 0.15  # p up to which something is said to be there that has no name
 
 
 @dataclasses.dataclass
 class Rest:
     """significant; text; cells: dicts (channel, from, to, counts) of what departs, the largest first; clues:
-    numbers that the decision is made of; confidence that something without a name is there."""
+    numbers that the decision is made of; p: share of real recordings without an effect that are as
+    unusual."""
 
     significant: bool
     text: str
     cells: list
     clues: dict
-    confidence: float
+    p: float
 
 
 def rest(session: Session, weak: list[Finding]) -> Rest:
@@ -53,10 +56,10 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["number"] = float(np.log1p(len(seen)))
     clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
-    family = "left_loaded" if session.loaded else "left_unloaded"
-    confidence = probability(family, clues)
+    clues |= _whole(session)
+    p = unusual(clues, session.loaded)
     if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
-        confidence = 0.0
+        p = 1.0
     listed = []
     for i in np.argsort(-np.maximum(parts["level"], parts["aside"]))[:3]:
         w = int(counts[:, i].argmax())
@@ -70,10 +73,48 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
             }
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
-    if confidence > _UNKNOWN:
+    if p <= UNKNOWN:
         text = "; ".join(
             f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
             f"{c['from']:.0f} s to {c['to']:.0f} s"
             for c in listed
         )
-    return Rest(confidence > _UNKNOWN, text, listed, clues, confidence)
+    return Rest(p <= UNKNOWN, text, listed, clues, p)
+
+
+def _whole(session):
+    """Clues that no model of the load is needed for, of the recording less what was named: rhythms, sharp
+    changes, rows that come again, and what is more than noise where noise is all there should be."""
+    r = session.recording
+    rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
+    x, rate = session.counts[rows], r.rate * session.fresh
+    if len(x) < 128:
+        return {"rhythm": 0.0, "sharp": 0.0, "again": 0.0, "low1": 0.0, "low6": 0.0}
+    size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
+    window = np.hanning(size)[:, None]
+    line = np.vander(np.linspace(-1, 1, size), 2)
+    project = line @ np.linalg.pinv(line)
+    parts = [x[a : a + size] for a in range(0, len(x) - size + 1, size // 2)]
+    power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
+    power += (window**2).sum() / 12  # rounding
+    f = np.fft.rfftfreq(size, 1 / rate)
+    around = median_filter(power, (2 * max(4, size // 32) + 1, 1), mode="nearest")
+    band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
+    over = np.log(power / around)[band]
+    low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
+    # from one row to the next, more than noise and than the rows around
+    step = np.abs(np.diff(x, axis=0))
+    usual = uniform_filter1d(step, 21, axis=0)
+    sharp = (step > 6 * noise_level(x) + 2) & (step > 5 * usual)
+    # noise never comes again in all electrodes
+    same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
+    live = np.median(noise_level(x)) > 1.0
+    return {
+        "rhythm": float(over.mean(1).max()),
+        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()),
+        "sharp": float(np.log(sharp.mean() * 1e4 + 1)),
+        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)),
+        "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
+        "low1": float(low.max()),
+        "low6": float(np.sort(low)[-6]),
+    }

@@ -81,8 +81,8 @@ def quantised(session: Session) -> list[Finding]:
     if not len(coarse) or 1 < len(coarse) < 0.5 * told.sum():  # levels that lie far apart look alike
         return []
     q = float(np.median(step[coarse]))
-    # of codes visited by chance every q-th would be one of these
-    strength = [np.log(q) * sum(len(np.unique(b[:, k])) - 1 for k in coarse) for b in blocks]
+    # of codes that noise takes it to by chance every q-th would be one of these
+    strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
     channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
     return [
         _finding(
@@ -123,8 +123,9 @@ def _held(session):
     on = held[start]
     if on.any():
         runs = length[on]
-        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs
-        usual = np.bincount(runs).argmax() + 1
+        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
+        each = [runs[(start[on] * BLOCKS // n) == b] for b in range(BLOCKS)]
+        usual = int(np.quantile([np.bincount(r).argmax() if len(r) else 0 for r in each], 0.25)) + 1
         long = on & (length > usual)
         mask = np.zeros(n, bool)
         for s, k in zip(start[long], length[long]):

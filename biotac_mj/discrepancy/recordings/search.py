@@ -11,7 +11,8 @@ from .between import find_between
 from .confidence import NAMED, confidence
 from .electronics import coloured, correlated, humming, noisy
 from .findings import Finding
-from .gains import gains
+from .gains import gains, undecided
+from .jumps import jumped
 from .levels import levels, settle
 from .order import exchanged
 from .proof import prove, views
@@ -145,10 +146,15 @@ def _search(session, weak, named, bar):
             if finding is None:
                 break
             mine = (None,) if len(finding.channels) > 12 else finding.channels
-            again = find is gains and any(f.channels == finding.channels for f in session.findings)
+            same = [f for f in session.findings if f.channels == finding.channels]
+            again = any(find is gains or "edge" in f.clues for f in same)
             if again or _more_of_the_same(session, finding) or not take(finding):
                 refused.add(mine)
-        if find is levels:
+        if find is gains:
+            for finding in jumped(session):
+                finding.ties = undecided(session, finding.channels[0])
+                take(finding)
+        else:
             settle(session)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
         if finding.id in ("drift", "gain", "flip"):

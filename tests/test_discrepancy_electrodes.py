@@ -1,0 +1,107 @@
+"""What one electrode or some do in a synthetic recording: jumps, exchanges for a while, cross-talk, noise."""
+
+import numpy as np
+import pytest
+from test_discrepancy_recordings import ids, noisy, pressed
+
+from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy.recordings.electronics import correlated
+from biotac_mj.discrepancy.recordings.electronics import noisy as noisier
+from biotac_mj.discrepancy.recordings.gains import gains, undecided
+from biotac_mj.discrepancy.recordings.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.levels import levels
+from biotac_mj.discrepancy.recordings.order import exchanged
+from biotac_mj.discrepancy.recordings.session import Session
+from biotac_mj.sensor.channels import electrode_noise
+
+RATE = 100.0
+
+
+def session(counts, share=0.6):
+    fit = np.arange(len(counts)) < share * len(counts)
+    return Session(Recording(counts, rate=RATE), fit)
+
+
+@pytest.mark.parametrize("back", (False, True))
+def test_a_jump_of_one_electrode_is_found_in_a_few_seconds(back):
+    counts, _, rng = pressed(3, 14)
+    counts = noisy(counts, rng)
+    when = slice(400, 1000 if back else None)
+    counts[when, 6] += 300
+    found = jumped(session(counts))
+    assert [f.channels for f in found] == [(6,)]
+    assert abs(found[0].start - 4.0) < 0.02
+    left = found[0].correct(counts, np.arange(len(counts)) / RATE)[when, 6] - counts[when, 6]
+    assert np.median(left) == pytest.approx(-300, abs=15)
+    assert abs(found[0].parameters["change"][0] - 300) < 15
+    assert "drift" in ids(diagnose_recording(Recording(counts, rate=RATE)))
+
+
+def test_what_several_do_at_once_is_no_jump_of_one():
+    counts, _, rng = pressed(3, 14)
+    counts = noisy(counts, rng)
+    assert not edges(session(counts))
+    counts[400:, 6:12] += 150
+    assert not edges(session(counts))
+
+
+def test_a_jump_is_tied_to_what_the_load_says_afterwards():
+    counts, _, rng = pressed(3, 40)
+    changed = counts.copy()
+    changed[1270:, 6] = 2 * counts[1270, 6] + 500 - changed[1270:, 6]
+    s = session(noisy(changed, rng))
+    assert undecided(s, 6) == ("flip",) and gains(s, set()).id == "flip"
+    changed = counts.copy()
+    changed[1270:, 6] += 150
+    assert undecided(session(noisy(changed, rng)), 6) == ()
+    changed = counts.copy()
+    changed[2395:, 6] += 150  # 50 ms before the rows fitted end
+    assert undecided(session(noisy(changed, rng)), 6) == ("gain", "flip")
+
+
+def test_a_course_of_one_electrode_at_rest_needs_no_long_recording():
+    rng = np.random.default_rng(0)
+    counts = np.tile(rng.uniform(2100, 3300, 19), (1500, 1))
+    assert levels(session(noisy(counts, rng)), set()) is None
+    counts[:, 4] += 40 * np.sin(np.linspace(0, 6, 1500))
+    found = levels(session(noisy(counts, rng)), set())
+    assert found.id == "drift" and found.channels == (4,)
+
+
+def test_channels_exchanged_for_a_while_are_put_back():
+    counts, _, rng = pressed(5, 60)
+    counts = noisy(counts, rng)
+    wrong = counts.copy()
+    wrong[1000:2200, [2, 7, 11]] = counts[1000:2200][:, [7, 11, 2]]
+    found = exchanged(session(wrong))
+    assert found.id == "swap" and set(found.channels) == {2, 7, 11}
+    assert abs(found.start - 10) < 0.3 and abs(found.end - 22) < 0.3
+    again = found.correct(wrong, np.arange(len(wrong)) / RATE)
+    assert (again == counts).mean() > 0.998
+    assert exchanged(session(counts)) is None
+
+
+def test_cross_talk_has_any_pattern_and_one_noise_of_all_is_none():
+    counts, _, rng = pressed(7, 60)
+    own = 4 * rng.standard_normal(counts.shape)
+    assert correlated(session(np.rint(counts + own))) is None
+    mirror = own + 0.4 * own[:, ::-1] * (np.arange(19) != 9)
+    assert correlated(session(np.rint(counts + mirror))).id == "crosstalk"
+    common = own + 8 * rng.standard_normal((len(counts), 1)) * rng.uniform(0.7, 1.3, 19)
+    assert correlated(session(np.rint(counts + common))).id == "common_noise"
+
+
+def test_noise_that_begins_late_is_seen():
+    counts, _, rng = pressed(9, 60)
+    counts = noisy(counts, rng, electrode_noise(np.median(counts, axis=0)))
+    assert not noisier(session(counts))
+    counts[2800:, 12] = np.rint(counts[2800:, 12] + 25 * rng.standard_normal(len(counts) - 2800))
+    assert [f.channels for f in noisier(session(counts))] == [(12,)]
+
+
+def test_seconds_that_are_sent_again_are_unknown():
+    counts, _, rng = pressed(2)
+    counts = noisy(counts, rng)
+    assert not diagnose_recording(Recording(counts, rate=RATE)).rest.significant
+    counts[3000:4200] = np.resize(counts[2900:3000], (1200, 19))
+    assert diagnose_recording(Recording(counts, rate=RATE)).rest.significant
