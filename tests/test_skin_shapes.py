@@ -364,3 +364,15 @@ def test_bad_poses():
         geoms.set_pose([0, 0, 0])
     with pytest.raises(ValueError, match="geom friction coefficients contain NaN"):
         geoms.set_friction([np.nan])
+
+
+@pytest.mark.parametrize("radius", [4e-5, 4e-4, 4e-3])
+def test_a_tiny_mesh_takes_no_more_memory(radius):
+    """A screw, or a model in the wrong unit: the grid's margin is many times the mesh."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    grid = bake_distance_grid(ball.vertices, ball.faces)
+    assert grid.value.size < 2.2e6
+    points = np.array([[0.0, 0.0, 1.2 * radius], [1e-3 + radius, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    _, d, _ = evaluate("mesh", (), points, grids=[grid])
+    np.testing.assert_allclose(d[:2], np.linalg.norm(points[:2], axis=1) - radius, atol=2 * grid.spacing)
+    assert d[2] > 0.9

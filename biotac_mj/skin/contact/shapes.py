@@ -88,7 +88,7 @@ def bake_distance_grid(
     Args:
       vert: (n, 3) [m].
       face: (m, 3), outward orientation.
-      cells: grid cells along the longest side of the mesh.
+      cells: grid cells along the longest side of the mesh, and at most twice as many with the margins.
       margin: how far the grid reaches beyond the mesh [m].
       spacing: of the grid [m], instead of `cells`.
 
@@ -102,7 +102,8 @@ def bake_distance_grid(
         raise ValueError("the mesh is open: its inside is not defined; close its holes")
     low, high = vert.min(0), vert.max(0)
     if spacing is None:
-        spacing = float((high - low).max() / cells)
+        longest = float((high - low).max())
+        spacing = max(longest / cells, (longest + 2 * margin) / (2 * cells))
     mesh = _mesh(vert, face, "cpu")
     scale = 1e3
     shape = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
