@@ -108,12 +108,13 @@ def diagnose(
             notes.append(f"{effect.name} cannot be known: {why}")
         else:
             usable.append(effect.among([data[i] for i in chosen]))
-    with tqdm.tqdm(total=2 + THRESHOLDS["most"], desc="diagnose", disable=not progress, leave=False) as bar:
+    with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress, leave=False) as bar:
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
         comparison = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance, chosen)
+        bar.update()
         null = fit_effects(comparison, [], chosen)
         bar.update()
-        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar.update)
+        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar)
         report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable)
         bar.update()
     return report
