@@ -98,19 +98,35 @@ def compose(
     fit, found, rounds, score = ends[winner]
     if found and found[0].effect.id == winner:
         _rank(found[0], first)
-        # Who tied at first and was carried on has to tie in the end too, without the winner beside it.
+        # Who tied at first and was carried on has to tie in the end too.
         zero = null.evidence(comparison)[chosen]
+        kin = found[0].effect.kin
         found[0].ties = [
-            t
-            for t in found[0].ties
-            if t not in ends
-            or winner not in {c.effect.id for c in ends[t][1]}
-            and _tied(score - zero, ends[t][3] - zero, t in found[0].effect.kin)
+            t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero, t in kin)
         ]
+        if len(found) > 1:  # and in the winner's place, beside the others
+            held = _left_out(comparison, fit, chosen, seed)[chosen]
+            others = [c for c in first if c.effect.id in found[0].ties]
+            swapped = [_instead(comparison, fit, winner, c, chosen, seed) for c in others]
+            found[0].ties = [
+                c.effect.id
+                for c, other in zip(others, swapped)
+                if other is not None and _tied(held - zero, other - zero, c.effect.id in kin)
+            ]
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
     return fit, found, rounds
+
+
+def _instead(comparison, fit, winner, other, chosen, seed):
+    """Evidence (chosen,) left out with another Candidate's effect in the winner's place; None where it is
+    there already."""
+    if any(e.id == other.effect.id for e, _ in fit.effects):
+        return None
+    mine = next(item for item in other.fit.effects if item[0].id == other.effect.id)
+    effects = [mine if e.id == winner else (e, theta) for e, theta in fit.effects]
+    return _left_out(comparison, fit_effects(comparison, effects, chosen, fit), chosen, seed)[chosen]
 
 
 def _simplest(options) -> int:
