@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...effects.catalogue import CATALOGUE
 from ...effects.effect import STAGES
 from ...files import replacing
 from ...recordings.recording import Recording
@@ -277,9 +278,10 @@ def _evidence(report):
             "tab:blue" if any(e["id"] == i for e in report.effects) else "0.7" for i, _, _ in report.ranking
         ],
     )
-    ax.set_yticks(y, [i for i, _, _ in report.ranking], fontsize=8)
+    names = {e.id: e.name for e in CATALOGUE}
+    ax.set_yticks(y, [names.get(i, i) for i, _, _ in report.ranking], fontsize=8)
     ax.axvline(THRESHOLDS["gain"], color="k", lw=0.7, ls=":")
-    ax.set_xlabel("evidence of each cause alone [nats per trajectory left out]; dotted: what is asked for")
+    ax.set_xlabel("evidence of each cause alone [nats]; dotted: asked for", fontsize=8)
     return figure
 
 
