@@ -145,7 +145,7 @@ FEATURES = (
     Feature("hysteresis", "`material.hysteresis`", {"hysteresis": ((0.5, 0.003),)},
             cells=_elastic("hysteresis")),
     Feature("stiffening", "`material.stiffening`", {"stiffening": 40.0}, cells=_elastic("stiffening")),
-    Feature("modulus by element", "`options.modulus`", modulus=True, cells=_elastic("modulus")),
+    Feature("modulus by element", "`options.modulus`", modulus=True),
     Feature("adhesion", _LAW, skin={"contact_law": {"adhesion": 0.3}}, cells=_COULOMB),
     Feature("adhesion with hysteresis", _LAW,
             skin={"contact_law": {"adhesion": 0.1, "adhesion_hysteresis": 4.0, "adhesion_range": 8e-5}},

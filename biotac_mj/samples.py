@@ -23,13 +23,10 @@ __all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
 
 OBJECT, SKIN = "sphere_7mm", "coarse"
 TOUCHES = 20
-_TOUCH, _AWAY = 24, 8  # rows of a touch, and on either side of it
+_TOUCH, _AWAY = 24, 12  # rows of a touch, and on either side of it
 _GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
-_LOGGED, _EVERY = (
-    6,
-    2,
-)  # touches and rows in log.csv: `biotac diagnose` solves the skin in each again and again
+_EVERY = 2  # row in log.csv: `biotac diagnose` solves the skin in each again and again
 _CLEAR = 4e-3  # [m] that the object goes away
 _SET_RATE = 33.0  # [Hz] of the rows that the set takes: eight or nine of a touch
 # what the recorded sensor has and the simulated one lacks, for `biotac diagnose` to find
@@ -40,7 +37,7 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
     """Writes a synthetic recording of touches by a sphere in the forms that people have, and a set of it.
 
     electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
-    log.csv has all channels and the sphere's pose beside them for the first touches; set/ is all touches with
+    log.csv has all channels and the sphere's pose beside them, every other row; set/ is all touches with
     the simulated skin under them, for `biotac train`.
 
     Args:
@@ -58,7 +55,6 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
     out = [folder / name for name in ("electrodes.txt", "forces.txt", "log.csv", "set")]
     _write(out[0], recording.electrodes, "%.0f")
     _write(out[1], recording.force, "%.4f")
-    logged = slice(0, _BEFORE + _LOGGED * (_TOUCH + 2 * _AWAY), _EVERY)
     columns = {
         "time": recording.time,
         **{f"e{i + 1}": column for i, column in enumerate(recording.electrodes.T)},
@@ -67,7 +63,7 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
         **{f"object_pos_{a}": column for a, column in zip("xyz", recording.object_pos.T)},
         **{f"object_q{a}": column for a, column in zip("wxyz", recording.object_quat.T)},
     }
-    _write(out[2], np.column_stack(list(columns.values()))[logged], "%.9g", ",".join(columns))
+    _write(out[2], np.column_stack(list(columns.values()))[::_EVERY], "%.9g", ",".join(columns))
     options = ResimulateOptions(skin=SKIN, rate=_SET_RATE, batch=TOUCHES, seed=seed)
     resimulate(recording, out[3], options, workers=0, progress=progress)
     return out
@@ -135,7 +131,8 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
 
 def _way(ways):
     """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back."""
-    out = np.r_[np.full(_AWAY - _AWAY // 2, 1.0), np.linspace(1, 0, _AWAY // 2, endpoint=False)][:, None]
+    # Slow where it meets the skin, as electrodes are read some milliseconds after they feel.
+    out = np.r_[1.0, 1.0, np.linspace(1, 0, _AWAY - 2, endpoint=False) ** 2][:, None]
     pos, mat = [], []
     for way in ways:
         inside = way.pos[0] + _GENTLE * (way.pos - way.pos[0])

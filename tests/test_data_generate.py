@@ -458,7 +458,5 @@ def test_what_cannot_vary_is_refused():
         with pytest.raises(ValueError, match=match):
             making.Maker(GenerateOptions(skin="coarse", labelled=0, vary=vary), {})
     options = GenerateOptions(skin="coarse", material={"prony": [[0.3, 0.1]]}, tier="condensed", labelled=0)
-    with pytest.raises(
-        ValueError, match="the condensed tier is elastic, the same everywhere: leave prony out"
-    ):
+    with pytest.raises(ValueError, match="the condensed tier is elastic: leave prony out"):
         making.Maker(options, {})

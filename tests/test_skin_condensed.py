@@ -116,6 +116,18 @@ def test_force_is_that_of_the_full_fem_on_the_default_skin():
         assert abs(c.memory.pressure - pressure) < 0.2 * pressure
 
 
+def test_rubber_that_varies_with_place_changes_what_it_changes_in_the_full_fem(both):
+    """Twice as stiff towards the tip: the change of force and of the nodes under the sphere, per element."""
+    plain, depths, full, condensed = both
+    geometry = plain.geometry
+    at = geometry.vert[geometry.elem[:, :4]].mean(1)
+    model = SkinModel(geometry, modulus=np.clip(1 - 100 * (at[:, 0] + 12e-3), 0.5, 2.0))
+    for k, (f, c) in enumerate(zip(*press_both(model, depths[:4]))):
+        change = f[0][:3] - full[k][0][:3], c.wrench[0, :3] - condensed[k].wrench[0, :3]
+        assert np.linalg.norm(change[0]) > 0.02 * np.linalg.norm(f[0][:3])
+        assert np.linalg.norm(change[1] - change[0]) < 0.2 * np.linalg.norm(change[0])
+
+
 def test_film_and_counts_are_those_of_the_full_fem(both):
     model, depths, full, condensed = both
     geometry = model.geometry

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bars import AREA, LENGTH, NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
+from bars import AREA, LENGTH, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import box, skin
 from forces import Elements
 
@@ -205,7 +205,3 @@ def test_what_cannot_be_is_refused():
     for bad in (np.ones(48), np.ones((2, 48)), np.full((1, 48), np.nan), np.zeros((1, 48))):
         with pytest.raises(ValueError, match=r"pass positive factors of shape \(1, 48\)"):
             SkinData(model, modulus=bad)
-    from biotac_mj.skin.condensed import CondensedSkin
-
-    with pytest.raises(ValueError, match="the same everywhere: leave modulus out"):
-        CondensedSkin(model, NOTHING)

@@ -151,7 +151,7 @@ def _samples(args):
     electrodes, forces, log, made = make_samples(args.out, args.seed, not args.quiet)
     print("synthetic, made by the simulation. Next:")
     print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
-    print(f"  biotac diagnose {log} --object {OBJECT}  # some minutes: the skin is solved again and again")
+    print(f"  biotac diagnose {log} --object {OBJECT}  # a minute or two: the skin is solved again and again")
     print(f"  biotac train {made} --no-paper --seeds 0 --splits trajectory")
 
 

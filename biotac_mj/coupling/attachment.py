@@ -274,8 +274,7 @@ def _check(config, geometry):
         material, options, modulus = skin_settings(config)
         liquid = config.liquid if options.liquid is None else options.liquid
         if config.tier == "condensed":
-            rubber = (*([] if modulus is None else ["modulus"]), *material.extensions)
-            refuse(rubber, options, liquid, config.device.startswith("cuda"))
+            refuse(material.extensions, options, liquid, config.device.startswith("cuda"))
         if modulus is not None:
             check_modulus(modulus, len(geometry.elem), f"{len(geometry.elem)} elements of {geometry.name!r}")
     if config.device != "cpu":

@@ -140,7 +140,7 @@ class Maker:
         model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
         self.geometry = model.geometry  # with all nodes that are solved
         if options.tier == "condensed":
-            refuse(model.rubber_options, skin, model.has_liquid, model.device.is_cuda)
+            refuse(model.material.extensions, skin, model.has_liquid, model.device.is_cuda)
         self.attributes = {
             "settings": settings,
             "skin": options.skin,

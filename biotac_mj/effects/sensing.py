@@ -177,7 +177,7 @@ class Saturation(Effect):
 
 class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
-    physics = "tau dV/dt + V = U"
+    physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     law = LAW
     confusable = {"latency": "two speeds a decade apart and a tap"}
@@ -189,7 +189,7 @@ class LowPass(Effect):
 
 class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
-    physics = "V(t - d)"
+    physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 

@@ -210,7 +210,7 @@ class SkinModel:
         clear of it.
       modulus: rubber that is not the same everywhere: factors on Young's modulus, (nelem,) one for each
         element of the given geometry, or a function of rest positions (n, 3) [m] that gives (n,), asked at
-        the centroids of the elements that are solved. Full tier.
+        the centroids of the elements that are solved.
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.

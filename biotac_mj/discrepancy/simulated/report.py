@@ -18,7 +18,7 @@ from .diagnosis import Finding, Simulated, names
 __all__ = ["draw", "simulated_dict", "summary", "write_simulated"]
 
 _SHOWN = 6  # cells of a sensor in the summary
-_TRIED = {"has": "without what the model has", "lacks": "with it", "fits": "a fit, no reason"}
+_TRIED = {"has": " (in the model)", "lacks": "", "fits": " (a fit, no reason)"}
 
 
 def simulated_dict(found: Simulated) -> dict:
@@ -91,35 +91,65 @@ def _finding(f: Finding, found: Simulated) -> dict:
     }
 
 
+def headline(found: Simulated) -> str:
+    """The verdict in one sentence for who has never seen a report: the largest gap, what closes it, by how
+    much."""
+    by_id = {f.id: f for f in found.findings}
+    named = [by_id[i] for i in found.named]
+    gaps = []
+    for k, s in enumerate(found.sensors):
+        error = np.sqrt((s.judged.error[:, s.worst] ** 2).mean())
+        gap = f"at {names(s.worst)} of {s.name}, {error:.0f} counts RMS"
+        gaps.append(gap + (f" ({named[0].tested[k].worst.after:.0f} with {named[0].name})" if named else ""))
+    if not any(c.red for s in found.sensors for c in s.cells):
+        return f"Sensor and simulation agree within noise and the fit's uncertainty; most differ {gaps[0]}."
+    if not named:
+        what = "no mechanism that was tried takes it away"
+        what += " from every sensor" if len(found.sensors) > 1 else ""
+    else:
+        what = f"{named[0].name} explains it best"
+        what += f", not told apart from {' and '.join(f.name for f in named[1:])}" if named[1:] else ""
+    return f"The largest gap between sensor and simulation is {' and '.join(gaps)}; {what}."
+
+
 def summary(found: Simulated) -> str:
-    """Text for the terminal."""
-    lines = [f"verdict: {found.verdict}"]
-    for s in found.sensors:
-        red = [c for c in s.cells if c.red]
-        lines.append(
-            f"  {s.name}: RMS {np.sqrt((s.judged.error**2).mean()):.0f} counts, {len(red)} of {len(s.cells)} "
-            f"cells above noise and the fit's own uncertainty; most at {names(s.worst)}"
-        )
-        for c in red[:_SHOWN]:
+    """Text for the terminal: one sentence, a table of what was tried, where it is, the verdict's words."""
+    lines = [headline(found), ""]
+    labels = [f.name + _TRIED[f.kind] for f in found.findings]
+    width = max(map(len, labels), default=0) + 2
+    wide = max(len(s.name) for s in found.sensors)
+    lines.append(
+        f"  {'tried':{width}}{'sensor':{wide}}{'worst electrodes':>20}{'all electrodes':>20}  whose it is"
+    )
+    for f, label in zip(found.findings, labels):
+        for k, (s, t) in enumerate(zip(found.sensors, f.tested)):
+            cells = [f"{c.before:.0f} -> {c.after:.0f} ({c.p:.1g})" for c in (t.worst, t.all)]
             lines.append(
-                f"    e{c.channel + 1} {c.view} {c.part}: {c.rms:.0f} counts, {c.expected:.0f} expected"
+                f"  {label if not k else '':{width}}{s.name:{wide}}{cells[0]:>20}{cells[1]:>20}"
+                f"  {f.whose if not k else ''}"
             )
-    lines.append("  RMS on blocks not fitted on, first 70 %, worst electrodes (p); all (p); value by halves:")
-    for f in found.findings:
-        lines.append(f"  {f.name} [{STAGES[f.stage]}], {_TRIED[f.kind]}: {f.whose}")
-        for s, t in zip(found.sensors, f.tested):
-            value = f"; {f.parameter} {', '.join(f'{v:.3g}' for v in t.value)} {f.unit}" if t.value else ""
-            lines.append(
-                f"    {s.name}: {t.worst.before:.0f} -> {t.worst.after:.0f} ({t.worst.p:.2g}); "
-                f"{t.all.before:.0f} -> {t.all.after:.0f} ({t.all.p:.2g}){value}"
-            )
+            if t.value:
+                values = ", ".join(f"{v:.3g}" for v in t.value) + ("" if f.unit == "1" else f" {f.unit}")
+                lines.append(f"    {f.parameter} {values}, from either half of the rows")
             if t.locked:
                 (a, b), (c, d) = t.locked["worst"], t.locked["all"]
-                lines.append(f"      locked rows: {a:.0f} -> {b:.0f}; {c:.0f} -> {d:.0f}")
+                lines.append(f"    on rows kept aside {a:.0f} -> {b:.0f}, all electrodes {c:.0f} -> {d:.0f}")
         if f.id in found.named and attached(f):
             lines += [
                 f"    a simulated {name}: attach(spec, **{one})" for name, one in _by_sensor(f, found).items()
             ]
+    lines.append(
+        "  (RMS [counts] without -> with it on rows that it was not fitted to; in brackets how often chance "
+        "gives as much)"
+    )
+    for s in found.sensors:
+        red = [c for c in s.cells if c.red]
+        lines.append(f"  {s.name}: {len(red)} of {len(s.cells)} cells (electrode, condition) are off, first")
+        lines += [
+            f"    e{c.channel + 1} {c.view} {c.part}: {c.rms:.0f} counts, {c.expected:.0f} expected"
+            for c in red[:_SHOWN]
+        ]
+    lines.append(f"  verdict: {found.verdict}")
     acts = acting(found)
     if acts:
         lines.append(f"  in sensor_amended.yaml, as {found.sensors[0].name} has it: {acts.name}")

@@ -3,9 +3,9 @@ further beams; at the end each has to be needed."""
 
 import dataclasses
 import typing
-from collections.abc import Callable
 
 import numpy as np
+import tqdm
 
 from ..evidence import benjamini_hochberg, sign_flip
 from .fitting import Fit, fit_effects
@@ -19,6 +19,7 @@ __all__ = ["Candidate", "compose"]
 
 _SETUP = {"misalign", "depth0"}  # on every short list: what most often is wrong, and cheap to look at
 _BEAMS = 3
+_FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
 
 @dataclasses.dataclass
@@ -59,16 +60,19 @@ def compose(
     usable: list,
     chosen: np.ndarray,
     seed: int,
-    tick: Callable[[], object] = lambda: None,
+    bar: tqdm.tqdm | None = None,
 ) -> tuple[Fit, list, list]:
     """The composition that trajectories left out like best.
+
+    Args:
+      bar: of the fits, which are counted as they are found to be needed.
 
     Returns:
       fit: Fit; found: list of Candidate, in the order of their acceptance; rounds: lists of Candidate of the
         winning beam, best first.
     """
-    first = _round(comparison, null, null, usable, chosen, seed)
-    tick()
+    bar = tqdm.tqdm(total=0, disable=True) if bar is None else bar
+    first = _round(comparison, null, null, usable, chosen, seed, bar)
     accepted = [c for c in first if not c.refused]
     if not accepted:
         return null, [], [first]
@@ -78,9 +82,8 @@ def compose(
     for start in tied[:_BEAMS]:
         fit, found, rounds = start.fit, [start], [first]
         while len(found) < THRESHOLDS["most"]:
-            step = _round(comparison, fit, null, usable, chosen, seed)
+            step = _round(comparison, fit, null, usable, chosen, seed, bar)
             rounds.append(step)
-            tick()
             able = [c for c in step if not c.refused]
             if not able:
                 break
@@ -97,15 +100,33 @@ def compose(
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
         zero = null.evidence(comparison)[chosen]
+        kin = found[0].effect.kin
         found[0].ties = [
-            t
-            for t in found[0].ties
-            if t not in ends or _tied(score - zero, ends[t][3] - zero, t in found[0].effect.kin)
+            t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero, t in kin)
         ]
+        if len(found) > 1:  # and in the winner's place, beside the others
+            held = _left_out(comparison, fit, chosen, seed)[chosen]
+            others = [c for c in first if c.effect.id in found[0].ties]
+            swapped = [_instead(comparison, fit, winner, c, chosen, seed) for c in others]
+            found[0].ties = [
+                c.effect.id
+                for c, other in zip(others, swapped)
+                if other is not None and _tied(held - zero, other - zero, c.effect.id in kin)
+            ]
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
     return fit, found, rounds
+
+
+def _instead(comparison, fit, winner, other, chosen, seed):
+    """Evidence (chosen,) left out with another Candidate's effect in the winner's place; None where it is
+    there already."""
+    if any(e.id == other.effect.id for e, _ in fit.effects):
+        return None
+    mine = next(item for item in other.fit.effects if item[0].id == other.effect.id)
+    effects = [mine if e.id == winner else (e, theta) for e, theta in fit.effects]
+    return _left_out(comparison, fit_effects(comparison, effects, chosen, fit), chosen, seed)[chosen]
 
 
 def _simplest(options) -> int:
@@ -144,8 +165,9 @@ def _rank(best, step):
     )
 
 
-def _round(comparison, current, null, effects, chosen, seed):
+def _round(comparison, current, null, effects, chosen, seed, bar):
     """Screen, then refit the short list with cross-validation by trajectory; Candidates, best first."""
+    bar.set_description(" + ".join(["diagnose", *(e.name for e, _ in current.effects)]))
     known = {e.id for e, _ in current.effects}
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
@@ -159,10 +181,13 @@ def _round(comparison, current, null, effects, chosen, seed):
     )
     excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
     out = []
+    bar.total += len(short)
     for _, effect, start in short:
         trial = [*current.effects, (effect, start)]
         fit = fit_effects(comparison, trial, chosen, current)
-        held = _left_out(comparison, fit, chosen, seed)[chosen]
+        held = fit.evidence(comparison)[chosen]
+        if not _hopeless(held - reference[chosen], out, effect, bool(known)):
+            held = _left_out(comparison, fit, chosen, seed)[chosen]
         gain = held - reference[chosen]
         left = fit.mean_square(comparison)[chosen]
         energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
@@ -179,9 +204,21 @@ def _round(comparison, current, null, effects, chosen, seed):
         )
         one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects])
         out.append(one)
+        bar.update()
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
+
+
+def _hopeless(gain, others, effect, beside) -> bool:
+    """Whether a gain (chosen,) on the very trajectories that were fitted, which flatters, is too little to be
+    accepted, or so far behind one of the Candidates that it neither wins nor ties nor lowers its lead."""
+    if gain.mean() <= THRESHOLDS["further" if beside else "gain"]:
+        return True
+    return any(
+        not c.refused and _ahead(c.gain - gain, _FAR) and not _tied(c.gain, gain, effect.id in c.effect.kin)
+        for c in others
+    )
 
 
 def _left_out(comparison, whole, chosen, seed, folds=3):

@@ -11,15 +11,17 @@ from .trajectory import Trajectory
 
 __all__ = ["trajectories_of"]
 
-_ROWS = 60  # of a contact: the skin is solved in each, and more of them share their errors
+_ROWS = 40  # of a contact: the skin is solved in each, and more of them share their errors
 _AFTER = 0.3  # [s] of a contact's end, without touch
+# [m] from the skin, or from row to row: on the way elsewhere, where a straight line may cross the finger
+_LEFT = 2e-3
 
 
 def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[list[Trajectory], list[str]]:
     """The contacts of recordings that hold the object's pose, and notes on what was assumed.
 
     Where the sensor's pose is there too, object and force are taken to its frame, else they are in it. A
-    force that pulls in touch is the one on the sensor and is turned round. Of each contact at most 60 rows
+    force that pulls in touch is the one on the sensor and is turned round. Of each contact at most 40 rows
     are kept, evenly by travel and time.
 
     Args:
@@ -39,7 +41,7 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
         gap = placed.nearest(surface)
         found = [
             _contact(recording, clock, rows, pos, mat, force, counts)
-            for rows in _contacts(recording.time, gap)
+            for rows in _contacts(recording.time, pos, gap)
         ]
         if not found:
             raise ValueError(
@@ -83,8 +85,9 @@ def _in_sensor(recording):
     return pos, mat, force
 
 
-def _contacts(time, gap):
-    """Rows (k,) of every contact: the last one before it, those of it, and what follows without touch."""
+def _contacts(time, pos, gap):
+    """Rows (k,) of every contact: the last one before it, those of it, and what follows near the skin."""
+    stride = np.linalg.norm(np.diff(pos, axis=0, prepend=pos[:1]), axis=1)
     touch = np.concatenate([[False], gap <= 0, [False]])
     change = np.diff(touch.astype(int))
     first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
@@ -92,7 +95,8 @@ def _contacts(time, gap):
     out = []
     for k, (a, b) in enumerate(zip(first, last)):
         end = first[k + 1] - 1 if k + 1 < len(first) else len(time)
-        after = b + int(np.searchsorted(time[b:end], time[b - 1] + _AFTER))
+        near = (time[b:end] < time[b - 1] + _AFTER) & (gap[b:end] < _LEFT) & (stride[b:end] < _LEFT)
+        after = b + int(np.logical_and.accumulate(near).sum())
         rows = np.arange(a - 1, after)
         if len(rows) >= 8:
             out.append(rows)
@@ -102,11 +106,12 @@ def _contacts(time, gap):
 def _contact(recording, clock, rows, pos, mat, force, counts):
     """A Trajectory of rows of a recording, thinned."""
     time = recording.time[rows]
-    travel = np.linalg.norm(np.diff(pos[rows], axis=0), axis=1)
-    gone = np.concatenate([[0], np.cumsum(travel / max(travel.sum(), 1e-9) + np.diff(time) / np.ptp(time))])
-    rows = rows[
-        np.unique(np.searchsorted(gone, np.linspace(0, gone[-1] * (1 - 1e-9), min(_ROWS, len(rows)))))
-    ]
+    if len(rows) > _ROWS:
+        travel = np.linalg.norm(np.diff(pos[rows], axis=0), axis=1)
+        gone = np.concatenate(
+            [[0], np.cumsum(travel / max(travel.sum(), 1e-9) + np.diff(time) / np.ptp(time))]
+        )
+        rows = rows[np.unique(np.searchsorted(gone, np.linspace(0, gone[-1] * (1 - 1e-9), _ROWS)))]
 
     def of(value, unit="counts"):
         there = value is not None and np.isfinite(value[rows]).all()

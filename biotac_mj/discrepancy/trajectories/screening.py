@@ -17,6 +17,7 @@ __all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "scree
 
 # Friction is no part of it: what it is off by has a name.
 _STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2}
+_SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 _RIDGE = 0.01  # of signatures, whose squares are nats
 
 
@@ -131,11 +132,8 @@ def isolability(
         for i in range(n):
             s = spaces[i][:, np.argmax(np.linalg.norm(spaces[i], axis=0))]
             M[i, j] = np.linalg.norm(s - basis @ (basis.T @ s)) ** 2 / max(s @ s, 1e-30)
-    notes = [
-        f"your data cannot show {e.name}: {v:.1f} nats per trajectory at a realistic size"
-        for e, v in zip(usable, size)
-        if v * len(chosen) < 3
-    ]
+    unseen = [e.name for e, v in zip(usable, size) if v * len(chosen) < _SEEN]
+    notes = [f"too small to show in these data at a realistic size: {', '.join(unseen)}"] if unseen else []
     return {"ids": ids, "matrix": M.tolist(), "nats": size, "notes": notes}
 
 
@@ -152,15 +150,15 @@ def next_experiment(effects: list, isolability: dict) -> str:
         text = effect["confusable"].get(other) or next(
             (e.confusable.get(effect["id"]) for e in CATALOGUE if e.id == other), None
         )
-        ids = isolability["ids"]
-        nats = ""
+        ids, own = isolability["ids"], ""
         if effect["id"] in ids and other in ids:
-            share = isolability["matrix"][ids.index(effect["id"])][ids.index(other)]
-            left = share * isolability["nats"][ids.index(effect["id"])]
-            count = int(np.ceil(3 / max(left, 1e-3)))
-            nats = (
-                f" (here {share:.0%} of its signature is its own, {left:.1f} nats per trajectory: "
-                f"{count} trajectories make 3 nats)"
+            i, j = ids.index(effect["id"]), ids.index(other)
+            share = isolability["matrix"][i][j]
+            count = int(np.ceil(_SEEN / max(share * isolability["nats"][i], 1e-3)))
+            own = f" (here {share:.0%} of what it does is its own" + (
+                f": about {count} trajectories like these are needed)" if count > 1 else ")"
             )
-        out.append(f"{effect['name']} or {other}: {text or 'vary load, speed and hold together less'}{nats}")
+        name = next((e.name for e in CATALOGUE if e.id == other), other)
+        how = text or "vary load, speed and hold together less"
+        out.append(f"to tell {effect['name']} from {name}: {how}{own}")
     return "; ".join(out) or "none needed: nothing was named, or nothing is tied"

@@ -213,24 +213,24 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 14 solutions of the data set, three of them by
-        finite elements, kept in `cache`."""
+        """The skin along the trajectories and its differences: 13 solutions of the data set, kept in
+        `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
         with tqdm.tqdm(
-            total=(13 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+            total=(12 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
         ) as bar:
             tick = bar.update
             base = self.solve(trajectories, progress=tick)
             slopes = {}
+            # What the whole skin differs by is taken from the condensed tier, whose price is seconds.
+            quick = self if self.tier == "condensed" else self._but(tier="condensed")
+            here = base if quick is self else quick.solve(trajectories)
             if self.skin in OTHER_MESH:
-                here, there = (
-                    self._but(skin=skin, tier="condensed").solve(trajectories)
-                    for skin in (self.skin, OTHER_MESH[self.skin])
-                )
+                there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
                 slopes["mesh"] = [
                     {k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)
                 ]
-                tick(len(trajectories))
+            slopes |= quick._uneven(trajectories, here, tick)
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
@@ -247,7 +247,6 @@ class Simulator:
                     base,
                     _RADIUS,
                 )
-            slopes |= self._uneven(trajectories, tick)
             less, more = (self.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
             slopes["friction"], slopes["friction2"] = _parabola(less, base, more, *_FRICTION)
             slopes["bubble"] = _difference(
@@ -271,20 +270,17 @@ class Simulator:
                 press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
         return {"press": press, "bend": bend}
 
-    def _uneven(self, trajectories, tick):
-        """Differences by a modulus that varies along and across the finger, which only elements can have."""
+    def _uneven(self, trajectories, base, tick):
+        """Differences by a modulus that varies along and across the finger."""
         given = read_settings(self.material, self.options).modulus
         geometry = load_skin(self.skin)
         at = geometry.vert[geometry.elem[:, :4]].mean(1)
-        factors = {"": np.ones(len(at))} | {
-            way: modulus_of({"along": 0.0, "across": 0.0, way: _UNEVEN})(at) for way in _MAPS
-        }
-        solved = {}
-        for way, factor in factors.items():
-            own = 1.0 if given is None else np.asarray(given(at) if callable(given) else given)
-            other = self._but(tier="full", options=self.options | {"modulus": own * factor})
-            solved[way] = other.solve(trajectories, progress=tick)
-        return {way: _difference(solved[way], solved[""], _UNEVEN) for way in _MAPS}
+        own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
+        for way in _MAPS:
+            factor = modulus_of({"along": 0.0, "across": 0.0, way: _UNEVEN})(at)
+            other = self._but(options=self.options | {"modulus": own * factor})
+            out[way] = _difference(other.solve(trajectories, progress=tick), base, _UNEVEN)
+        return out
 
     # --- all stages  ---
 
@@ -472,11 +468,12 @@ def _stiffness(base, slopes, t):
 
 
 def _impedance(film, vert_xpos):
-    """(n, 19) [ohm]; a row whose film has no solution keeps the last one."""
+    """(n, 19) [ohm]; a row whose film has no solution keeps the last one, as does one that has not moved."""
     rows, last = [], None
-    for x in vert_xpos:
+    for x, before in zip(vert_xpos, [None, *vert_xpos]):
         try:
-            last = film.impedance(x)
+            if before is None or not np.array_equal(x, before):
+                last = film.impedance(x)
         except ValueError:
             if last is None:
                 raise

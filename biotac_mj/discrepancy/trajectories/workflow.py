@@ -36,8 +36,9 @@ class Report:
       before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
         them.
       isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
-      fit: Fit. comparison, selection, locked: what it was made of. trace: numbers that thresholds are set on,
-        as a file can hold them.
+      fit: Fit. comparison, selection, locked: what it was made of. residuals: (before, after), of every
+        locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
+        file can hold them.
     """
 
     verdict: str
@@ -54,6 +55,7 @@ class Report:
     comparison: Comparison
     selection: np.ndarray
     locked: np.ndarray
+    residuals: tuple
     remainder: str = ""
     trace: dict = dataclasses.field(default_factory=dict)
 
@@ -108,12 +110,13 @@ def diagnose(
             notes.append(f"{effect.name} cannot be known: {why}")
         else:
             usable.append(effect.among([data[i] for i in chosen]))
-    with tqdm.tqdm(total=2 + THRESHOLDS["most"], desc="diagnose", disable=not progress, leave=False) as bar:
+    with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress, leave=False) as bar:
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
         comparison = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance, chosen)
+        bar.update()
         null = fit_effects(comparison, [], chosen)
         bar.update()
-        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar.update)
+        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar)
         report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable)
         bar.update()
     return report
@@ -144,8 +147,9 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
     left = _excess(square[1])
     inside = 1 - left / max(_excess(square[0]), left, 1e-9)
+    names = {e.id: e.name for e in usable}
     effects = [
-        _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)))
+        _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
         for item in found
     ]
     named = inside >= THRESHOLDS["named"] or not _wrong(after)
@@ -157,8 +161,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         )
     else:
         parts = [
-            e["name"]
-            + (f" (behaves like {', '.join(e['ties'])} too: not distinguished)" if e["ties"] else "")
+            e["name"] + (f" (or {' or '.join(e['tie_names'])}: not told apart)" if e["ties"] else "")
             for e in effects
         ]
         if effects and named:
@@ -171,7 +174,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
                 else f"unknown ({remainder})"
             )
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
-    gap_before, gap_after = _gap(comparison, null, aside), _gap(comparison, current, aside)
+    (gap_before, first), (gap_after, last) = (_gap(comparison, fit, aside) for fit in (null, current))
     outside = [_excess(g["mean_square"]) for g in (gap_before, gap_after)]
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if found or _wrong(before) else float("nan")
     notes = notes + _base(comparison, current, chosen)
@@ -201,12 +204,13 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         comparison,
         chosen,
         aside,
+        (first, last),
         remainder,
         trace,
     )
 
 
-def _describe(item, current, certain) -> dict:
+def _describe(item, current, certain, names) -> dict:
     theta = next(th for e, th in current.effects if e.id == item.effect.id)
     parameters = []
     for name, value in theta.items():
@@ -229,6 +233,7 @@ def _describe(item, current, certain) -> dict:
         "physics": item.effect.physics,
         "parameters": parameters,
         "ties": item.ties,
+        "tie_names": [names[t] for t in item.ties],
         "p": item.p,
         "q": item.q,
         "nats": item.nats,
@@ -244,7 +249,7 @@ def _gap(comparison, fit, rows):
     for name, part in comparison.groups.items():
         out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
     out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
-    return out
+    return out, [residual[i] for i in rows]
 
 
 def _base(comparison, fit, chosen) -> list:

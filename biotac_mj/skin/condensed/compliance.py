@@ -225,6 +225,7 @@ class SurfaceCompliance:
         mesh = [model.geometry.vert, model._elem, model.geometry.inner_face, model.free, model.element]
         rest = [model.rest.vert, model.rest.pressure, model.has_liquid] if model.rest.pressure else []
         law = [m.law, m.youngs_modulus, m.poissons_ratio]
+        law += [] if model.modulus is None else [model.modulus]
         return [*mesh, *law, *rest, self._outer, self._inner, self._direction]
 
     def _digest(self):

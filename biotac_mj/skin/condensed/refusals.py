@@ -9,11 +9,11 @@ def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_c
     """Refuses settings of a skin that the condensed tier does not have.
 
     Args:
-      rubber: what the rubber has beyond its law, `SkinModel.rubber_options`.
+      rubber: what the material has beyond its law, `Material.extensions`.
       options: SkinOptions. has_liquid: whether the skin is filled. on_cuda: whether it is on a CUDA device.
 
     Raises:
-      ValueError: CUDA, inertia, rubber that remembers, stiffens or varies with place, a contact law, or less
+      ValueError: CUDA, inertia, rubber that remembers or stiffens, a contact law, or less
         liquid than the unstressed skin holds.
     """
     if on_cuda:
@@ -22,8 +22,7 @@ def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_c
         raise ValueError("the condensed tier has no inertia: choose dynamics='quasistatic' or the full tier")
     if rubber:
         raise ValueError(
-            "the condensed tier is elastic, the same everywhere: leave "
-            f"{' and '.join(rubber)} out, or choose the full tier"
+            f"the condensed tier is elastic: leave {' and '.join(rubber)} out, or choose the full tier"
         )
     if options.contact_law is not None:
         raise ValueError(

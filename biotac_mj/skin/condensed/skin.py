@@ -119,7 +119,7 @@ class CondensedSkin:
     """
 
     def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 2.5):
-        refuse(model.rubber_options, model.options, model.has_liquid, model.device.is_cuda)
+        refuse(model.material.extensions, model.options, model.has_liquid, model.device.is_cuda)
         self.model, self.geoms, self.patience = model, geoms, patience
         self.correction = correction(model.material.law)
         g = model.geometry
