@@ -382,6 +382,31 @@ def pressing(shape, timestep=0.002, **settings):
     return scene(f'<body name="probe" mocap="true" pos="0 0 .03">{shape}</body>', timestep, **settings)
 
 
+@pytest.mark.parametrize("tier", ["full", "condensed"])
+def test_pressure_on_the_skin_adds_up_to_the_force(tier):
+    """Without friction all of it is pressure; it is where the ball is, and gone with it."""
+    model, data, handle = pressing(
+        f'<geom type="sphere" size="{RADIUS}" friction="0"/>', friction=0.0, tier=tier
+    )
+    mujoco.mj_step(model, data)
+    assert not handle.contact_pressure(model, data).any()
+    data.mocap_pos[0] = [0, 0, TOP + RADIUS - 4e-4]
+    mujoco.mj_step(model, data, 2)
+    pressure, vert = handle.contact_pressure(model, data), handle.vert_xpos(model, data)
+    corner = vert[load_skin("coarse").outer_face]
+    area = np.zeros_like(vert)
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+    np.add.at(area, load_skin("coarse").outer_face, across[:, None])
+    force = handle.read(data, "contact_force")[:3]
+    assert np.linalg.norm(force) > 0.1
+    np.testing.assert_allclose(-(pressure[:, None] * area).sum(0), force, atol=0.03 * np.linalg.norm(force))
+    pressed = vert[pressure > 0.1 * pressure.max()]
+    assert np.ptp(pressed, axis=0).max() < RADIUS and pressure.min() > -1e-3 * pressure.max()
+    data.mocap_pos[0] = [0, 0, 0.03]
+    mujoco.mj_step(model, data)
+    assert not handle.contact_pressure(model, data).any()
+
+
 def test_a_geom_deep_in_the_core_is_told_and_survived():
     model, data, handle = pressing(f'<geom name="probe" type="sphere" size="{RADIUS}"/>')
     mujoco.mj_step(model, data)

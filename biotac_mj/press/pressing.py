@@ -99,7 +99,7 @@ def press(
         pac=pac,
         nonconverged=nonconverged,
         vert_xpos=xpos.astype(np.float32),
-        contact_pressure=pressure.astype(np.float32),
+        contact_pressure=None if pressure[0] is None else pressure.astype(np.float32),
         indenter_pos=position,
         indenter_quat=np.tile(path.quat, (len(times), 1)),
         indenter_vert=indenter.vert,

@@ -374,12 +374,13 @@ def play_model(
 
     skins = {name: load_skin(h.config.skin) for name, h in handles.items()}
     films = {name: _under(skin) for name, skin in skins.items()}
-    if page is None:
-        fingers = {
-            name: Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS)) for name, h in handles.items()
-        }
-        page = Page(fingers, **server)
     mujoco.mj_forward(model, data)
+    if page is None:
+        fingers = {}
+        for name, h in handles.items():
+            known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
+            fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
+        page = Page(fingers, **server)
     scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
 
