@@ -14,8 +14,8 @@ import numpy as np
 import biotac_mj
 from biotac_mj.geometry import load_skin
 from biotac_mj.tasks.hands import HANDS
-from biotac_mj.tasks.mounting import light, side_view
-from biotac_mj.view.offscreen import Offscreen, find_gl
+from biotac_mj.tasks.mounting import side_view
+from biotac_mj.view.offscreen import Offscreen, find_gl, stage
 
 MODELS = {  # in the Menagerie
     "shadow_hand": "shadow_hand/right_hand.xml",
@@ -43,7 +43,7 @@ def press(path, hand, **settings):
     for finger in HANDS[hand]:
         ball = spec.worldbody.add_body(name=f"ball_{finger}", mocap=True, pos=[0, 0, 9])
         ball.add_geom(size=[RADIUS, 0, 0], rgba=[0.85, 0.45, 0.15, 1])
-    light(spec)
+    stage(spec)
     handles = biotac_mj.attach_to_hand(spec, hand, **{"skin": "coarse", "tier": "condensed", **settings})
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -28,7 +28,7 @@ except (AttributeError, ImportError, OSError, RuntimeError) as error:
 
 from . import plugin  # registers the engine plugin  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "SensorBioTac",

@@ -1,9 +1,10 @@
 """What the command line's arguments may be: each says what is wrong with its text before any work begins."""
 
 import argparse
+import difflib
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from .files import check_output, check_output_file
 
@@ -21,7 +22,27 @@ __all__ = [
 
 
 class Parser(argparse.ArgumentParser):
-    """Its errors are one line, and end with exit code 2."""
+    """Its errors are one line, and end with exit code 2. Options are written in full: what is short for one
+    today is short for two when the next is added."""
+
+    def __init__(self, *args: object, **settings: object):
+        super().__init__(*args, **{"allow_abbrev": False} | settings)
+
+    def parse_known_args(
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """As argparse's, but a verb itself answers what it does not know, before it misses anything."""
+        if args is not None and not self._subparsers:
+            known = [name for name in self._option_string_actions if name.startswith("--")]
+            for given in (word.split("=")[0] for word in args if word.startswith("--") and word != "--"):
+                if given not in known:
+                    meant = [name for name in known if name.startswith(given)]
+                    near = (meant + difflib.get_close_matches(given, known, 1))[:1]
+                    self.error(f"no option {given}{f': did you mean {near[0]}?' if near else ''}")
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"nothing takes {' '.join(unknown)}")
+        return found, unknown
 
     def error(self, message: str) -> None:
         text = " ".join(message.split())

@@ -103,12 +103,18 @@ def check_arrays(
 
 
 def read_hdf5(
-    path: pathlib.Path | str, what: str, remedy: str, wanted: Mapping[str, Array], attributes: Iterable = ()
+    path: pathlib.Path | str,
+    what: str,
+    remedy: str,
+    wanted: Mapping[str, Array],
+    attributes: Iterable = (),
+    also: Mapping[str, Array] | None = None,
 ) -> tuple[dict, dict]:
-    """Arrays and attributes of an HDF5 file; see `check_arrays`."""
+    """Arrays and attributes of an HDF5 file; see `check_arrays`. also: arrays that may be missing."""
     import h5py
 
     with reading(path, what, remedy), h5py.File(path) as file:
+        wanted = {**wanted, **{name: array for name, array in (also or {}).items() if name in file}}
         there = {name: file[name] for name in wanted if name in file}
         check_arrays(path, there, wanted, remedy)  # before anything is read
         found = {name: value[()] for name, value in there.items()}

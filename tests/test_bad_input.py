@@ -720,9 +720,9 @@ def numbers():
     for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
     for timestep in ("1001", "1e30"):
-        yield Row(f"press --timestep {timestep}", "1 s at most")
+        yield Row(f"press --timestep {timestep}", "1000 ms at most")
     for speed in ("10001", "1e99"):
-        yield Row(f"press --speed {speed}", "10 m/s at most")
+        yield Row(f"press --speed {speed}", "10000 mm/s at most")
     for verb in ("import --out out", "show --out out", "evaluate --electrodes", "resimulate --out out"):
         yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
     yield Row("press --location 1 2 3 4", "location")
@@ -732,7 +732,7 @@ def numbers():
     along = "press --skin coarse --slide 1 --direction 0 1 0 --slide-direction 0 1 0"
     yield Row(along, "slide_direction is along the press")
     yield Row("press --two-way --one-way", "not allowed with")
-    yield Row("press --jelly", "unrecognized arguments: --jelly")
+    yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")
     yield Row("view --recording press.h5", "add --web")

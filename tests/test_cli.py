@@ -67,7 +67,7 @@ def test_help_is_light():
             ["press", "--skin", "coarse", "--material", "jelly"],
             "unknown material 'jelly': choose one of default, paper, rubber",
         ),
-        (["press", "--depth", "-1"], "depth is -0.001: it must be a positive number"),
+        (["press", "--depth", "-1"], "depth is -1 mm: it must be a positive number"),
         (["import-mesh", "nowhere"], "no mesh at nowhere"),
         (["import-mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
     ],
@@ -78,6 +78,24 @@ def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
     err = capsys.readouterr().err
     assert err.startswith("biotac: error: ") and text in err and err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["press", "--indentor", "cone"], "no option --indentor: did you mean --indenter? (`biotac press -"),
+        (["press", "--dep=1"], "no option --dep: did you mean --depth? (`biotac press --help`"),
+        (["mount", "hand.xml", "--bodi", "ff"], "no option --bodi: did you mean --body? (`biotac mount "),
+        (["press", "--qqq"], "no option --qqq (`biotac press --help`"),
+        (["press", "deep"], "nothing takes deep (`biotac press --help`"),
+        (["pres"], "invalid choice: 'pres'"),
+    ],
+)
+def test_what_a_verb_does_not_know_it_says_itself(words, text, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(words)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and text in err and err.count("\n") == 1
 
 
 def test_view_without_a_display_says_what_to_do(capsys, monkeypatch):

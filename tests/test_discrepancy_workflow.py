@@ -297,8 +297,9 @@ def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
         ("latency", {"delay": 0.06}),
         ("relax", {"g": 0.25, "tau": 0.5}),
         ("mount", {"compliance": 1.2e-4}),
-        ("depth0", {"dz": 1.2e-4}),
-        ("misalign", {"x": 2.5e-4, "z": 0.0}),
+        # as a mount, of the set-up
+        pytest.param("depth0", {"dz": 1.2e-4}, marks=pytest.mark.slow),
+        pytest.param("misalign", {"x": 2.5e-4, "z": 0.0}, marks=pytest.mark.slow),
     ],
 )
 def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path):

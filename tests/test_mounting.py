@@ -10,8 +10,9 @@ import pytest
 from test_hands import FINGER, HAND, springs
 
 from biotac_mj import cli
+from biotac_mj.coupling.show import SKIN
 from biotac_mj.tasks.hands import HANDS, attach_to_hand
-from biotac_mj.tasks.mounting import guess_mount
+from biotac_mj.tasks.mounting import _REPLACED, draw_mount, guess_mount
 from biotac_mj.tasks.mounts import read_mounts, write_mounts
 from biotac_mj.view.offscreen import find_gl
 
@@ -61,8 +62,11 @@ def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
     if find_gl():
         from matplotlib.image import imread
 
-        for row in np.split(imread(picture)[..., :3], 2):
-            before, beside, onto = np.split(row, 3, axis=1)
+        legend = imread(picture)[-40:, :, :3]
+        for colour in (_REPLACED, SKIN):
+            assert (np.abs(legend - colour).max(2) < 0.02).sum() > 100
+        for mount in read_mounts(out).values():
+            before, beside, onto = (x / 255 for x in draw_mount(hand, mount))
             pure = [(x[..., i] > 0.6 * x.sum(2)).sum() for x, i in ((before, 0), (beside, 1), (onto, 2))]
             assert pure[0] > 1000 and min(pure[1:]) > 20  # the capsule that goes; axes to the nail and across
             assert (beside[..., 1] > 1.3 * beside[..., 0]).mean() > 0.01  # the skin

@@ -153,7 +153,7 @@ def test_quaternion_turns_y_to_the_direction():
         (dict(location=(0.05, 0.0)), "no skin at x = 50 mm: it reaches from -21.0 to 5.0 mm"),
         (dict(direction=(0.0, -1.0, 0.0)), "leaves the skin"),
         (dict(slide=1e-3, slide_direction=(0.0, 1.0, 0.0), direction=(0.0, 1.0, 0.0)), "along the press"),
-        (dict(depth=0.0), "depth is 0.0: it must be a positive number"),
+        (dict(depth=0.0), "depth is 0 mm: it must be a positive number"),
         (dict(speed=float("nan")), "speed is nan"),
         (dict(location=(float("nan"), 0.0)), "location .* NaN"),
         (dict(location=(0.0,)), "1 numbers: give x and an angle, or x, y and z"),

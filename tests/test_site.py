@@ -70,7 +70,10 @@ def test_every_page_is_in_the_menu(repo):
 
 
 def test_no_link_is_broken(repo):
-    wrong = {str(p.relative_to(repo)): broken(p) for p in [repo / "README.md", *pages(repo)]}
+    wrong = {
+        str(p.relative_to(repo)): broken(p)
+        for p in [repo / "README.md", repo / "CONTRIBUTING.md", *pages(repo)]
+    }
     assert not any(wrong.values()), "\n".join(f"{p}: {', '.join(t)}" for p, t in wrong.items() if t)
 
 

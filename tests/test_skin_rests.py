@@ -17,7 +17,7 @@ RADIUS, START, INWARDS = 3.5e-3, np.array([-12e-3, -11.3e-3, 0.5e-3]), np.array(
 CHANNELS = ("electrodes", "pdc", "contact_force")
 FILLS = [
     pytest.param({"rest_pressure": 6e3}, [0.6, 1.0, 1.7], {}, id="pressure"),
-    pytest.param({"fill_volume": 4e-8}, [0.6, 1.0, 1.7], {}, id="volume"),
+    pytest.param({"fill_volume": 4e-8}, [0.6, 1.0, 1.7], {}, id="volume", marks=pytest.mark.slow),
     pytest.param({}, [1.0, 1.0, 1.3], {"fill_volume": [0.0, 2e-8, 4e-8]}, id="volumes"),
     pytest.param({"fill_volume": 3e-8}, [1.0, 1.0, 0.8], {"bulk_modulus": [2e9, 2e5, np.inf]}, id="bulk"),
 ]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from biotac_mj.coupling.show import PAD_UP
 from biotac_mj.view import offscreen, window
 
 
@@ -56,5 +57,5 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
     # the ball of 100 g has come to rest: the pad, up here, carries it
     assert np.abs(data.qvel).max() < 1e-3
     force = np.empty(3)
-    mujoco.mju_rotVecQuat(force, data.sensor("biotac_contact_force").data[:3], window._PAD_UP)
+    mujoco.mju_rotVecQuat(force, data.sensor("biotac_contact_force").data[:3], PAD_UP)
     assert force[2] == pytest.approx(-0.1 * 9.81, rel=0.01)

@@ -2,6 +2,7 @@
 browser shows."""
 
 import asyncio
+import dataclasses
 import urllib.request
 
 import numpy as np
@@ -16,6 +17,7 @@ import zstandard
 from biotac_mj import cli
 from biotac_mj.press.record import write_skin
 from biotac_mj.view import web as web_view
+from biotac_mj.view.web import FIELDS, Moment
 
 
 def messages(page, seconds=1.0):
@@ -75,20 +77,19 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     counts = np.full(19, 3000.0)
     counts[4] -= 300
     for time in (0.1, 0.2):
-        page.update(
-            time, {"left": (moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]), np.array([1.0, 0, 0, 0]))}
-        )
+        page.update(time, {"left": Moment(moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]))})
     found = messages(page)
     names = {m.get("name") for m, _ in found}
     assert {"/left", "/left/skin", "/left/core", *(f"/left/e{i}" for i in range(1, 20))} <= names
     np.testing.assert_allclose(vertices(found, "/left/skin"), moved, atol=1e-7)
     text = repr([m for m, _ in found])
     assert "t = 0.200 s" in text and "force [N]" in text and "'e19'" in text
+    assert {f"/left/n{i}" for i in range(1, 20)} <= names  # their numbers
     # the electrode whose counts fell is red, the others are grey
     assert tuple(page._scene["left"][2][4].color) == (204, 38, 25) and tuple(
         page._scene["left"][2][5].color
     ) == (216, 216, 216)
-    rows = page._gui["left"][1].data
+    rows = page._gui["left"][1][0].data
     np.testing.assert_allclose(rows[0], [0.1, 0.2])
     np.testing.assert_allclose(rows[5], [-300, -300])
 
@@ -110,38 +111,88 @@ def test_a_browser_shows_the_finger_wherever_it_is_and_what_it_feels(page, shell
     counts[4] -= 300
     pose = np.array([0.3, -0.2, 1.0]), np.array([np.cos(0.4), 0, 0, np.sin(0.4)])
     with browser.Browser(page.url, tmp_path) as window:
-        page.update(0.1, {"left": (vert, counts, 50.0, 0.4, *pose)})
+        page.update(0.1, {"left": Moment(vert, counts, 50.0, 0.4, *pose)})
         # the skin, and on the map the electrode whose counts fell; the page may draw one before the other
         before = window.until(lambda picture: len(green(picture)) > 3000 and red_on_the_map(picture) > 100)
         assert (
             np.abs(green(before).mean(0) - np.array(before.shape[:2]) / 2).max() < 70
         )  # in the middle of the page
         wide = vert * [1, 1, 1.6]
-        page.update(0.2, {"left": (wide, counts, 50.0, 0.4, *pose)})
+        page.update(0.2, {"left": Moment(wide, counts, 50.0, 0.4, *pose)})
         window.until(lambda picture: len(green(picture)) > 1.15 * len(green(before)))
         text = window.evaluate("document.body.innerText")
-    assert "t = 0.200 s" in text and "electrodes (tip left)" in text and "force and pressure" in text
+    assert "t = 0.200 s" in text and "tip left" in text and "PDC above rest [counts]" in text
+
+
+def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
+    """Triangles go to the mesh of their band; the top of the scale is a round number and only grows."""
+    finger = web_view.Finger.of(shell, np.full(19, 3000.0), fields=("contact pressure",))
+    page = web_view.Page({"one": finger}, port=8934)
+    try:
+        vert = shell.vert[finger.node]
+        pressed = np.where(vert[:, 1] < -4e-3, 2.4e4, 0.0)
+
+        def show(pressure):
+            fields = {"contact pressure": lambda: pressure}
+            page.update(0.0, {"one": Moment(vert, finger.rest, 0.0, 0.0, fields=fields)})
+            skin = page._scene["one"][1]
+            return [m.faces if m.visible else m.faces[:0] for m in skin], [tuple(m.color) for m in skin]
+
+        (whole, *rest), _ = show(pressed)
+        assert len(whole) == len(finger.face) and not any(map(len, rest)) and not page._legend.content
+        page.field.value = "contact pressure"
+        faces, colors = show(pressed)
+        raised = pressed[finger.face].mean(1) >= 30e3 / 8  # above the lowest of eight bands
+        assert len(faces[0]) == len(finger.face) and sum(map(len, faces[1:])) == raised.sum()
+        # 24 of 30 kPa
+        full = (pressed[finger.face] > 0).all(1)
+        np.testing.assert_array_equal(faces[6], finger.face[full])
+        assert colors[6] == web_view._rgb(FIELDS["contact pressure"].bands()[6]) != colors[0]
+        assert "30 kPa" in page._legend.content
+        show(pressed / 100)
+        assert "30 kPa" in page._legend.content
+    finally:
+        page.close()
 
 
 def test_electrode_map_shows_each_electrode_at_its_place():
+    from xml.etree import ElementTree
+
     position = np.array([[-16e-3, -5e-3, 0], [0.0, -3.5e-3, -3.5e-3]])
-    picture = web_view.electrode_map(position, np.array([-300.0, 300.0])).astype(int)
-    red = np.argwhere((picture[..., 0] > 180) & (picture[..., 2] < 60))
-    blue = np.argwhere((picture[..., 2] > 180) & (picture[..., 0] < 60))
-    assert len(red) > 50 and len(blue) > 50
-    assert red[:, 1].mean() < blue[:, 1].mean() - 100  # the tip is on the left
-    assert red[:, 0].mean() == pytest.approx(75, abs=1) and blue[:, 0].mean() < 60
+    picture = ElementTree.fromstring(web_view.electrode_map(position, np.array([-300.0, 300.0])))
+    space = "{http://www.w3.org/2000/svg}"
+    red, blue = picture.findall(f"{space}circle")
+    assert (red.get("fill"), blue.get("fill")) == ("rgb(204, 38, 25)", "rgb(25, 76, 216)")
+    assert float(red.get("cx")) < float(blue.get("cx")) - 100  # the tip is on the left
+    assert float(blue.get("cy")) < float(red.get("cy"))
+    numbers = picture.findall(f"{space}text")
+    assert [t.text for t in numbers[:2]] == ["1", "2"]
+    assert float(numbers[0].get("x")) == float(red.get("cx"))
 
 
-def test_a_recorded_press_is_played(synthetic_press, tmp_path):
-    write_skin(synthetic_press, tmp_path / "skin.h5")
-    page = web_view.play_file(tmp_path / "skin.h5", speed=1e3, rounds=1, port=8932)
+def test_recorded_presses_are_played_beside_each_other(synthetic_press, tmp_path):
+    """With their indenters, and pressure where the file has it."""
+    pressure = np.zeros(synthetic_press.vert_xpos.shape[:2], np.float32)
+    pressure[-1] = 5e4
+    with_pressure = dataclasses.replace(synthetic_press, contact_pressure=pressure)
+    for name, record in (("a", synthetic_press), ("b", with_pressure)):
+        (tmp_path / name).mkdir()
+        write_skin(record, tmp_path / name / "skin.h5")
+    files = [tmp_path / name / "skin.h5" for name in "ab"]
+    page = web_view.play_file(*files, speed=1e3, rounds=1, port=8932)
     try:
-        finger = page.fingers["biotac"]
+        finger = page.fingers["a"]
+        assert page.fingers["b"].fields == ("contact pressure",) and not finger.fields
+        found = messages(page)
         np.testing.assert_allclose(
-            vertices(messages(page), "/biotac/skin"), synthetic_press.vert_xpos[-1][finger.node], atol=1e-7
+            vertices(found, "/a/skin"), synthetic_press.vert_xpos[-1][finger.node], atol=1e-7
         )
-        rows = page._gui["biotac"][2].data
+        np.testing.assert_allclose(vertices(found, "/b/tool"), synthetic_press.indenter_vert, atol=1e-7)
+        apart = page._scene["b"][0].position - page._scene["a"][0].position
+        assert np.linalg.norm(apart) > np.ptp(synthetic_press.geometry.vert[:, 0])
+        tool = page._scene["a"][3]
+        np.testing.assert_allclose(tool.position, synthetic_press.indenter_pos[-1], atol=1e-7)
+        rows = page._gui["a"][1][2].data
         np.testing.assert_allclose(rows[1], np.linalg.norm(synthetic_press.force, axis=1), atol=1e-9)
     finally:
         page.close()
@@ -163,7 +214,7 @@ def test_a_model_is_shown_while_it_steps():
     model = spec.compile()
     page = web_view.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
     try:
-        rows = page._gui["finger"][2].data
+        rows = page._gui["finger"][1][2].data
         assert len(rows[0]) == 5 and rows[0][0] == pytest.approx(0.01) and np.ptp(np.diff(rows[0])) < 1e-9
         assert rows[1][-1] > 0  # the ball pushes
     finally:

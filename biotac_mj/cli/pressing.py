@@ -183,7 +183,10 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         help="a page in the browser with skin, electrodes and traces (extra web)",
     )
     verb.add_argument(
-        "--recording", metavar="FILE", help="with --web: play the skin.h5 of a press instead of a simulation"
+        "--recording",
+        nargs="+",
+        metavar="FILE",
+        help="with --web: play the skin.h5 of a press instead of a simulation; of several beside each other",
     )
     verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
 

@@ -92,10 +92,28 @@ class Handle:
 
     def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
+        setup, state = self._skin_state(model, data)
+        return setup.skin.stepper.vert_xpos(state).copy()
+
+    def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
+        """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
+        0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without
+        `contact_force(state)`."""
+        setup, state = self._skin_state(model, data)
+        stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
+        if not hasattr(stepper, "contact_force"):
+            return None
+        with setup.skin.lock:
+            force = stepper.contact_force(state)
+        corner = stepper.vert_xpos(state)[face]
+        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+        area = np.zeros_like(force)
+        np.add.at(area, face, across[:, None])
+        return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
+
+    def _skin_state(self, model, data):
         setup, start = self._place(model)
-        return setup.skin.stepper.vert_xpos(
-            setup.parts(data.plugin_state[start : start + setup.nstate])[2]
-        ).copy()
+        return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
 
 
 _setups = weakref.WeakKeyDictionary()  # of each living model

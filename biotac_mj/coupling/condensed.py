@@ -94,6 +94,9 @@ class CondensedStepper(FemStepper):
             load=out.load,
         )
 
+    def contact_force(self, state: np.ndarray) -> np.ndarray:
+        return self._skin.contact_force(self._read(state))[: self._geometry.nvert]
+
     def resting(self, state: np.ndarray) -> bool:
         return not self._part(state, "forces")[0]
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, step
+from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
@@ -143,6 +143,12 @@ class FemStepper:
         return np.bincount(
             group[contacts[:, 1].astype(int)], share[face], minlength=1 + max(group, default=-1)
         )
+
+    def contact_force(self, state: np.ndarray) -> np.ndarray:
+        """(nvert, 3) of what touches on the nodes in a state [N]."""
+        self._unpack(state)
+        prepare_step(self._model, self._data, self._geom_set).evaluate_forces()
+        return self._data.contact_force[0]
 
     def solve_skin(
         self,

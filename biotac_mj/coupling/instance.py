@@ -7,7 +7,6 @@ it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see not
 import ctypes
 import dataclasses
 import functools
-import gc
 import math
 import threading
 
@@ -54,12 +53,6 @@ class _Skin:
         self.readings = make_readings(config, self.geometry, geoms, self.stepper)
         self.lock = threading.Lock()
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
-
-    def __del__(self, collect=gc.collect):
-        # recorded launches and what they work on refer to each other in circles: few objects, so that Python
-        # would look for them late, and much memory
-        self.__dict__.clear()
-        collect()
 
     @functools.cached_property
     def thickness(self):

@@ -5,7 +5,13 @@ import numpy as np
 
 from ..sensor.channels import ELECTRODES, NELECTRODE
 
-__all__ = ["Shown", "electrode_colors"]
+__all__ = ["CORE", "OBJECT", "PAD_UP", "SKIN", "Shown", "electrode_colors"]
+
+# what all pictures show: as in mjcf/biotac.xml, and of what touches the skin
+SKIN, CORE, OBJECT = np.array([0.25, 0.6, 0.4]), np.array([0.25, 0.25, 0.28]), np.array([0.85, 0.45, 0.15])
+PAD_UP = np.array(
+    [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
+)  # turns the pad, -y of the BioTac, to +z of the world
 
 _FULL_SCALE = 300.0  # change of an electrode at full colour [counts]
 _NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]), np.array([0.1, 0.3, 0.85])

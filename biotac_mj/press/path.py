@@ -18,6 +18,7 @@ _LONGEST_STEP = 1.0  # [s]
 _FASTEST = 10.0  # [m/s]
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
 _PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
+_UNITS = dict(depth="mm", slide="mm", speed="mm/s", timestep="ms", hold="ms")  # in which messages say them
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
 
 
@@ -74,32 +75,27 @@ class PressOptions:
 
     def __post_init__(self):
         check_types(self, _PLAIN)
-        for name in ("depth", "timestep", "speed"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be a positive number")
-        for name in ("slide", "hold"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be zero or a positive number")
-        for name, most in (("depth", _DEEPEST), ("slide", _LONGEST)):
+        for name, least in (("depth", 1), ("timestep", 1), ("speed", 1), ("slide", 0), ("hold", 0)):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and (value > 0 if least else value >= 0)):
+                wanted = "a positive number" if least else "zero or a positive number"
+                raise ValueError(f"{name} is {_said(name, value)}: it must be {wanted}")
+        for name, most, why in (
+            ("depth", _DEEPEST, "the finger ends there"),
+            ("slide", _LONGEST, "the finger ends before"),
+            ("timestep", _LONGEST_STEP, "a longer one is no press"),
+            ("speed", _FASTEST, "what is faster is no press"),
+        ):
             if getattr(self, name) > most:
                 raise ValueError(
-                    f"{name} is {getattr(self, name):g} m: the finger ends before {most:g} m; choose less"
+                    f"{name} is {_said(name, getattr(self, name))}: {_said(name, most)} at most, {why}"
                 )
         rests = self.hold * (2 if self.slide else 1)
-        if self.timestep > _LONGEST_STEP:
-            raise ValueError(
-                f"timestep is {self.timestep:g} s: {_LONGEST_STEP:g} s at most, a longer one is no press"
-            )
-        if self.speed > _FASTEST:
-            raise ValueError(
-                f"speed is {self.speed:g} m/s: {_FASTEST:g} m/s at most, what is faster is no press"
-            )
         steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
         if steps > _MOST_STEPS:
             raise ValueError(
-                f"this press takes {steps:.3g} steps of {self.timestep:g} s: {_MOST_STEPS} at most; "
-                "shorten hold, "
-                "depth or slide, or raise speed or timestep"
+                f"this press takes {steps:.3g} steps of {_said('timestep', self.timestep)}: {_MOST_STEPS} at "
+                "most; shorten hold, depth or slide, or raise speed or timestep"
             )
         if self.friction is not None and not 0 <= self.friction < np.inf:
             raise ValueError(f"friction is {self.friction}: pass a Coulomb coefficient >= 0, or None")
@@ -118,6 +114,11 @@ class PressOptions:
             value = getattr(self, name)
             if value is not None and (len(value) != 3 or not np.linalg.norm(value)):
                 raise ValueError(f"{name} {value} is no direction: give three numbers that are not all zero")
+
+
+def _said(name, value):
+    """A length or time of a press as a person says it, whatever it was given in: 2.4 mm."""
+    return f"{1e3 * value:.6g} {_UNITS[name]}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,11 +57,11 @@ def press(
     with plugin.explained():
         model = spec.compile()
         data = mujoco.MjData(model)
-    rows, picture = [], None
+    rows, picture, seconds = [], None, 0.0
     last = len(path.depth) - 1
-    begin = time.perf_counter()
     for step in tqdm.trange(last + 1, desc="press", unit="step", disable=not progress, leave=False):
         travel = np.array([path.depth[step], path.slid[step]])
+        begin = time.perf_counter()
         if options.two_way:
             data.ctrl[:] = (travel + [LEAD, 0])[: model.nu]
             mujoco.mj_step(model, data)
@@ -69,19 +69,20 @@ def press(
         else:
             data.mocap_pos[0] = path.position(*travel)
             mujoco.mj_step(model, data)
+        seconds += time.perf_counter() - begin
         rows.append(
             (
                 data.time,
                 travel[0],
                 path.position(*travel),
                 handle.vert_xpos(model, data),
+                handle.contact_pressure(model, data),
                 *_read(handle, data),
             )
         )
-    seconds = time.perf_counter() - begin
     if render is not None:
         picture = render(model, data)
-    times, depth, position, xpos, force, counts, pac, nonconverged = (
+    times, depth, position, xpos, pressure, force, counts, pac, nonconverged = (
         np.array(column) for column in zip(*rows)
     )
     record = PressRecord(
@@ -98,6 +99,7 @@ def press(
         pac=pac,
         nonconverged=nonconverged,
         vert_xpos=xpos.astype(np.float32),
+        contact_pressure=None if pressure[0] is None else pressure.astype(np.float32),
         indenter_pos=position,
         indenter_quat=np.tile(path.quat, (len(times), 1)),
         indenter_vert=indenter.vert,

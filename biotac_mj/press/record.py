@@ -35,6 +35,7 @@ class PressRecord:
       indenter_vert, indenter_face: (p, 3) [m], (q, 3), its surface in that frame, for pictures.
       seconds: wall time of the steps [s].
       pac: (n, 22) samples of each row's latest frame [counts], None where they were not kept.
+      contact_pressure: (n, nvert) float32 of the indenter on the nodes [Pa], None where it was not kept.
     """
 
     geometry: SkinGeometry
@@ -51,6 +52,7 @@ class PressRecord:
     indenter_face: np.ndarray
     seconds: float
     pac: np.ndarray | None = None
+    contact_pressure: np.ndarray | None = None
 
     def __post_init__(self):
         n = len(self.time)
@@ -101,8 +103,8 @@ def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
 
 
 def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
-    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], the skin's topology, the readings; parameters and
-    versions as JSON attributes."""
+    """skin.h5: `vert_xpos` (n, nvert, 3) float32 [m], `contact_pressure` (n, nvert) float32 [Pa], the skin's
+    topology, the readings; parameters and versions as JSON attributes."""
     geometry = record.geometry
     pose = np.concatenate([record.indenter_pos, record.indenter_quat], axis=1)
     columns = dict(
@@ -125,16 +127,11 @@ def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
         indenter_face=(record.indenter_face, "vertex"),
     )
     with hdf5(path) as file:
-        shape = record.vert_xpos.shape
-        file.create_dataset(
-            "vert_xpos",
-            data=record.vert_xpos,
-            dtype="f4",
-            chunks=(1, *shape[1:]),
-            compression="gzip",
-            shuffle=True,
-        )
-        file["vert_xpos"].attrs["unit"] = "m"
+        for name, unit in (("vert_xpos", "m"), ("contact_pressure", "Pa")):
+            value = getattr(record, name)
+            if value is not None:
+                kept = dict(dtype="f4", chunks=(1, *value.shape[1:]), compression="gzip", shuffle=True)
+                file.create_dataset(name, data=value, **kept).attrs["unit"] = unit
         for name, (value, unit) in {**columns, **topology}.items():
             file[name] = value
             file[name].attrs["unit"] = unit

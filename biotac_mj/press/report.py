@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from ..coupling.show import OBJECT, SKIN
 from ..files import replacing
 from ..geometry.rigid import matrix
 from .record import PressRecord
@@ -16,9 +17,7 @@ from .record import PressRecord
 __all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "unroll", "write_picture"]
 
 _CORE_RADIUS = 5.325e-3  # of the core, to unroll it [m] (NVlabs/biotac_sim)
-_SKIN = np.array([0.20, 0.55, 0.42])
 _HARD = np.array([0.75, 0.75, 0.78])
-_INDENTER = np.array([0.85, 0.45, 0.15])
 # BioTac frame to a frame whose z leaves the pad
 _TO_PAD_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
@@ -31,16 +30,16 @@ def unroll(points: np.ndarray) -> np.ndarray:
 
 def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
     """The unrolled core: electrodes coloured by their change (red: fewer counts, as in the render) over
-    contours of the skin's motion."""
+    contours of how far the skin moved."""
     geometry = record.geometry
     change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)
     outer = outer[np.abs(np.arctan2(geometry.vert[outer, 2], -geometry.vert[outer, 1])) < 2.0]
     moved = 1e3 * np.linalg.norm(record.vert_xpos[step, outer] - geometry.vert[outer], axis=1)
     if np.ptp(moved) > 0:
-        axes.tricontour(
-            *unroll(geometry.vert[outer]).T, moved, levels=6, colors="0.75", linewidths=0.8, zorder=1
-        )
+        place = unroll(geometry.vert[outer])
+        lines = axes.tricontour(*place.T, moved, levels=6, colors="0.6", linewidths=0.8, zorder=1)
+        axes.clabel(lines, fmt="%g", fontsize=7, zorder=1)
     limit = max(np.abs(change).max(), 1.0)
     place = unroll(geometry.electrode_pos)
     dots = axes.scatter(
@@ -62,18 +61,19 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
         aspect="equal",
         xlabel="along the finger, tip on the left [mm]",
         ylabel="around the core [mm]",
-        title="Electrodes E1..E19",
+        title="Electrodes E1..E19; lines: how far the skin moved [mm]",
     )
     axes.margins(0.12)
 
 
 def draw_force(axes: Axes, record: PressRecord) -> None:
-    """Components and size of the force over depth."""
-    depth = 1e3 * record.depth
+    """Components and size of the force over depth; over time where the indenter slides at one depth."""
+    slides = bool(record.parameters.get("slide"))
+    along = record.time if slides else 1e3 * record.depth
     for i, name in enumerate("xyz"):
-        axes.plot(depth, record.force[:, i], lw=1, label=f"$F_{name}$")
-    axes.plot(depth, np.linalg.norm(record.force, axis=1), "k", lw=2, label="$|F|$")
-    axes.set(xlabel="depth [mm]", ylabel="force on the indenter [N]", title="Force")
+        axes.plot(along, record.force[:, i], lw=1, label=f"$F_{name}$")
+    axes.plot(along, np.linalg.norm(record.force, axis=1), "k", lw=2, label="$|F|$")
+    axes.set(xlabel="time [s]" if slides else "depth [mm]", ylabel="force on the indenter [N]", title="Force")
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
 
@@ -108,11 +108,11 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
         (
             xpos,
             geometry.outer_face,
-            np.hstack([_SKIN + glow * (np.array([0.95, 0.85, 0.30]) - _SKIN), np.ones_like(glow)]),
+            np.hstack([SKIN + glow * (np.array([0.95, 0.85, 0.30]) - SKIN), np.ones_like(glow)]),
         ),
         (geometry.nail_vert, geometry.nail_face, np.tile([*_HARD, 1.0], (len(geometry.nail_face), 1))),
         (geometry.clamp_vert, geometry.clamp_face, np.tile([*_HARD, 1.0], (len(geometry.clamp_face), 1))),
-        (indenter, record.indenter_face, np.tile([*_INDENTER, 0.35], (len(record.indenter_face), 1))),
+        (indenter, record.indenter_face, np.tile([*OBJECT, 0.35], (len(record.indenter_face), 1))),
     ]
     # one collection, so that matplotlib sorts all triangles by depth together
     tri = 1e3 * np.concatenate([vert[face].reshape(-1, 3, 3) for vert, face, _ in parts]) @ _TO_PAD_UP.T

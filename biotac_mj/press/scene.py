@@ -4,7 +4,9 @@ import mujoco
 import numpy as np
 
 from ..coupling.attachment import Handle
+from ..coupling.show import OBJECT
 from ..geometry.rigid import matrix, quaternion
+from ..view.offscreen import stage
 from .indenter import Indenter, add_indenter
 from .path import LEAD, Path, PressOptions
 
@@ -37,13 +39,14 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
     spec.option.timestep = options.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = np.zeros(3)
-    _stage(spec)
+    stage(spec)
+    _add_camera(spec)
     spec.worldbody.add_body(name="finger")
 
     body = spec.worldbody.add_body(
         name="indenter", pos=path.position(-LEAD), quat=path.quat, mocap=not options.two_way
     )
-    look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[0.85, 0.45, 0.15, 0.35])
+    look = dict(contype=0, conaffinity=0, friction=[friction, 0.005, 1e-4], rgba=[*OBJECT, 0.35])
     if options.two_way:
         if indenter.type == "plane":
             raise ValueError(
@@ -91,32 +94,10 @@ def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
         spec.site(f"{handle.prefix}e{i}").size[0] = 7e-4
 
 
-def _stage(spec):
-    """Camera, light and a white background."""
+def _add_camera(spec):
     # from beside the pad, which looks up in the picture
     eye, up = np.array([-0.45, -0.55, -0.70]), np.array([0.0, -1.0, 0.0])
     z = eye / np.linalg.norm(eye)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
     quat = quaternion(np.stack([x, np.cross(z, x), z], axis=1))
     spec.worldbody.add_camera(name="press", pos=0.036 * z + [-0.008, -0.003, 0], quat=quat, fovy=40)
-    spec.worldbody.add_light(
-        pos=[-0.1, -0.3, -0.1],
-        dir=[0.6, 0.9, -0.1],
-        diffuse=[0.5] * 3,
-        specular=[0.1] * 3,
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        castshadow=False,
-    )
-    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:], spec.visual.headlight.specular[:] = (
-        0.35,
-        0.35,
-        0.05,
-    )
-    sky = spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        width=8,
-        height=48,
-    )
-    sky.rgb1, sky.rgb2 = [1.0] * 3, [1.0] * 3

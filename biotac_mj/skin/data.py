@@ -249,6 +249,15 @@ class SkinData:
         for array in (self.x, self.x_last):
             array.assign(np.ascontiguousarray(rest))
 
+    def _forget_steps(self):
+        for one in self.steps.values():
+            one.forget()
+        self.steps.clear()
+
+    def __del__(self):
+        if hasattr(self, "steps"):  # not where making it failed
+            self._forget_steps()
+
     def set_external(self, force: ArrayLike | None) -> None:
         """Loads the nodes in every step from now on, until `reset`.
 
@@ -261,7 +270,7 @@ class SkinData:
         shape = (self.nworld, self.model.nvert, 3)
         if force is None:
             if self.external is not None:
-                self.steps.clear()  # what was recorded knows of loads
+                self._forget_steps()  # what was recorded knows of loads
             self.external = None
             return
         force = np.asarray(force, float)
@@ -270,7 +279,7 @@ class SkinData:
                 f"external forces have shape {force.shape}: pass finite numbers of shape {shape}"
             )
         if self.external is None:
-            self.steps.clear()  # what was recorded knows of no loads
+            self._forget_steps()  # what was recorded knows of no loads
             self.external = wp.zeros_like(self.x)
         self.external.assign(np.ascontiguousarray(np.swapaxes(force, 0, 1)))
 

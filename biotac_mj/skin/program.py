@@ -85,6 +85,11 @@ class Program(Launcher):
             for command in self._commands:
                 command()
 
+    def forget(self) -> None:
+        """Lets go of the launches and of all that they work on: these may hold the program, and Python finds
+        circles late, which a skin is too large for."""
+        self._record, self._commands, self._arguments = None, [], []
+
     def _recorded(self, body):
         outer, self._open = self._open, []
         body()

@@ -252,6 +252,10 @@ class SkinStep:
             self._graph = capture.graph
         wp.capture_launch(self._graph)
 
+    def forget(self) -> None:
+        """Lets go of what was recorded; it cannot run again."""
+        self._program.forget()
+
     def launch(self) -> None:
         """Launches a step, for the caller's capture."""
         self._program.run()

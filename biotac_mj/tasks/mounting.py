@@ -7,16 +7,18 @@ import pathlib
 import mujoco
 import numpy as np
 
+from ..coupling.show import SKIN
 from ..files import replacing
 from ..geometry.rigid import matrix
 from ..reading import reading
-from ..view.offscreen import Offscreen, find_gl
+from ..view.offscreen import Offscreen, find_gl, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
 from .mounts import TIP, Mount, write_mounts
 
-__all__ = ["draw_mount", "guess_mount", "light", "mount_verb", "side_view"]
+__all__ = ["draw_mount", "guess_mount", "mount_verb", "side_view"]
 
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
+_REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
 
 
@@ -123,10 +125,10 @@ def side_view(
 
 def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
-) -> np.ndarray | None:
-    """(height, 3 width, 3) uint8: the link as it was, what the BioTac stands for in red; then with the
-    BioTac and its axes (x red, to the clamp; y green, to the nail; z blue), from beside and onto its pad.
-    None where no GL library works.
+) -> list[np.ndarray] | None:
+    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
+    with the BioTac and its axes (x red, y green, z blue), from beside and onto its pad. None where no GL
+    library works.
 
     Args:
       path: MJCF of the hand.
@@ -142,8 +144,8 @@ def draw_mount(
             _add_axes(spec.body(handle.body))
         else:
             for geom in fixed_geoms(link, mount.replaces):
-                geom.material, geom.rgba = "", [0.9, 0.15, 0.1, 1]
-        light(spec)
+                geom.material, geom.rgba = "", [*_REPLACED, 1]
+        stage(spec)
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -152,17 +154,7 @@ def draw_mount(
         pos, mat = here.xpos + frame @ mount.pos, frame @ matrix(mount.quat)
         with Offscreen(model, width, height, gl) as screen:
             views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
-    return np.concatenate(views, axis=1)
-
-
-def light(spec: mujoco.MjSpec) -> None:
-    """Light from where the camera is, a white background, and nothing cut off that is near the camera."""
-    spec.stat.extent, spec.visual.map.znear = 0.2, 0.02
-    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.5, 0.6
-    for texture in [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]:
-        spec.delete(texture)
-    flat = dict(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
-    spec.add_texture(name="biotac_sky", width=8, height=48, rgb1=[1, 1, 1], rgb2=[1, 1, 1], **flat)
+    return views
 
 
 def _add_axes(body):
@@ -201,8 +193,32 @@ def mount_verb(args: argparse.Namespace) -> None:
             raise ValueError(
                 "no GL library works here: leave --picture out, or install libosmesa6 or libegl1"
             )
-        import matplotlib.image
-
-        with replacing(args.picture) as temporary:
-            matplotlib.image.imsave(temporary, np.concatenate(rows))
+        _write_picture(args.picture, dict(zip(mounts, rows)))
         print(f"drawn: {args.picture}")
+
+
+def _write_picture(path, rows):
+    """rows: {body: what `draw_mount` answered}."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    figure = Figure(figsize=(10, 0.8 + 3.4 * len(rows)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    for line, (body, views) in zip(axes, rows.items()):
+        for axis, view, title in zip(line, views, ("before", "the BioTac from beside", "onto its pad")):
+            axis.imshow(view)
+            axis.set(title=title, xticks=[], yticks=[])
+        line[0].set_ylabel(body)
+    ways = (
+        ("r", "x: to the clamp, into the link"),
+        ("g", "y: to the nail, away from the pad"),
+        ("b", "z: across"),
+    )
+    shown = [Patch(color=_REPLACED, label="what it stands for"), Patch(color=SKIN, label="skin")]
+    shown += [Line2D([], [], color=color, lw=3, label=label) for color, label in ways]
+    figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -14,7 +14,7 @@ import sys
 import mujoco
 import numpy as np
 
-__all__ = ["find_gl", "Offscreen"]
+__all__ = ["Offscreen", "find_gl", "stage"]
 
 _PROBE = """
 import importlib, os, sys
@@ -110,3 +110,14 @@ class Offscreen:
         pixels = np.empty((self.rect.height, self.rect.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self.rect, self._mjr)
         return pixels[::-1]
+
+
+def stage(spec: mujoco.MjSpec) -> None:
+    """What all pictures have around their model: light from where the camera is, a white background, and
+    nothing cut off that is near the camera."""
+    spec.stat.extent, spec.visual.map.znear = 0.2, 0.02
+    spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.5, 0.6
+    for texture in [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]:
+        spec.delete(texture)
+    flat = dict(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
+    spec.add_texture(name="biotac_sky", width=8, height=48, rgb1=[1, 1, 1], rgb2=[1, 1, 1], **flat)

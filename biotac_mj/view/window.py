@@ -5,21 +5,21 @@ import os
 import pathlib
 import sys
 import time
+from collections.abc import Sequence
 
 import mujoco
-import numpy as np
 
 from .. import plugin
 from ..coupling.attachment import Handle
+from ..coupling.show import OBJECT, PAD_UP
 from ..files import replacing
 from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
+from .offscreen import stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
-# turns the pad, -y of the BioTac, to the world's +z
-_PAD_UP = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0])
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 
 
@@ -44,8 +44,8 @@ def build_scene(
     spec = mujoco.MjSpec()
     spec.option.timestep = 4e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    stage(spec)
     spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
-    _light(spec)
     ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
     ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
     for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
@@ -57,30 +57,11 @@ def build_scene(
         size=[_RADIUS, 0, 0],
         contype=0,
         conaffinity=0,
-        rgba=[0.85, 0.45, 0.15, 0.6],
+        rgba=[*OBJECT, 0.35],
     )
-    handle = attach(spec, body="world", quat=_PAD_UP, skin=skin, geoms=["ball"], **attach_options)
+    handle = attach(spec, body="world", quat=PAD_UP, skin=skin, geoms=["ball"], **attach_options)
     see_through(spec, handle)
     return spec, handle
-
-
-def _light(spec):
-    """Sky and light."""
-    spec.visual.headlight.ambient[:] = 0.3
-    sky = spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        width=64,
-        height=384,
-    )
-    sky.rgb1, sky.rgb2 = [0.95, 0.97, 1.0], [0.6, 0.65, 0.7]
-    spec.worldbody.add_light(
-        pos=[-0.1, -0.2, 0.3],
-        dir=[0.3, 0.5, -0.8],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        castshadow=False,
-    )
 
 
 def build_hand(
@@ -107,10 +88,10 @@ def build_hand(
         )
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    _light(spec)
+    stage(spec)
     ball = spec.worldbody.add_body(name="ball", pos=[0.41, 0.0, 0.05])
     ball.add_freejoint(name="ball")
-    ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[0.85, 0.45, 0.15, 1])
+    ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[*OBJECT, 1])
     return spec, attach_to_hand(spec, "shadow_hand", skin=skin, **attach_options)
 
 
@@ -125,7 +106,7 @@ def view(
     seconds: float = 0.3,
     hand: pathlib.Path | str | None = None,
     web: bool = False,
-    recording: pathlib.Path | str | None = None,
+    recording: pathlib.Path | str | Sequence | None = None,
     port: int = 8080,
     options: dict | str | None = None,
 ) -> object:
@@ -136,7 +117,8 @@ def view(
         material's choice.
       render: path of a picture to write after `seconds` [s] instead.
       hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
-      web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`.
+      web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`; of
+        several files beside each other.
 
     Raises:
       ValueError: no display for a window, or no GL library to render with.
@@ -148,7 +130,8 @@ def view(
     if recording:
         from .web import play_file
 
-        return play_file(recording, port=port)
+        one = isinstance(recording, (str, os.PathLike))
+        return play_file(*[recording] if one else recording, port=port)
     linux = sys.platform.startswith("linux")
     if (
         render is None

@@ -57,31 +57,30 @@ def evaluate_recording(
         for i, share in enumerate(saturated)
         if share > 0.001
     ]
-    with tqdm(
-        total=(3 if network else 1) + (TRIALS if recording.force is not None else 0),
-        disable=not progress,
-        desc="evaluate",
-        leave=False,
-    ) as bar:
-        reconstruction, traces = _reconstruction(counts, ntrain, seed, network, bar)
-        result = {
-            "schema": "biotac_mj.learning.recording/2",
-            "recording": recording.name,
-            "source": recording.source,
-            "rows": n,
-            "train_rows": ntrain,
-            "seed": seed,
-            "notes": notes,
-            "saturated": saturated.tolist(),
-            "reconstruction": reconstruction,
-        }
-        predicted = None
-        if recording.force is not None:
+    steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS)) if network else 0
+    look = dict(disable=not progress, leave=False)
+    with tqdm(total=2 * steps, desc="evaluate: codes", **look) as bar:
+        reconstruction, traces = _reconstruction(counts, ntrain, seed, steps, bar)
+    result = {
+        "schema": "biotac_mj.learning.recording/2",
+        "recording": recording.name,
+        "source": recording.source,
+        "rows": n,
+        "train_rows": ntrain,
+        "seed": seed,
+        "notes": notes,
+        "saturated": saturated.tolist(),
+        "reconstruction": reconstruction,
+    }
+    predicted = None
+    if recording.force is not None:
+        # a bar of its own: a step of the networks is no measure of how long a trial takes
+        with tqdm(total=TRIALS, desc="evaluate: force", **look) as bar:
             result["force_regression"], predicted = _force(
                 counts, recording.force, ntrain, seed, network, bar
             )
-        else:
-            result["notes"].append("no force: the force regression was left out")
+    else:
+        result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
     out = pathlib.Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -122,16 +121,14 @@ def _rms(error):
     }
 
 
-def _reconstruction(counts, ntrain, seed, network, bar):
+def _reconstruction(counts, ntrain, seed, steps, bar):
     mean = counts[:ntrain].mean(0)
     centred = counts - mean
     axes = np.linalg.eigh(centred[:ntrain].T @ centred[:ntrain])[1][:, ::-1][:, :8].T
     rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": centred @ axes.T @ axes + mean}
-    bar.update()
-    if network:
+    if steps:
         for name, linear in (("electrode_vae", None), ("electrode_vae_linear_start", axes)):
-            rows[name] = np.clip(_vae(counts, mean, ntrain, linear, seed), 0, FULL_SCALE)
-            bar.update()
+            rows[name] = np.clip(_vae(counts, mean, ntrain, linear, seed, steps, bar), 0, FULL_SCALE)
     table = {
         name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])}
         for name, y in rows.items()
@@ -152,8 +149,8 @@ def _reconstruction(counts, ntrain, seed, network, bar):
     }, rows[best]
 
 
-def _vae(counts, mean, ntrain, linear, seed):
-    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows."""
+def _vae(counts, mean, ntrain, linear, seed, steps, bar):
+    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows in so many steps."""
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
@@ -164,7 +161,6 @@ def _vae(counts, mean, ntrain, linear, seed):
     # What a common change of ln Z does to counts: dE = -E (1 - E / 4095) d ln Z.
     common = torch.tensor(-counts * (1 - counts / FULL_SCALE) / size, dtype=torch.float32)
     net = ElectrodeVAE(linear=None if linear is None else torch.tensor(linear.copy(), dtype=torch.float32))
-    steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS))
     optimizer = torch.optim.Adam(net.parameters(), 2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
     for _ in range(steps):
@@ -174,6 +170,7 @@ def _vae(counts, mean, ntrain, linear, seed):
         divergence = 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
         loss = ((got - y) ** 2).sum(1).mean() + _KL * divergence
         optimizer.zero_grad(set_to_none=True), loss.backward(), optimizer.step(), schedule.step()
+        bar.update()
     net.eval()
     with torch.no_grad():
         return net(x)[0].numpy() * size + mean

@@ -355,6 +355,13 @@ class CondensedSkin:
             )
         return self._fields[key]
 
+    def contact_force(self, memory: Memory) -> np.ndarray:
+        """(nvert, 3) of what touches on the nodes [N]."""
+        out, outer = np.zeros((self.model.nvert, 3)), memory.coordinate < 3 * len(self._outer)
+        node, axis = np.divmod(memory.coordinate[outer], 3)
+        out[self._outer[node], axis] = memory.force[outer]
+        return out
+
     def _keep(self, memory, u):
         if len(self._fields) > 16:
             self._fields.clear()
