@@ -282,8 +282,15 @@ def draw_sensor(rng: np.random.Generator) -> Sensor:
 
 
 def generator(seed: ArrayLike, what: int) -> np.random.Generator:
-    """Draws `what` of a sensor: whole numbers up to 2^64 - 1, one or several, are its seed."""
-    return np.random.default_rng([*map(int, np.ravel(np.asarray(seed, object))), what])
+    """Draws `what` of a sensor: whole numbers up to 2^64 - 1, one or several, are its seed.
+
+    Raises:
+      ValueError: others.
+    """
+    words = np.ravel(np.asarray(seed, object))
+    if not all(isinstance(word, (int, np.integer)) and 0 <= word < 2**64 for word in words):
+        raise ValueError(f"seed is {seed!r}: pass whole numbers from 0 to 2**64 - 1")
+    return np.random.default_rng([*map(int, words), what])
 
 
 def read_sensor(value: str | Sensor | Mapping, seed: ArrayLike = 0) -> Sensor:
