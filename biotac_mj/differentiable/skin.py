@@ -18,7 +18,7 @@ from .inverse import Factors
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
 
 # of a step: the gradient is that of a balance, and wrong by as much as that is missed
-TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-8, 300, 6000
+TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
 
 # what a skin is made of, as its kernels take it: shear modulus and second constant of the law [Pa], stiffness
 # of the contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
