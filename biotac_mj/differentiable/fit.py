@@ -17,6 +17,8 @@ from .sweep import Inputs, push_forward
 
 __all__ = ["Forces", "calibrate"]
 
+_PRECISION = 1e-6  # of the slopes, which only steer
+
 
 class Forces:
     """What `calibration.fit.forces_and_jacobian` gives, by gradients; keeps the skin from call to call.
@@ -84,6 +86,7 @@ class Forces:
                 configuration.options,
                 **geoms,
                 modulus=configuration.modulus,
+                precision=_PRECISION,
             )
         return self._skins[key]
 

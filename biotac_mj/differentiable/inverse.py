@@ -9,7 +9,8 @@ from ..skin.model import SkinModel
 
 __all__ = ["Factors", "RoughInverse", "solve_by_gmres"]
 
-_FACTOR = 120  # products with the tangent that cost as much as a factor
+_FACTOR = 80  # products with the tangent that cost as much as a factor
+_FEW = 8  # that a solve takes with a factor of the present shape
 
 
 class Factors:
@@ -30,7 +31,7 @@ class Factors:
 
     def watch(self, products: int, x: np.ndarray) -> None:
         """After solves that took so many products with the tangent at x (nvert, 3) [m]."""
-        self._products += products
+        self._products += max(products - _FEW, 0)
         if self._products > _FACTOR:
             self.now, self._products = self._model.factor_at(x), 0
 

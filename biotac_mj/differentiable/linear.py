@@ -25,7 +25,6 @@ from .wet import differentiate_push, differentiate_volume
 
 __all__ = ["GIVEN", "LinearStep"]
 
-PRECISION = 1e-10  # of a linear solve
 _SCALARS = (*NUMBERS, "offset", "reference")
 GIVEN = ("x_last", "anchor", "pose", "pose_last", "friction", *_SCALARS)
 
@@ -261,7 +260,10 @@ class LinearStep:
         """K^-1 r, or K^-T r, of r (3 nvert,); zero at fixed nodes."""
         with single_thread():
             found, count = solve_by_gmres(
-                lambda v: self._tangent(v, transpose), self._rough(transpose), r * self._free, PRECISION
+                lambda v: self._tangent(v, transpose),
+                self._rough(transpose),
+                r * self._free,
+                self._skin.precision,
             )
             self._skin.factors.watch(count, self.record.x)
         return found

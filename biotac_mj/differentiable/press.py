@@ -12,7 +12,7 @@ from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
 from .record import Changes, follow
 from .skin import NUMBERS, Skin
-from .sweep import Outputs, pull_back
+from .sweep import Inputs, Outputs, pull_back, push_forward
 
 __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
@@ -52,7 +52,8 @@ def press(
     friction: torch.Tensor | None = None,
     **parameters: torch.Tensor,
 ) -> Pressed:
-    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first.
+    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
+    backwards and, by `torch.autograd.forward_ad`, forwards.
 
     Worlds are walked one after another on the CPU. What a backward pass needs of a step is kept, some
     hundred kilobytes; no step is solved twice.
@@ -180,16 +181,30 @@ class _Press(torch.autograd.Function):
         incompressible = math.isinf(skin.model.options.bulk_modulus)
         context.trajectory = trajectory = follow(skin, *path, values, incompressible)
         changes += [record.changes for record in trajectory.steps]
-        context.save_for_backward(mat)
+        context.mat = mat.detach()
         out = Outputs.of(trajectory)
         return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
+
+    @staticmethod
+    def jvp(context, _skin, _changes, pos, mat, friction, numbers):
+        count, zero = len(NUMBERS), torch.zeros(())
+        pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
+        turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
+        turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1)
+        pose = torch.cat([pos + torch.zeros_like(turn), turn], -1)
+        friction, numbers = friction.expand(context.mat.shape[1]), numbers.expand(count)
+        ahead = Inputs(
+            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None]))
+        )
+        out = push_forward(context.skin, context.trajectory, ahead)
+        return tuple(torch.from_numpy(a[0]) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(context, nodes, wrench, pressure):
         given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
         found = pull_back(context.skin, context.trajectory, given)
-        (mat,) = context.saved_tensors
+        mat = context.mat
         move, turn = torch.from_numpy(found.pose).split(3, -1)
         x, y, z = turn.unbind(-1)
         zero = torch.zeros_like(x)

@@ -1,7 +1,7 @@
 """A skin and its geoms that gradients can pass through: one world on the CPU, steps solved tightly."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
@@ -35,6 +35,7 @@ class Skin:
         MAX_WORK.
       types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
       modulus: factors on Young's modulus, as `skin.SkinModel` has them.
+      precision: of the linear solves of a gradient.
 
     Attributes:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
@@ -56,7 +57,8 @@ class Skin:
         groups: ArrayLike | None = None,
         rounding: ArrayLike | None = None,
         grids: Sequence[DistanceGrid] = (),
-        modulus: ArrayLike | None = None,
+        modulus: ArrayLike | Callable | None = None,
+        precision: float = 1e-9,
     ):
         given = options or SkinOptions()
         tight = dataclasses.replace(
@@ -65,6 +67,7 @@ class Skin:
             max_newton=max(given.max_newton, MAX_NEWTON),
             max_work=max(given.max_work, MAX_WORK),
         )
+        self.precision = precision
         self.model = SkinModel(geometry, material, tight, modulus=modulus)
         refuse_beyond(self.model)
         if "ellipsoid" in types:
