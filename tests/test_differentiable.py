@@ -5,13 +5,16 @@ import functools
 import numpy as np
 import pytest
 import torch
+import trimesh
 from bubble import bubble
+from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
 from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.samples import differentiate_samples
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
-from biotac_mj.skin import ContactLaw, Material, SkinOptions
+from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
 
 TIGHT = 1e-10
 
@@ -91,6 +94,83 @@ def test_every_input_against_differences(element, liquid):
         assert found == pytest.approx((value.grad * way).sum().item(), rel=3e-6), name
 
 
+@pytest.mark.parametrize(
+    "material, options",
+    [
+        (Material("neo_hookean", 3e5, 0.48, 0.2, liquid=False), {"element": "quadratic"}),
+        (Material("svk", 1e6, 0.3, 0.2, liquid=False, stiffening=0.5), {"element": "linear"}),
+        (Material("linear", 1e6, 0.3, 0.2), {"element": "linear", "bulk_modulus": np.inf}),
+        (Material(friction=0.2), {"element": "linear", "bulk_modulus": 1e7, "fill_volume": 5e-9}),
+    ],
+    ids=["neo_hookean", "svk", "incompressible", "filled"],
+)
+def test_laws_and_liquids(material, options):
+    """Of Young's modulus, Poisson's ratio, the path, and a filling."""
+    skin = ball(material=material, **options)
+    # the volume of what hardly yields is known to rounding alone, and with it the pressure of differences
+    exact = 3e-4 if np.isinf(skin.model.options.bulk_modulus) else 1e-5
+    pos, quat = path(6, 2e-4)
+    given = {"youngs_modulus": material.youngs_modulus, "poissons_ratio": material.poissons_ratio}
+    sizes = {"pos": 1e-8, "youngs_modulus": 3e-4 * material.youngs_modulus, "poissons_ratio": 3e-4}
+    if skin.model.has_liquid:
+        given["fill_volume"], sizes["fill_volume"] = options.get("fill_volume", 0.0), 3e-12
+    given = {
+        name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in given.items()
+    }
+    given["pos"] = pos.requires_grad_()
+    loss_of(press(skin, quat=quat, **given)).backward()
+
+    def moved(h, name):
+        with torch.no_grad():
+            return loss_of(press(skin, quat=quat, **given | {name: given[name] + h})).item()
+
+    for name, size in sizes.items():
+        found = differences(functools.partial(moved, name=name), size)
+        assert found == pytest.approx(given[name].grad.sum().item(), rel=exact), name
+
+
+SHAPES = {
+    "plane": [0], "sphere": [4e-3], "capsule": [3e-3, 4e-3], "cylinder": [4e-3, 3e-3],
+    "box": [4e-3, 3e-3, 2e-3], "mesh": [0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_samples_on_every_shape(kind):
+    """Force and anchor by place, anchor, friction and stiffness; some points lie at a kink."""
+    draw, n = np.random.default_rng(3), 200
+    hull = trimesh.creation.icosphere(subdivisions=1, radius=4e-3)
+    grids = [bake_distance_grid(hull.vertices, hull.faces)] if kind == "mesh" else ()
+    rounding = 5e-4 * (kind in ("box", "cylinder"))
+    geoms = GeomSet([kind], [SHAPES[kind]], rounding=[rounding], grids=grids)
+    way = draw.normal(size=(n, 3))
+    local = way / np.linalg.norm(way, axis=1, keepdims=True) * draw.uniform(2e-3, 3.7e-3, (n, 1))
+    if kind == "plane":
+        local[:, 2] = -0.01 * abs(local[:, 2])
+    if kind == "mesh":
+        points, face = trimesh.sample.sample_surface(hull, n, seed=4)
+        local = points - 5e-5 * hull.face_normals[face]
+    given = [local, local + 2e-5 * draw.normal(size=(n, 3)), np.full(n, 0.5), np.full(n, 2e3)]
+    units = np.array([1e-2] * 3 + [1e-5] * 3)
+
+    def felt(*given):
+        return differentiate_samples(geoms.struct, np.zeros(n, int), *given, 0.1)
+
+    own = felt(*given)
+    assert own.slips.any() or kind in ("sphere", "mesh")
+    slopes = own.by_local, own.by_stick, own.by_friction[..., None], own.by_stiffness[..., None]
+    for at, (slope, size) in enumerate(zip(slopes, (1e-9, 1e-9, 1e-5, 1e-2))):
+        way = draw.normal(size=given[at].shape)
+        ends = []
+        for h in (size, -size):
+            one = felt(*given[:at], given[at] + h * way, *given[at + 1 :])
+            ends.append(np.concatenate([one.force, one.anchor], 1))
+        found = (ends[0] - ends[1]) / (2 * size) / units
+        expected = np.einsum("noi,ni->no", slope, way.reshape(n, -1)) / units
+        error = np.abs(found - expected).max(1) / (np.abs(expected).max(1) + 1e-3)
+        assert np.percentile(error, 97) < 1e-6
+
+
 def test_tangents_and_cotangents_are_of_one_jacobian():
     skin = ball(element="linear", liquid=True, bulk_modulus=1e5)  # others' slopes drown in that of water
     pos, _ = path(9)
@@ -140,6 +220,24 @@ def test_sixty_steps():
             return loss_of(press(skin, pos + h * way, quat)).item()
 
     assert differences(moved, 1e-8) == pytest.approx((shift.grad @ way).item(), rel=1e-4)
+
+
+def test_forward_mode():
+    skin = ball(element="linear", liquid=True, bulk_modulus=1e6)
+    pos, quat = path(6, 2e-4)
+    given = {"pos": pos, "quat": quat, "youngs_modulus": torch.tensor(1.4e6, dtype=torch.float64)}
+    draw = torch.Generator().manual_seed(3)
+    ways = {
+        name: torch.randn(value.shape, generator=draw, dtype=torch.float64) for name, value in given.items()
+    }
+    scale = {"pos": 1e-4, "quat": 1e-2, "youngs_modulus": 1e4}
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(value, scale[name] * ways[name]) for name, value in given.items()}
+        ahead = forward_ad.unpack_dual(loss_of(press(skin, **dual))).tangent.item()
+    given = {name: value.clone().requires_grad_() for name, value in given.items()}
+    loss_of(press(skin, **given)).backward()
+    back = sum((value.grad * scale[name] * ways[name]).sum().item() for name, value in given.items())
+    assert ahead == pytest.approx(back, rel=1e-6)
 
 
 def test_worlds_are_alone():
