@@ -1,5 +1,6 @@
 """Gradients of a press against central differences, on a small skin."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -10,6 +11,7 @@ from bubble import bubble
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
+from biotac_mj.differentiable.linear import LinearStep
 from biotac_mj.differentiable.record import follow
 from biotac_mj.differentiable.samples import differentiate_samples
 from biotac_mj.differentiable.skin import NUMBERS
@@ -92,6 +94,50 @@ def test_every_input_against_differences(element, liquid):
         way = torch.tensor(way / np.linalg.norm(way))
         found = differences(functools.partial(moved, name=name, way=way), STEPS[name])
         assert found == pytest.approx((value.grad * way).sum().item(), rel=3e-6), name
+
+
+def balanced(skin, record):
+    """The record at a balance to rounding, by Newton's method with the consistent tangent; the step there."""
+    for _ in range(8):
+        step = LinearStep(skin, record)
+        force = skin.data.force.numpy()[:, 0] * skin.model.free_mask.numpy()[:, None]
+        if np.linalg.norm(force) < 1e-10:
+            break
+        record = dataclasses.replace(record, x=record.x + step.solve(force.ravel()).reshape(-1, 3))
+    return record, step
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_one_step_to_rounding(element):
+    """Nodes and anchors after a step that sticks and slips, by the pose and the anchors before."""
+    skin = ball(element=element, liquid=True)
+    pos, _ = path(13)
+    mat = np.tile(np.eye(3), (13, 1, 1, 1))
+    steps = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False).steps
+    mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.held.sample)]
+    record, step = balanced(skin, mixed[-1])
+    draw = np.random.default_rng(5)
+    free = skin.model.free_mask.numpy()[:, None]
+    nodes, anchors = (
+        1e3 * free * draw.normal(size=record.x.shape),
+        draw.normal(size=step.touching.stick.shape),
+    )
+    slopes = step.pull(nodes, np.zeros((1, 6)), 0.0, 1e3 * anchors)
+
+    def moved(h, name, way):
+        if name == "anchor":
+            change = {"held": dataclasses.replace(record.held, anchor=record.held.anchor + h * way)}
+        else:
+            change = {"poses": record.poses | {"pos": record.poses["pos"] + h * way}}
+        there, step = balanced(skin, dataclasses.replace(record, **change))
+        after = skin.data.outer.trial_anchor.numpy()[step.touching.sample, 0]
+        return (nodes * there.x).sum() + 1e3 * (anchors * after).sum()
+
+    for name, shape in (("pose", (1, 3)), ("anchor", record.held.anchor.shape)):
+        way = draw.normal(size=shape)
+        expected = (slopes[name][..., :3] * way).sum()
+        found = differences(functools.partial(moved, name=name, way=way), 1e-8)
+        assert found == pytest.approx(expected, rel=1e-6), name
 
 
 @pytest.mark.parametrize(
