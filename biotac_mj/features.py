@@ -296,6 +296,24 @@ each world. What comes before the first row takes as long as what comes after it
 parameters."""
 
 
+# What `biotac_mj.differentiable` has gradients of: by what, and what is refused.
+_GRADIENTS = [
+    ("poses of geoms, pose of the core", "`press(pos, quat, core_pos, core_quat)`", "yes"),
+    ("Young's modulus, Poisson's ratio, friction, contact stiffness", "`press`, `calibrate`", "yes"),
+    ("fill volume, bulk modulus", "`press`, `calibrate`", "yes; of an incompressible liquid the fill alone"),
+    ("four and ten nodes, all laws, stiffening, modulus by element", "`Skin`", "yes"),
+    ("planes, spheres, capsules, cylinders, boxes, meshes; contact with the core", "`Skin`", "yes"),
+    ("nodes, wrench, pressure of every step", "`Pressed`", "yes, backwards and forwards"),
+    ("electrodes and PDC without rounding, by nodes, pressure and the film's constants", "`impedance`, "
+     "`electrode_counts`, `pdc_counts`", "yes; not what acts in time (warm-up, drift, low-pass, latency)"),
+    ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
+    ("rubber with prony, mullins or hysteresis; contact_law; implicit dynamics", "`Skin`", "refused by name"),
+    ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),
+    ("ellipsoids", "`Skin`", "refused by name"),
+    ("rest positions of nodes, heat, PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
+]  # fmt: skip
+
+
 def markdown() -> str:
     """`docs/features.md`."""
     lines = [
@@ -350,6 +368,15 @@ def markdown() -> str:
     lines.append("vibration out; calibrate and compare have no sensor.")
     lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _READINGS]
+    lines += [
+        "",
+        "## Gradients",
+        "",
+        "`tests/test_differentiable.py` and `test_differentiable_film.py` hold them ",
+    ]
+    lines[-1] += "against differences (docs/lab/differentiable.md)."
+    lines += ["", "| of, or by | where | there |", "|---|---|---|"]
+    lines += [f"| {' | '.join(row)} |" for row in _GRADIENTS]
     lines += ["", "## Beside other software", "", "| what | how | tried in |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _NEIGHBOURS]
     lines += ["", "## How options travel", ""]

@@ -11,7 +11,7 @@ import trimesh
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.sensor.film import FilmConduction, _spreading_table, sheet_laplacian, spreading_resistance
+from biotac_mj.sensor.film import FilmConduction, sheet_laplacian, spreading_resistance, spreading_table
 
 RADIUS, LENGTH, GAP, SIGMA = 5.325e-3, 100e-3, 0.4e-3, 0.5
 EXCITATION = tuple((-0.045, angle) for angle in np.radians([-135, -45, 45, 135]))
@@ -223,7 +223,7 @@ def test_against_a_sparse_solution(tube_film):
     solved = sparse_linalg.splu(matrix[1:, 1:]).solve(weight[1:])
     resistance = weight[1:].T @ solved  # against node 0
     a, local = film.electrode_radius, thickness @ weight
-    step, table = _spreading_table()
+    step, table = spreading_table()
     slab = np.interp(local / (local + a), step * np.arange(len(table)), table) / a
     resistance += np.diag(np.log(0.8e-3 / a) / (2 * np.pi * local) + slab) / SIGMA
     ground = np.block([[resistance[19:, 19:], np.ones((4, 1))], [np.ones((1, 4)), 0]])

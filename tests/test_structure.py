@@ -26,6 +26,7 @@ LAYERS = {
     "batch": "coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "batch",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
+    "differentiable": "geometry skin sensor threads calibration",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards versions press.approach "

@@ -15,6 +15,7 @@ TYPED = (
     "effects",
     "geometry",
     "calibration",
+    "differentiable",
     "tasks",
     "learning",
     "data",

@@ -6,6 +6,7 @@ SLSQP) minimises its square, which has the same minimum and a round bottom; a tr
 worlds of one batch; parameters that a batch shares (solver options) take a batch each."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -217,6 +218,7 @@ def calibrate(
     progress: bool = False,
     finer: SkinGeometry | None = None,
     corrections: int = 2,
+    forces: Callable | None = None,
 ) -> Calibration:
     """Fits parameters to the force of an indentation.
 
@@ -232,6 +234,8 @@ def calibrate(
         the difference of both meshes' forces at the fitted values and repeated, `corrections` times (space
         mapping): it ends where the finer mesh fits the data, at the price of `corrections` indentations of
         it.
+      forces: what gives forces and their Jacobian, as `forces_and_jacobian` does by differences. With
+        another the fit is Gauss and Newton's from the start.
 
     Raises:
       ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not
@@ -276,7 +280,7 @@ def calibrate(
             )
             cache[key] = (
                 values,
-                *forces_and_jacobian(fixed, material, parameters, values, indentation, device),
+                *(forces or forces_and_jacobian)(fixed, material, parameters, values, indentation, device),
             )
             bar.update()
             bar.set_postfix(rms_N=f"{np.sqrt(((cache[key][1] - indentation.force) ** 2).sum(1).mean()):.4f}")
@@ -309,9 +313,6 @@ def calibrate(
         dict(type="ineq", fun=lambda u: upper - start - back @ u, jac=lambda u: -back),
     ]
     settings = dict(ftol=1e-5, maxiter=max_iterations)
-    rough = minimize(
-        cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings
-    )
     # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and
     # Newton's needs no history
 
@@ -327,7 +328,13 @@ def calibrate(
             max_nfev=max_iterations,
         )
 
-    found, correction = finish(start + back @ rough.x, 0.0), 0.0
+    begun = start
+    if forces is None:
+        rough = minimize(
+            cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings
+        )
+        begun = start + back @ rough.x
+    found, correction = finish(begun, 0.0), 0.0
     modulus = configuration.modulus
     if finer is not None and modulus is not None and not callable(modulus):
         modulus = np.repeat(

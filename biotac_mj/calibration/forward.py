@@ -13,7 +13,7 @@ from ..skin import GeomSet, SkinModel, SkinOptions, bake_distance_grid, step
 from ..skin.per_world import make_worlds
 from .indentation import Indentation
 
-__all__ = ["Response", "displacement_norms", "simulate"]
+__all__ = ["Response", "Steps", "displacement_norms", "simulate", "steps_of"]
 
 _STRIDE = 2.5e-4  # [m] longer ways between two samples are taken in several steps
 
@@ -64,24 +64,53 @@ def simulate(
     materials = list(materials)
     model = SkinModel(geometry, materials[0], options, device, modulus=modulus)
     data = make_worlds(model, len(materials), materials)
-    geoms, place = _indenter(indentation, materials, device)
-    force, norms, steps = [], [], 0
-    at = indentation.tip[0]
-    geoms.set_pose(*place(at))
+    steps, shape = steps_of(indentation)
+    geoms = GeomSet(**shape, nworld=len(materials), device=device)
+    geoms.set_friction([[m.friction] for m in materials])
+    force, norms = [], []
     weight, outer = _outer_weights(geometry)
-    times = np.diff(indentation.time, prepend=2 * indentation.time[0] - indentation.time[1])
-    for tip, dt in zip(indentation.tip, times):
-        count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _STRIDE - 1e-9)))
-        for k in range(1, count + 1):
-            geoms.set_pose(*place(at + (tip - at) * k / count))
-            step(model, data, geoms, dt / count)
-        steps, at = steps + count, tip
+    for i, (pos, mat, dt) in enumerate(zip(steps.pos, steps.mat, steps.dt)):
+        geoms.set_pose(pos, mat)
+        step(model, data, geoms, dt)
+        if i not in steps.ends:
+            continue
         force.append(data.wrench[:, 0, :3])
         norms.append(displacement_norms(data.vert_xpos[:, outer] - geometry.vert[outer], weight))
         if progress:
             progress()
     peak, mean = np.moveaxis(np.array(norms), 0, -1)
-    return Response(np.swapaxes(force, 0, 1), peak, mean, data.nonconverged.copy(), steps)
+    return Response(np.swapaxes(force, 0, 1), peak, mean, data.nonconverged.copy(), len(steps.pos))
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """The way of an indentation in steps.
+
+    Attributes:
+      pos: (nstep, 1, 3) [m], mat: (nstep, 1, 3, 3) of the geom. dt: (nstep,) [s].
+      ends: (n,) number of the step at whose end each sample is.
+    """
+
+    pos: np.ndarray
+    mat: np.ndarray
+    dt: np.ndarray
+    ends: np.ndarray
+
+
+def steps_of(indentation: Indentation) -> tuple[Steps, dict]:
+    """The steps in which an indentation is walked, and the indenter as arguments of `skin.GeomSet`."""
+    shape, place = _indenter(indentation)
+    pos, mat, times, ends = [], [], [], []
+    at = indentation.tip[0]
+    times_of_samples = np.diff(indentation.time, prepend=2 * indentation.time[0] - indentation.time[1])
+    for tip, dt in zip(indentation.tip, times_of_samples):
+        count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _STRIDE - 1e-9)))
+        for k in range(1, count + 1):
+            p, m = place(at + (tip - at) * k / count)
+            pos, mat, times = [*pos, p], [*mat, m], [*times, dt / count]
+        at = tip
+        ends.append(len(pos) - 1)
+    return Steps(np.array(pos), np.array(mat), np.array(times), np.array(ends)), shape
 
 
 def displacement_norms(displacement: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -108,19 +137,13 @@ def _shape(name):
     return shape, bake_distance_grid(shape.vert, shape.face) if shape.type == "mesh" else None
 
 
-def _indenter(indentation, materials, device):
-    """The indenter as a GeomSet with a friction for each world, and tip -> (positions, rotations)."""
+def _indenter(indentation):
+    """The indenter as arguments of GeomSet, and tip -> (positions, rotations)."""
     shape, grid = _shape(indentation.indenter)
     mesh = grid is not None
-    geoms = GeomSet(
-        [shape.type],
-        [shape.size],
-        rounding=[shape.rounding],
-        grids=[grid] if mesh else (),
-        nworld=len(materials),
-        device=device,
+    geoms = dict(
+        types=[shape.type], sizes=[shape.size], rounding=[shape.rounding], grids=[grid] if mesh else ()
     )
-    geoms.set_friction([[m.friction] for m in materials])
     frame = matrix(indentation.quat / np.linalg.norm(indentation.quat))
     offset = np.zeros(3) if mesh else frame @ shape.pos
     rotation = frame if mesh else frame @ matrix(shape.quat)

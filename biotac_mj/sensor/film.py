@@ -48,6 +48,7 @@ __all__ = [
     "read_film",
     "sheet_laplacian",
     "spreading_resistance",
+    "spreading_table",
 ]
 
 # X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for
@@ -340,7 +341,7 @@ class BatchFilm:
         self._rhs = nblock * (reach + 1) * TILE
         electrode, face = film._pair
         order = np.argsort(electrode, kind="stable")
-        table_step, table = _spreading_table()
+        table_step, table = spreading_table()
         geometry = film.geometry
         with wp.ScopedDevice(self.device):
             self._core = (
@@ -542,7 +543,7 @@ def spreading_resistance(ratio: ArrayLike, npoint: int = 20000) -> np.ndarray:
     )
 
 
-def _spreading_table():
+def spreading_table() -> tuple[float, np.ndarray]:
     """Step in r / (1 + r), r = h / a, and values of `spreading_resistance`, between which the kernels
     interpolate."""
     s = np.linspace(0, 0.98, 200)

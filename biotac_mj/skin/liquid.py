@@ -82,6 +82,36 @@ def contact_pressure(i: int, w: int, geom: wp.array2d(dtype=int), force: wp.arra
     return c
 
 
+@wp.func
+def dried(
+    k: int,
+    w: int,
+    sample: wp.array(dtype=vec3),
+    area: real,
+    stiffness: real,
+    reference: real,
+    geom: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=vec3),
+):
+    """What the corners of face k lose of their wet thirds, and its overlap with the core that is no liquid
+    [m]."""
+    nsample = sample.shape[0]
+    share = real(1.0) / real(nsample)
+    full = real(2.0) * reference
+    loss = vec3()
+    overlap = real(0.0)
+    for s in range(nsample):
+        pressure = contact_pressure(k * nsample + s, w, geom, force, area * share)
+        dry = real(1.0)
+        if pressure < full:
+            dry = pressure / full
+            overlap += share * dry * pressure / (real(2.0) * stiffness)
+        else:
+            overlap += share * (pressure - reference) / stiffness
+        loss += share * dry * sample[s]
+    return loss, overlap
+
+
 @wp.kernel
 def wet_faces(
     # In:
@@ -120,19 +150,8 @@ def wet_faces(
         k = slot[f]
         if k >= 0:
             if touching[k, w] == 1:
-                nsample = sample.shape[0]
-                share = real(1.0) / real(nsample)
-                full = real(2.0) * reference[w]
-                overlap = real(0.0)
-                for s in range(nsample):
-                    pressure = contact_pressure(k * nsample + s, w, geom, force, area[k] * share)
-                    dry = real(1.0)
-                    if pressure < full:
-                        dry = pressure / full
-                        overlap += share * dry * pressure / (real(2.0) * stiffness[w])
-                    else:
-                        overlap += share * (pressure - reference[w]) / stiffness[w]
-                    wet -= share * dry * sample[s]
+                loss, overlap = dried(k, w, sample, area[k], stiffness[w], reference[w], geom, force)
+                wet -= loss
                 total += overlap * wp.length(normal) / real(2.0)
         wet_out[f, w] = wet
         g = real(-0.5) * normal

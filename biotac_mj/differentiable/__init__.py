@@ -1,0 +1,19 @@
+"""Gradients through rubber, liquid and film (extra `learning`, which has PyTorch)."""
+
+from .counts import electrode_counts, pdc_counts
+from .film import impedance
+from .fit import calibrate
+from .press import PARAMETERS, Pressed, press, relative_pose
+from .skin import Skin
+
+__all__ = [
+    "PARAMETERS",
+    "Pressed",
+    "Skin",
+    "calibrate",
+    "electrode_counts",
+    "impedance",
+    "pdc_counts",
+    "press",
+    "relative_pose",
+]

@@ -1,0 +1,38 @@
+"""Counts without rounding, as functions that PyTorch differentiates: what a sensor reads when nothing changes
+any more.
+
+What acts in time, warm-up, relaxation, loss, drift, low-pass and latency of `Sensor`, is not in them, nor is
+noise."""
+
+import torch
+
+from ..sensor.channels import DIVIDER, FULL_SCALE, PDC_REST, counts_from_impedance, counts_from_pressure
+from ..sensor.presets import Sensor
+
+__all__ = ["electrode_counts", "pdc_counts"]
+
+
+def electrode_counts(
+    impedance: torch.Tensor, rest: torch.Tensor, sensor: Sensor | None = None
+) -> torch.Tensor:
+    """Counts of the electrodes.
+
+    Args:
+      impedance: (..., 19) of the film [ohm]. rest: (19,) of the film at rest [ohm].
+      sensor: whose own rest counts, mixing, power and saturation count; None: `Sensor()`.
+    """
+    sensor = Sensor() if sensor is None else sensor
+    base = torch.tensor(sensor.rest, dtype=torch.float64)
+    own = DIVIDER * (FULL_SCALE / base - 1)
+    change = counts_from_impedance(own * (impedance / torch.as_tensor(rest)) ** sensor.power) - base
+    if sensor.mixing:
+        change = change @ torch.tensor(sensor.mixing, dtype=torch.float64).T
+    share, knee = sensor.saturation
+    over = (change.abs() - knee).clamp(min=0.0) * share
+    return base + change - change.sign() * over
+
+
+def pdc_counts(pressure: torch.Tensor, sensor: Sensor | None = None) -> torch.Tensor:
+    """Counts (...) of PDC at a pressure above rest [Pa]."""
+    sensor = Sensor() if sensor is None else sensor
+    return sensor.pdc_rest + sensor.pdc_gain * (counts_from_pressure(pressure) - PDC_REST)

@@ -1,0 +1,151 @@
+"""The film's impedances as a function that PyTorch differentiates: the equations of `sensor.film` on tensors.
+
+Which triangle of the core is nearest to a node and which faces lie over a disc is asked of the film itself;
+between two such changes impedances are smooth."""
+
+import math
+
+import numpy as np
+import torch
+
+from ..sensor.channels import NELECTRODE
+from ..sensor.film import FilmConduction, NoFilmError, spreading_table
+
+__all__ = ["impedance"]
+
+_INSIDE = 1e-9  # barycentric coordinate from which a point is on a triangle's edge
+_ON_EDGE = 1e-9  # as `sensor.film_kernels`: both faces take a sample on their edge
+
+
+def impedance(
+    film: FilmConduction,
+    nodes: torch.Tensor,
+    conductivity: torch.Tensor | None = None,
+    electrode_radius: torch.Tensor | None = None,
+    residual_film: torch.Tensor | None = None,
+    cell_constant: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Impedances (19,) [ohm] of E1..E19 over a deformed skin.
+
+    Args:
+      film: of the skin.
+      nodes: (nvert, 3) in the BioTac frame [m]; of a skin with edge nodes those of the film come first.
+      conductivity [S/m], electrode_radius [m], residual_film [m], cell_constant (19,): constants of the
+        sensor; None: the film's own.
+
+    Raises:
+      NoFilmError: an electrode that no film covers.
+    """
+    sigma, radius, least, cell = (
+        torch.as_tensor(own if given is None else given, dtype=torch.float64)
+        for own, given in (
+            (film.conductivity, conductivity),
+            (film.electrode_radius, electrode_radius),
+            (film.residual_film, residual_film),
+            (film.cell_constant, cell_constant),
+        )
+    )
+    middle, thickness = _lay(film, nodes[film.node], least)
+    face = torch.as_tensor(film.face.astype(np.int64))
+    system = _laplacian(middle, thickness, face, sigma)
+    weights, local = _cover(film, middle, thickness, face)
+    resistance = weights.T @ torch.linalg.solve(system, weights)
+    own = resistance.diagonal() + _near(film, local, radius, sigma)
+    ground, among = slice(NELECTRODE, None), resistance[NELECTRODE:, NELECTRODE:]
+    one = torch.ones(len(among), 1, dtype=torch.float64)
+    among = among - among.diagonal().diag() + own[ground].diag()
+    scale = among.diagonal().mean().detach()
+    border = torch.cat(
+        [torch.cat([among, scale * one], 1), torch.cat([scale * one.T, torch.zeros(1, 1).double()], 1)]
+    )
+    into = torch.cat([resistance[ground, :NELECTRODE], scale * torch.ones(1, NELECTRODE).double()])
+    return cell * (own[:NELECTRODE] - (into * torch.linalg.solve(border, into)).sum(0))
+
+
+def _lay(film, point, least):
+    """The surface halfway between skin and core, and the film's thickness."""
+    at = point.detach().numpy()
+    distance, foot, triangle = film.core.closest(at)
+    corner = film.core.core.corner.numpy()[triangle]
+    fixed, along = torch.from_numpy(foot), torch.from_numpy(_projection(corner, foot))
+    here = fixed + (along @ (point - torch.from_numpy(at))[..., None])[..., 0]
+    gap = point - here
+    thickness = torch.from_numpy(np.sign(distance)) * gap.norm(dim=-1)
+    thickness = torch.where(torch.from_numpy(distance) < float(least.detach()), least, thickness)
+    if film._power != 1.0:
+        rest = torch.from_numpy(film._rest_thickness)
+        thickness = rest * (thickness / rest) ** film._power
+    return point - 0.5 * gap, thickness
+
+
+def _projection(corner, foot):
+    """(n, 3, 3) onto what a foot moves along: the triangle, its edge, or nothing at a corner."""
+    a, b, c = np.moveaxis(corner, 1, 0)
+    normal = np.cross(b - a, c - a)
+    size = (normal**2).sum(1)
+    share = [(normal * np.cross(q - p, foot - p)).sum(1) / size for p, q in ((b, c), (c, a), (a, b))]
+    out = np.eye(3) - normal[:, :, None] * normal[:, None, :] / size[:, None, None]
+    on = np.array(share).T < _INSIDE
+    for k, (p, q) in enumerate(((b, c), (c, a), (a, b))):
+        edge = (q - p) / np.linalg.norm(q - p, axis=1, keepdims=True)
+        out[on[:, k]] = (edge[:, :, None] * edge[:, None, :])[on[:, k]]
+    out[on.sum(1) > 1] = 0
+    return out
+
+
+def _laplacian(middle, thickness, face, sigma):
+    """Of the sheet, (n, n); the first diagonal doubled, which holds the free constant."""
+    a, b, c = (middle[face[:, k]] for k in range(3))
+    side = c - b, a - c, b - a
+    area = torch.linalg.cross(side[0], side[1]).norm(dim=-1)
+    area = torch.maximum(area, 1e-6 * sum((e * e).sum(-1) for e in side))
+    scale = 0.5 * sigma * thickness[face].mean(1) / area
+    n = len(middle)
+    total = torch.zeros(n * n, dtype=torch.float64)
+    for k in range(3):
+        i, j = face[:, (k + 1) % 3], face[:, (k + 2) % 3]
+        value = -scale * (side[(k + 1) % 3] * side[(k + 2) % 3]).sum(-1)
+        for row, column, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            total = total.index_add(0, row * n + column, sign * value)
+    first = torch.zeros(n, n, dtype=torch.float64)
+    first[0, 0] = 1.0
+    total = total.reshape(n, n)
+    return total + first * total[0, 0]
+
+
+def _cover(film, middle, thickness, face):
+    """Weights (n, 23) of the discs' means, and their mean thickness (23,)."""
+    electrode, candidate = film._pair
+    corner = face[torch.from_numpy(candidate)]
+    tangent, pos = torch.from_numpy(film._tangent)[electrode], torch.from_numpy(film._pos)[electrode]
+    flat = torch.einsum("mak,mck->mca", tangent, middle[corner] - pos[:, None])
+    a, first, second = flat[:, 0], flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    d = torch.from_numpy(film._disc)[None] - a[:, None]
+    u = (d[..., 0] * second[:, None, 1] - d[..., 1] * second[:, None, 0]) / area[:, None]
+    v = (first[:, None, 0] * d[..., 1] - first[:, None, 1] * d[..., 0]) / area[:, None]
+    weight = torch.stack([1 - u - v, u, v], -1)
+    over = (weight.detach() >= -_ON_EDGE).all(-1).numpy()
+    hits = np.zeros((len(film._pos), len(film._disc)))
+    np.add.at(hits, electrode, over)
+    covered = (hits > 0).sum(1)
+    if (covered == 0).any():
+        raise NoFilmError(f"no liquid film over disc {int(np.argmin(covered)) + 1}: take a smaller step")
+    share = over / np.maximum(hits[electrode], 1) / covered[electrode][:, None]
+    weight = (weight * torch.from_numpy(share)[..., None]).sum(1)
+    n, m = len(middle), len(hits)
+    number = corner * m + torch.from_numpy(electrode)[:, None]
+    weights = torch.zeros(n * m, dtype=torch.float64).index_add(0, number.ravel(), weight.ravel())
+    weights = weights.reshape(n, m)
+    return weights, weights.T @ thickness
+
+
+def _near(film, local, radius, sigma):
+    """Resistance near a disc that the mesh does not see."""
+    step, table = spreading_table()
+    ratio = local / radius
+    s = ratio / (1 + ratio) / step
+    i = s.detach().long().clamp(max=len(table) - 2)
+    table, f = torch.from_numpy(table), (s - i).clamp(max=1.0)
+    slab = table[i] * (1 - f) + table[i + 1] * f
+    return (torch.log(film._footprint / radius) / (2 * math.pi * local) + slab / radius) / sigma

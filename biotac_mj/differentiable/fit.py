@@ -1,0 +1,113 @@
+"""`calibrate` by gradients: one press gives the forces and their derivatives by all parameters, where
+differences take a press for each."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from ..calibration import Calibration, Configuration, Indentation, Parameter
+from ..calibration import calibrate as calibrate_with
+from ..calibration.forward import steps_of
+from ..skin import Material
+from .press import PARAMETERS, numbers_of
+from .record import follow
+from .skin import NUMBERS, Skin
+from .sweep import Inputs, push_forward
+
+__all__ = ["Forces", "calibrate"]
+
+_PRECISION = 1e-6  # of the slopes, which only steer
+
+
+class Forces:
+    """What `calibration.fit.forces_and_jacobian` gives, by gradients; keeps the skin from call to call.
+
+    Raises:
+      ValueError: a parameter by which there is no gradient.
+    """
+
+    def __init__(self):
+        self._skins = {}
+
+    def __call__(
+        self,
+        configuration: Configuration,
+        material: Material,
+        parameters: list[Parameter],
+        values: np.ndarray,
+        indentation: Indentation,
+        device: str = "cpu",
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Forces (n, 3) [N], their derivatives by the scaled parameters (n, 3, p), steps that were lost."""
+        names = [p.name for p in parameters]
+        missing = sorted(set(names) - {"friction", *PARAMETERS})
+        if missing:
+            raise ValueError(
+                f"gradients by {', '.join(missing)} are not there: fit with calibration.calibrate, or choose "
+                f"from friction, {', '.join(PARAMETERS)}"
+            )
+        steps, geoms = steps_of(indentation)
+        skin = self._skin(configuration, material, geoms)
+        values = torch.tensor(values, dtype=torch.float64)
+        others = [name for name in names if name != "friction"]
+
+        def numbers(values):
+            given = numbers_of(skin, {name: values[names.index(name)] for name in others})
+            return torch.stack([given[name] for name in NUMBERS])
+
+        slopes = torch.autograd.functional.jacobian(numbers, values).numpy()
+        slopes = slopes * [p.slope(float(v)) for p, v in zip(parameters, values)]
+        friction = material.friction if "friction" not in names else float(values[names.index("friction")])
+        trajectory = follow(
+            skin,
+            steps.pos,
+            steps.mat,
+            np.array([friction]),
+            dict(zip(NUMBERS, numbers(values).tolist())),
+            np.isinf(configuration.options.bulk_modulus),
+        )
+        by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
+        ahead = Inputs(
+            np.zeros((len(parameters), len(steps.pos), 1, 6)),
+            np.array(by_friction),
+            dict(zip(NUMBERS, slopes)),
+        )
+        change = push_forward(skin, trajectory, ahead).wrench[:, steps.ends, 0, :3]
+        force = np.array([trajectory.steps[i].wrench[0, :3] for i in steps.ends])
+        return force, np.moveaxis(change, 0, -1), sum(r.changes.lost for r in trajectory.steps)
+
+    def _skin(self, configuration, material, geoms):
+        key = configuration.name, configuration.options, material
+        if key not in self._skins:
+            self._skins[key] = Skin(
+                configuration.geometry,
+                material,
+                configuration.options,
+                **geoms,
+                modulus=configuration.modulus,
+                precision=_PRECISION,
+            )
+        return self._skins[key]
+
+
+def calibrate(
+    configuration: Configuration,
+    material: Material,
+    indentation: Indentation,
+    parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
+    max_iterations: int = 20,
+    progress: bool = False,
+) -> Calibration:
+    """`calibration.calibrate` by gradients, on the CPU: Gauss and Newton's method from the start.
+
+    Args:
+      configuration, material, indentation, max_iterations, progress: see there.
+      parameters: E, nu, mu, fill_volume, bulk_modulus, contact_stiffness.
+
+    Raises:
+      ValueError: what `calibration.calibrate` and `Skin` raise, or a parameter by which there is no gradient.
+    """
+    return calibrate_with(
+        configuration, material, indentation, parameters, max_iterations, progress=progress, forces=Forces()
+    )

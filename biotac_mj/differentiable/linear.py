@@ -1,0 +1,325 @@
+"""A step at its balance, linear in all that it depends on: the implicit function theorem.
+
+At the end of a step the forces f on the free nodes balance, f(x, u) = 0, with u all that the step was given.
+So dx = K^-1 (df/du) du with the tangent K = -df/dx, and what the step gives out follows. Conjugate
+gradients of a forward step take a symmetric tangent; here it is the consistent one, with the friction that
+follows the normal force, the curvature of the geoms and the pressure that follows what lies dry on the core.
+It is not symmetric, so a cotangent is solved with its transpose, by GMRES (`inverse` makes it short).
+
+Columns of u, one after another: the nodes when the step began, the anchors then, poses of the geoms (a
+translation and a rotation vector about the geom's own origin, both in the BioTac frame) when it ended and
+began, frictions, and `skin.NUMBERS` with the pressures `offset` and `reference` of `newton.worlds.Worlds`.
+Rows of what comes out: wrenches of the groups, anchors of the samples that touch, the liquid's pressure."""
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..geometry.rigid import skew
+from ..threads import single_thread
+from .inverse import RoughInverse, solve_by_gmres
+from .record import Record, restore
+from .samples import differentiate_samples
+from .skin import NUMBERS, Skin
+from .touching import Held, look
+from .wet import differentiate_push, differentiate_volume
+
+__all__ = ["GIVEN", "LinearStep"]
+
+_SCALARS = (*NUMBERS, "offset", "reference")
+GIVEN = ("x_last", "anchor", "pose", "pose_last", "friction", *_SCALARS)
+
+
+class LinearStep:
+    """The step of a record, see the module's docstring. What is given has the names of GIVEN:
+    x_last (nvert, 3), anchor (nheld, 3), pose and pose_last (ngeom, 6), friction (ngeom,), else numbers.
+
+    Raises:
+      ValueError: a linear solve did not come to its end.
+    """
+
+    def __init__(self, skin: Skin, record: Record):
+        self._skin, self.record = skin, record
+        self.n, self.ngeom, self.ngroup = skin.model.nvert, record.geoms.count, record.geoms.ngroup
+        sizes = [3 * self.n, 3 * len(record.held.sample), 6 * self.ngeom, 6 * self.ngeom, self.ngeom]
+        sizes += [1] * len(_SCALARS)
+        ends = np.cumsum(sizes)
+        self._columns = {name: slice(end - size, end) for name, size, end in zip(GIVEN, sizes, ends)}
+        self.ngiven = int(ends[-1])
+        free = np.zeros(self.n)
+        free[skin.model.free] = 1
+        self._free = np.repeat(free, 3)
+        with single_thread():
+            restore(skin, record)
+            self._contact()
+            self._rubber()
+            self._liquid()
+            self._turn_pushes()
+
+    # --- derivatives of the parts ---
+
+    def _contact(self):
+        skin, record, model = self._skin, self.record, self._skin.model
+        struct = record.geoms.struct
+        at = look(skin.data.outer, skin.weights, struct, record.x, record.x_last, record.held)
+        self.touching = at
+        jacobians, felt = self._felt(at, struct)
+        m, n = len(at.sample), self.n
+        self._force_by_x, self._force_by = felt[0][: 3 * m], felt[1][: 3 * m]
+        self.anchor_by_x, self.anchor_by = felt[0][3 * m :], felt[1][3 * m :]
+        spread = _interpolation(at, n)
+        force = np.einsum("mij,mj->mi", record.poses["mat"][at.geom], jacobians.force)
+        self._fx, self._fu = spread.T @ self._force_by_x, spread.T @ self._force_by
+        # wrench: -sum F, -sum p x F
+        rows = 6 * record.geoms.groups[at.geom][:, None] + np.arange(6)
+        collect = np.concatenate([np.tile(-np.eye(3), (m, 1, 1)), -skew(at.point)], 1)
+        shape = 6 * self.ngroup, 3 * m
+        collect = _blocks(rows, 3 * np.arange(m)[:, None] + np.arange(3), collect, shape)
+        turn = _blocks(rows[:, 3:], 3 * np.arange(m)[:, None] + np.arange(3), skew(force), shape)
+        self.wrench_by_x = collect @ self._force_by_x + turn @ spread
+        self.wrench_by = collect @ self._force_by
+        self._core = None
+        if skin.data.core and (skin.data.core.trial_geom.numpy() >= 0).any():
+            core = model.core(1).struct
+            none = Held(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+            there = look(skin.data.core, skin.weights, core, record.x, record.x, none)
+            pushed, felt = self._felt(there, core, alone=True)
+            k = len(there.sample)
+            self._core = there, pushed.force, felt[0][: 3 * k], felt[1][: 3 * k]
+            spread = _interpolation(there, n)
+            self._fx, self._fu = (
+                self._fx + spread.T @ felt[0][: 3 * k],
+                self._fu + spread.T @ felt[1][: 3 * k],
+            )
+
+    def _felt(self, at, struct, alone=False):
+        """Jacobians of the samples, and force (world) and anchor (geom's frame) (6m, ...) by x and by u.
+        alone: of geoms that are no input."""
+        skin, m, n = self._skin, len(at.sample), self.n
+        pos, mat, pos_last, mat_last, friction = (
+            getattr(struct, name).numpy()[:, 0] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
+        )
+        springs = self.record.numbers["contact_stiffness"] * at.area
+        ratio = skin.model.options.stick_ratio
+        own = differentiate_samples(struct, at.geom, at.local, at.stick, friction[at.geom], springs, ratio)
+        R = mat[at.geom]
+
+        def outward(J):  # forces into the BioTac frame; rows of all forces, then of all anchors
+            return np.concatenate([R @ J[:, :3], J[:, 3:]])
+
+        numbers = np.arange(m)[:, None]
+        rows = np.concatenate([3 * numbers, 3 * (numbers + m)]) + np.arange(3)
+        three = 3 * numbers + np.arange(3)
+        twice = np.concatenate([three, three])
+        by_local = _blocks(rows, twice, outward(own.by_local), (6 * m, 3 * m))
+        local_by_point = _blocks(three, three, np.swapaxes(R, 1, 2), (3 * m, 3 * m))
+        by_x = by_local @ local_by_point @ _interpolation(at, n)
+        by = sp.csr_matrix((6 * m, self.ngiven))
+        column = self._columns["contact_stiffness"].start
+        by_springs = outward(own.by_stiffness[..., None])[:, :, 0] * np.tile(at.area, 2)[:, None]
+        by = by + _blocks(rows, np.full((2 * m, 1), column), by_springs[..., None], by.shape)
+        if alone or not m:
+            return own, (by_x, by)
+        geom, shape = at.geom[:, None], (3 * m, self.ngiven)
+        six = 6 * geom + np.arange(6)
+        # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
+        RT = np.swapaxes(R, 1, 2)
+        moved = np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
+        by = by + by_local @ _blocks(three, self._columns["pose"].start + six, moved, shape)
+        force = np.einsum("mij,mj->mi", R, own.force)
+        turned = np.concatenate([np.zeros((m, 3, 3)), -skew(force)], 2)
+        by = by + _blocks(three, self._columns["pose"].start + six, turned, by.shape)
+        by_friction = outward(own.by_friction[..., None])
+        column = self._columns["friction"].start + np.concatenate([geom, geom])
+        by = by + _blocks(rows, column, by_friction, by.shape)
+        by_stick = _blocks(rows, twice, outward(own.by_stick), (6 * m, 3 * m))
+        old, new = np.flatnonzero(at.old >= 0), np.flatnonzero(at.old < 0)
+        anchor = self._columns["anchor"].start + 3 * at.old[old][:, None] + np.arange(3)
+        eye = np.tile(np.eye(3), (len(old), 1, 1))
+        stick = _blocks(three[old], anchor, eye, shape)
+        RT = np.swapaxes(mat_last[at.geom[new]], 1, 2)
+        moved = np.concatenate([-RT, RT @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
+        stick = stick + _blocks(three[new], self._columns["pose_last"].start + six[new], moved, shape)
+        for a in range(3):
+            block = at.weight[new, a, None, None] * RT
+            stick = stick + _blocks(three[new], 3 * at.node[new, a][:, None] + np.arange(3), block, shape)
+        return own, (by_x, by + by_stick @ stick)
+
+    def _rubber(self):
+        """Forces of the rubber are homogeneous in both its constants, and linear in the second on either side
+        of where points feel no more of it (`Tetrahedra.cap`): two evaluations are exact."""
+        skin, numbers = self._skin, self.record.numbers
+        mu, lam, lams = numbers["mu"], numbers["lam"], skin.data.rubber.lam
+        other = lam * (2.0 if lam > skin.model.elements.cap * mu else 0.5)
+        lams.fill_(other)
+        there = skin.push_rubber()
+        lams.fill_(lam)
+        here = skin.push_rubber()
+        by_lam = (there - here) / (other - lam)
+        self._dense = {"lam": by_lam, "mu": (here - lam * by_lam) / mu}
+
+    def _liquid(self):
+        """The pressure is p = offset - kappa (V - natural), and pushes by the area vectors G."""
+        skin, numbers, model = self._skin, self.record.numbers, self._skin.model
+        self._push = self._pressure_by_x = np.zeros(3 * self.n)
+        self._pressure_by = np.zeros(self.ngiven)
+        self.pressure = 0.0
+        if not model.has_liquid:
+            return
+        world = skin.read("pressure", "volume")
+        kappa, reference, k = (numbers[name] for name in ("kappa", "reference", "contact_stiffness"))
+        self.pressure, self._push = world["pressure"], skin.data.gradient.numpy()[:, 0].ravel()
+        none = np.zeros((0, 3)), np.zeros(0, int)
+        core, area = skin.data.core, model.inner.area
+        if core:
+            none = core.sample_force.numpy()[:, 0], core.trial_geom.numpy()[:, 0]
+            area = core.surface.area
+        volume = differentiate_volume(
+            self.record.x, model.inner.face, model.core_slot, area, model.sample, *none, k, reference
+        )
+        by_x, by = volume.by_node.ravel(), np.zeros(self.ngiven)
+        by[self._columns["contact_stiffness"]] = volume.by_stiffness
+        by[self._columns["reference"]] = volume.by_reference
+        if self._core:
+            at, force, force_by_x, force_by = self._core
+            by_force = volume.by_force[at.sample].ravel()
+            by_x, by = by_x + force_by_x.T @ by_force, by + force_by.T @ by_force
+            self._dry(at, force, force_by_x, force_by, k, reference)
+        self._pressure_by_x, self._pressure_by = -kappa * by_x, -kappa * by
+        for name, value in (
+            ("offset", 1.0), ("kappa", numbers["natural"] - world["volume"]), ("natural", kappa)
+        ):  # fmt: skip
+            self._pressure_by[self._columns[name]] += value
+
+    def _dry(self, at, force, force_by_x, force_by, k, reference):
+        """What the pressure pushes less where the core dries more of the skin."""
+        core, s = self._skin.data.core, len(self._skin.weights)
+        face = np.unique(at.sample // s)
+        samples = s * face[:, None] + np.arange(s)
+        pushes, geom = core.sample_force.numpy()[samples, 0], core.trial_geom.numpy()[samples, 0]
+        pushes = np.where(geom[..., None] >= 0, pushes, 0.0)
+        node = core.surface.face_np[face]
+        corner, area = self.record.x[node], core.surface.area.numpy()[face]
+        by_force, by_reference = differentiate_push(
+            corner, area, self._skin.model.sample, pushes, geom, k, reference
+        )
+        m = len(face)
+        rows = (3 * node[:, :, None] + np.arange(3)).reshape(m, 9)
+        number = np.full(len(core.trial_geom), -1)
+        number[at.sample] = np.arange(len(at.sample))
+        f, i = np.nonzero(geom >= 0)
+        columns = 3 * number[samples[f, i]][:, None] + np.arange(3)
+        push = _blocks(rows[f], columns, by_force[f, :, i], (3 * self.n, 3 * len(at.sample)))
+        self._fx = self._fx + self.pressure * (push @ force_by_x)
+        self._fu = self._fu + self.pressure * (push @ force_by)
+        dense = np.zeros(3 * self.n)
+        np.add.at(dense, rows, by_reference)
+        self._dense["reference"] = self.pressure * dense
+
+    def _turn_pushes(self):
+        """The area vectors turn with their faces, where what is wet stays; what contact adds before that is
+        known to the approximate inverse as well."""
+        row = np.unique(self._fx.nonzero()[0])
+        self._nodes, self._inverses = np.unique(row[self._free[row] > 0] // 3), {}
+        dof = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self._stiff = -self._fx[dof][:, dof].toarray()
+        if self.pressure == 0:
+            return
+        face = self._skin.model.inner.face_np
+        corner = self.record.x[face]
+        wet = self._skin.solver(self.record.geoms).k.wet.numpy()[:, 0]
+        second = 0.5 * skew(corner[:, 2] - corner[:, 0])
+        third = -0.5 * skew(corner[:, 1] - corner[:, 0])
+        turn = np.concatenate([-second - third, second, third], 2)  # of -(x1 - x0) x (x2 - x0) / 2
+        turn = self.pressure * np.einsum("fa,fij->faij", wet, turn).reshape(len(face), 9, 9)
+        at = (3 * face[:, :, None] + np.arange(3)).reshape(len(face), 9)
+        self._fx = self._fx + _blocks(at, at, turn, self._fx.shape)
+
+    # --- solves ---
+
+    def _tangent(self, v, transpose=False):
+        """The consistent tangent times v (3 nvert,), zero at fixed nodes."""
+        rest = self._skin.multiply_rubber(self._free * v)
+        left, right = self._push, self._pressure_by_x
+        if transpose:
+            left, right = right, left
+        own = self._fx.T if transpose else self._fx
+        return self._free * (rest - own @ v - left * (right @ v))
+
+    def _rough(self, transpose):
+        """The approximate inverse, made when first asked for."""
+        if transpose not in self._inverses:
+            nodes, stiff = self._nodes, self._stiff
+            a, b = -self._push * self._free, self._pressure_by_x * self._free
+            if transpose:
+                stiff, a, b = stiff.T, b, a
+            soft = self.record.numbers["softness"]
+            self._inverses[transpose] = RoughInverse(self._skin.factors, soft, nodes, stiff, a, b)
+        return self._inverses[transpose]
+
+    def solve(self, r: np.ndarray, transpose: bool = False) -> np.ndarray:
+        """K^-1 r, or K^-T r, of r (3 nvert,); zero at fixed nodes."""
+        with single_thread():
+            found, count = solve_by_gmres(
+                lambda v: self._tangent(v, transpose),
+                self._rough(transpose),
+                r * self._free,
+                self._skin.precision,
+            )
+            self._skin.factors.watch(count, self.record.x)
+        return found
+
+    # --- what comes out by what goes in ---
+
+    def pull(self, x: np.ndarray, wrench: np.ndarray, pressure: float, anchor: np.ndarray) -> dict:
+        """Cotangents of what the step was given, from those of what it gives.
+
+        Args:
+          x: (nvert, 3). wrench: (ngroup, 6). pressure: a number.
+          anchor: (m, 3) of the samples that touch.
+        """
+        wrench, anchor = wrench.ravel(), anchor.ravel()
+        g = x.ravel() + self.wrench_by_x.T @ wrench + self.anchor_by_x.T @ anchor
+        balance = self.solve(g + pressure * self._pressure_by_x, transpose=True)
+        pressure = pressure + self._push @ balance
+        given = self._fu.T @ balance + self.wrench_by.T @ wrench + self.anchor_by.T @ anchor
+        given = given + pressure * self._pressure_by
+        for name, column in self._dense.items():
+            given[self._columns[name]] += column @ balance
+        return self._named(given)
+
+    def push(self, given: dict) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        """Tangents of what the step gives, as `pull` names them, from those of what it was given; what is not
+        named does not change."""
+        u = np.zeros(self.ngiven)
+        for name, value in given.items():
+            u[self._columns[name]] = np.ravel(value)
+        pressure = self._pressure_by @ u
+        force = self._fu @ u + self._push * pressure
+        for name, column in self._dense.items():
+            force = force + column * u[self._columns[name]]
+        x = self.solve(force)
+        return (
+            x.reshape(-1, 3),
+            (self.wrench_by_x @ x + self.wrench_by @ u).reshape(-1, 6),
+            float(pressure + self._pressure_by_x @ x),
+            (self.anchor_by_x @ x + self.anchor_by @ u).reshape(-1, 3),
+        )
+
+    def _named(self, u):
+        shapes = {"x_last": (-1, 3), "anchor": (-1, 3), "pose": (-1, 6), "pose_last": (-1, 6)}
+        shapes |= {"friction": (-1,)} | dict.fromkeys(_SCALARS, ())
+        return {name: u[self._columns[name]].reshape(shapes[name]) for name in GIVEN}
+
+
+def _blocks(rows, columns, values, shape):
+    """Sparse sum of m dense blocks (m, r, c) at rows (m, r) and columns (m, c)."""
+    at = np.broadcast_arrays(rows[:, :, None], columns[:, None, :], values)
+    return sp.coo_matrix((at[2].ravel(), (at[0].ravel(), at[1].ravel())), shape=shape).tocsr()
+
+
+def _interpolation(at, n):
+    """(3m, 3n): the samples' points of the nodes."""
+    m = len(at.sample)
+    numbers = np.arange(m)[:, None]
+    flat = _blocks(numbers, at.node, at.weight[:, None, :], (m, n))
+    return sp.kron(flat, sp.identity(3), format="csr")

@@ -1,0 +1,213 @@
+"""A press as a function that PyTorch differentiates."""
+
+import dataclasses
+import math
+import types
+
+import numpy as np
+import torch
+
+from ..skin.model import stiffness_of_contact
+from ..skin.rubber.law import LAWS
+from ..skin.rubber.material import Material
+from .record import Changes, follow
+from .skin import NUMBERS, Skin
+from .sweep import Inputs, Outputs, pull_back, push_forward
+
+__all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
+
+# of the skin, which `press` takes; what is not given is the skin's own
+PARAMETERS = ("youngs_modulus", "poissons_ratio", "fill_volume", "bulk_modulus", "contact_stiffness")
+
+
+@dataclasses.dataclass
+class Pressed:
+    """What a press gives, as tensors of double precision that know their gradients.
+
+    Attributes:
+      nodes: (..., nstep, nvert, 3) in the BioTac frame [m].
+      wrench: (..., nstep, ngroup, 6) of the skin on the geoms, torque about the frame's origin [N, N m].
+      pressure: (..., nstep) of the liquid above rest [Pa].
+      changes: for each world a list of `Changes`, one for each step: where a gradient holds on one side only.
+    """
+
+    nodes: torch.Tensor
+    wrench: torch.Tensor
+    pressure: torch.Tensor
+    changes: list
+
+    @property
+    def counts(self) -> Changes:
+        """Changes of all steps of all worlds together."""
+        steps = [dataclasses.astuple(change) for world in self.changes for change in world]
+        return Changes(*np.sum(steps, 0).tolist())
+
+
+def press(
+    skin: Skin,
+    pos: torch.Tensor,
+    quat: torch.Tensor,
+    core_pos: torch.Tensor | None = None,
+    core_quat: torch.Tensor | None = None,
+    friction: torch.Tensor | None = None,
+    **parameters: torch.Tensor,
+) -> Pressed:
+    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
+    backwards and, by `torch.autograd.forward_ad`, forwards.
+
+    Worlds are walked one after another on the CPU. What a backward pass needs of a step is kept, some
+    hundred kilobytes; no step is solved twice.
+
+    Args:
+      skin: the skin and its geoms.
+      pos: (nstep, ngeom, 3) or (nworld, nstep, ngeom, 3), of the geoms [m].
+      quat: the same of 4, w x y z; of any length but zero.
+      core_pos, core_quat: (..., nstep, 3) [m] and (..., nstep, 4) pose of the BioTac, in the frame in which
+        those of the geoms are; None: they are in the BioTac frame.
+      friction: (ngeom,) or (nworld, ngeom) Coulomb's coefficients; None: the skin's.
+      parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
+        (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
+        contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
+
+    Raises:
+      ValueError: shapes that do not fit, an unknown parameter, or one that the skin has no use for.
+    """
+    pos, quat = (torch.as_tensor(value, dtype=torch.float64) for value in (pos, quat))
+    if core_pos is not None or core_quat is not None:
+        pos, quat = relative_pose(core_pos, core_quat, pos, quat)
+    count, alone = skin.geoms.count, pos.ndim == 3
+    if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
+        raise ValueError(
+            f"pos has shape {tuple(pos.shape)} and quat {tuple(quat.shape)}: pass (nstep, {count}, 3) and "
+            f"(nstep, {count}, 4), or both with a leading nworld"
+        )
+    if alone:
+        pos, quat = pos[None], quat[None]
+    nworld = len(pos)
+    if friction is None:
+        friction = torch.as_tensor(skin.friction)
+    friction = _of_worlds("friction", friction, nworld, (count,))
+    given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
+    worlds, changes = [], []
+    for w in range(nworld):
+        numbers = numbers_of(skin, {name: value[w] for name, value in given.items()})
+        stacked = torch.stack([numbers[name] for name in NUMBERS])
+        changes.append([])
+        worlds.append(_Press.apply(skin, changes[-1], pos[w], _matrix(quat[w]), friction[w], stacked))
+    nodes, wrench, pressure = (torch.stack(parts) for parts in zip(*worlds))
+    if alone:
+        nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
+    return Pressed(nodes, wrench, pressure, changes)
+
+
+def numbers_of(skin: Skin, parameters: dict) -> dict:
+    """`skin.NUMBERS` as tensors, of the skin's material with other PARAMETERS.
+
+    Raises:
+      ValueError: an unknown parameter, or one of the liquid of a dry skin.
+    """
+    model, options = skin.model, skin.model.options
+    unknown = set(parameters) - set(PARAMETERS)
+    if unknown:
+        raise ValueError(
+            f"cannot press with {', '.join(sorted(unknown))}: choose from {', '.join(PARAMETERS)}"
+        )
+    wet = {"fill_volume", "bulk_modulus"} & set(parameters)
+    if wet and not model.has_liquid:
+        raise ValueError(f"the skin has no liquid: leave {' and '.join(sorted(wet))} out")
+    if "bulk_modulus" in parameters and math.isinf(options.bulk_modulus):
+        raise ValueError("the skin's liquid is incompressible: make the skin with a finite bulk_modulus")
+    own = {name: getattr(model.material, name, None) for name in PARAMETERS}
+    own |= {name: getattr(options, name) for name in PARAMETERS if own[name] is None}
+    own = types.SimpleNamespace(**own | parameters)
+    as_is = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in skin.own.items()}
+    if {"youngs_modulus", "poissons_ratio"} & set(parameters):
+        # the material's own formulas, of tensors
+        as_is["mu"] = Material.mu.fget(own)
+        as_is["lam"] = (Material.bulk if model.law == LAWS["neo_hookean"] else Material.lame).fget(own)
+    if own.contact_stiffness is None:
+        own.contact_stiffness = stiffness_of_contact(own)
+    as_is["contact_stiffness"] = torch.as_tensor(own.contact_stiffness, dtype=torch.float64)
+    if wet:
+        bulk = as_is["kappa"] * as_is["natural"]
+        if "fill_volume" in parameters:
+            as_is["natural"] = model.liquid_volume + own.fill_volume
+        if "bulk_modulus" in parameters:
+            bulk = own.bulk_modulus
+        as_is["kappa"] = bulk / as_is["natural"]
+    return as_is
+
+
+def relative_pose(
+    core_pos: torch.Tensor, core_quat: torch.Tensor, pos: torch.Tensor, quat: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Poses of geoms (..., ngeom, 3), (..., ngeom, 4) as seen from the BioTac at (..., 3), (..., 4)."""
+    core_quat = core_quat / core_quat.norm(dim=-1, keepdim=True)
+    turn = _matrix(core_quat).transpose(-1, -2)[..., None, :, :]
+    w, v = core_quat[..., None, :1], -core_quat[..., None, 1:]
+    a, b = quat[..., :1], quat[..., 1:]
+    turned = torch.cat(
+        [w * a - (v * b).sum(-1, keepdim=True), w * b + a * v + torch.linalg.cross(v.expand_as(b), b)], -1
+    )
+    return (turn @ (pos - core_pos[..., None, :])[..., None])[..., 0], turned
+
+
+def _matrix(quat):
+    """(..., 3, 3) of (..., 4)."""
+    w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).reshape(*quat.shape[:-1], 3, 3)
+
+
+def _of_worlds(name, value, nworld, shape):
+    value = torch.as_tensor(value, dtype=torch.float64)
+    if value.shape not in (shape, (nworld, *shape)):
+        raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
+    return value.expand(nworld, *shape)
+
+
+class _Press(torch.autograd.Function):
+    """One world. Rotations are matrices here: their cotangents are those that lie along rotations."""
+
+    @staticmethod
+    def forward(context, skin, changes, pos, mat, friction, numbers):
+        context.skin = skin
+        values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
+        path = (a.detach().numpy() for a in (pos, mat, friction))
+        incompressible = math.isinf(skin.model.options.bulk_modulus)
+        context.trajectory = trajectory = follow(skin, *path, values, incompressible)
+        changes += [record.changes for record in trajectory.steps]
+        context.mat = mat.detach()
+        out = Outputs.of(trajectory)
+        return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
+
+    @staticmethod
+    def jvp(context, _skin, _changes, pos, mat, friction, numbers):
+        count, zero = len(NUMBERS), torch.zeros(())
+        pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
+        turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
+        turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1)
+        pose = torch.cat([pos + torch.zeros_like(turn), turn], -1)
+        friction, numbers = friction.expand(context.mat.shape[1]), numbers.expand(count)
+        ahead = Inputs(
+            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None]))
+        )
+        out = push_forward(context.skin, context.trajectory, ahead)
+        return tuple(torch.from_numpy(a[0]) for a in (out.nodes, out.wrench, out.pressure))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(context, nodes, wrench, pressure):
+        given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
+        found = pull_back(context.skin, context.trajectory, given)
+        mat = context.mat
+        move, turn = torch.from_numpy(found.pose).split(3, -1)
+        x, y, z = turn.unbind(-1)
+        zero = torch.zeros_like(x)
+        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(mat.shape)
+        numbers = torch.tensor([found.numbers[name] for name in NUMBERS], dtype=torch.float64)
+        return None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), numbers

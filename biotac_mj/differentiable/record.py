@@ -1,0 +1,136 @@
+"""A press step by step, with all that its gradient needs: the state in which every step began, and where it
+ended. No step is solved a second time."""
+
+import dataclasses
+
+import numpy as np
+
+from ..skin import GeomSet, step
+from .skin import NUMBERS, Skin
+from .touching import Held, look
+
+__all__ = ["Changes", "Record", "Trajectory", "follow", "restore"]
+
+_WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds`, as a step had them
+
+
+@dataclasses.dataclass(frozen=True)
+class Changes:
+    """Samples of a step at which the force has a kink: a gradient holds on one side of it.
+
+    Attributes:
+      touched, parted: began, ceased to touch. slipped, stuck: began, ceased to slip.
+      lost: 1 where the step found no balance: its gradient means nothing.
+    """
+
+    touched: int = 0
+    parted: int = 0
+    slipped: int = 0
+    stuck: int = 0
+    lost: int = 0
+
+
+@dataclasses.dataclass
+class Record:
+    """One step.
+
+    Attributes:
+      geoms: what touched: the skin's, or nothing.
+      x, x_last: (nvert, 3) nodes when it ended and began [m].
+      held: what stuck when it began.
+      poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, ...).
+      numbers: of the world. last_pressure: of the liquid when it began.
+      wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
+      touches, slips: samples that touch, that slip, when it ends.
+      changes: against the step before.
+    """
+
+    geoms: GeomSet
+    x: np.ndarray
+    x_last: np.ndarray
+    held: Held
+    poses: dict
+    numbers: dict
+    last_pressure: float
+    wrench: np.ndarray
+    pressure: float
+    touches: np.ndarray
+    slips: np.ndarray
+    changes: Changes
+
+
+@dataclasses.dataclass
+class Trajectory:
+    """Records of a press: of the skin at rest on its filling, None of a dry one, and of the steps."""
+
+    rest: Record | None
+    steps: list
+
+
+def follow(
+    skin: Skin, pos: np.ndarray, mat: np.ndarray, friction: np.ndarray, numbers: dict, incompressible: bool
+) -> Trajectory:
+    """Takes the geoms along a path, from a skin at rest.
+
+    Args:
+      skin: the skin.
+      pos, mat: (nstep, ngeom, 3) [m], (nstep, ngeom, 3, 3) in the BioTac frame.
+      friction: (ngeom,). numbers: of NUMBERS.
+      incompressible: whether the liquid's pressure is an unknown of its own.
+    """
+    data, geoms = skin.data, skin.geoms
+    data.reset()
+    skin.write(numbers)
+    geoms.set_friction(friction)
+    rest = None
+    if skin.model.has_liquid:
+        data.worlds.holds.fill_(int(incompressible or numbers["kappa"] == 0))
+        rest = _advance(skin, skin.nothing, None)
+    geoms.set_pose(pos[0], mat[0])
+    geoms.advance()
+    steps, before = [], None
+    for p, m in zip(pos, mat):
+        geoms.set_pose(p, m)
+        before = _advance(skin, geoms, before)
+        steps.append(before)
+    return Trajectory(rest, steps)
+
+
+def _advance(skin, geoms, before):
+    data, outer, struct = skin.data, skin.data.outer, geoms.struct
+    x_last, held = data.x.numpy()[:, 0].copy(), Held.of(outer)
+    last_pressure = skin.read("last_pressure")["last_pressure"]
+    names = ("pos", "mat", "pos_last", "mat_last", "friction")
+    poses = {name: getattr(struct, name).numpy()[:, 0].copy() for name in names}
+    step(skin.model, data, geoms)
+    x = data.x.numpy()[:, 0].copy()
+    for name, value in poses.items():  # the step makes the last poses these
+        getattr(struct, name).numpy()[:, 0] = value
+    seen = look(outer, skin.weights, struct, x, x_last, held)
+    geoms.advance()
+    slips = (outer.trial_anchor.numpy()[seen.sample, 0] != seen.stick).any(1)
+    touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
+    changes = Changes(lost=int(not data.converged[0]))
+    if before is not None:
+        both = np.intersect1d(touches, before.touches)
+        changes = Changes(
+            touched=len(touches) - len(both),
+            parted=len(before.touches) - len(both),
+            slipped=len(np.setdiff1d(np.intersect1d(slips, both), before.slips)),
+            stuck=len(np.setdiff1d(np.intersect1d(before.slips, both), slips)),
+            lost=changes.lost,
+        )
+    pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
+    end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
+    return Record(geoms, x, x_last, held, poses, *end, touches, slips, changes)
+
+
+def restore(skin: Skin, record: Record) -> None:
+    """Puts the skin where a step ended, with the contact and the liquid of there."""
+    data, struct = skin.data, record.geoms.struct
+    skin.write(record.numbers)
+    record.held.give(data.outer)
+    data.x.numpy()[:, 0], data.x_last.numpy()[:, 0] = record.x, record.x_last
+    for name, value in record.poses.items():
+        getattr(struct, name).numpy()[:, 0] = value
+    skin.solver(record.geoms).evaluate_forces()

@@ -1,0 +1,135 @@
+"""A skin and its geoms that gradients can pass through: one world on the CPU, steps solved tightly."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ..geometry.skin_geometry import SkinGeometry
+from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
+from ..skin.contact.shapes import DistanceGrid
+from ..skin.program import Launcher
+from ..skin.step import SkinStep, prepare_step
+from .inverse import Factors
+
+__all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
+
+# of a step: the gradient is that of a balance, and wrong by as much as that is missed
+TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
+
+# what a skin is made of, as its kernels take it: shear modulus and second constant of the law [Pa], stiffness
+# of the contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
+NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
+
+
+class Skin:
+    """A skin and what may touch it.
+
+    Args:
+      geometry: of the skin.
+      material: a preset's name or a Material.
+      options: SkinOptions; tolerance and limits are made at least as good as TOLERANCE, MAX_NEWTON and
+        MAX_WORK.
+      types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
+      modulus: factors on Young's modulus, as `skin.SkinModel` has them.
+      precision: of the linear solves of a gradient.
+
+    Attributes:
+      model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
+      weights: (s, 3) barycentric, of the samples of a face.
+      factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
+
+    Raises:
+      ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.
+    """
+
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        material: str | Material = "default",
+        options: SkinOptions | None = None,
+        types: Sequence[str] = (),
+        sizes: Sequence = (),
+        friction: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        rounding: ArrayLike | None = None,
+        grids: Sequence[DistanceGrid] = (),
+        modulus: ArrayLike | Callable | None = None,
+        precision: float = 1e-9,
+    ):
+        given = options or SkinOptions()
+        tight = dataclasses.replace(
+            given,
+            tolerance=min(given.tolerance, TOLERANCE),
+            max_newton=max(given.max_newton, MAX_NEWTON),
+            max_work=max(given.max_work, MAX_WORK),
+        )
+        self.precision = precision
+        self.model = SkinModel(geometry, material, tight, modulus=modulus)
+        refuse_beyond(self.model)
+        if "ellipsoid" in types:
+            raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
+        self.data = SkinData(self.model)
+        friction = np.full(len(types), self.model.material.friction) if friction is None else friction
+        self.geoms = GeomSet(types, sizes, friction, groups, rounding, grids)
+        self.nothing = GeomSet([], [])
+        self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
+        self._direction = wp.zeros_like(self.data.x)
+        slot = self._elements.slot.numpy()
+        ones, start = np.ones(len(slot)), self._elements.start.numpy()
+        self._gather = sp.csr_matrix((ones, slot, start), shape=(self.model.nvert, len(slot)))
+        self.weights = self.model.sample.numpy()
+        self.factors = Factors(self.model)
+        self.own = self.read(*NUMBERS)
+
+    @property
+    def friction(self) -> np.ndarray:
+        """(ngeom,) Coulomb's coefficients."""
+        return self.geoms.struct.friction.numpy()[:, 0].copy()
+
+    def solver(self, geoms: GeomSet) -> SkinStep:
+        """The step of the skin under `self.geoms` or `self.nothing`."""
+        return prepare_step(self.model, self.data, geoms)
+
+    def push_rubber(self) -> np.ndarray:
+        """(3 nvert,) forces of the rubber alone, at the nodes [N]."""
+        data, elements = self.data, self._elements
+        elements.push_corners(Launcher("cpu"), data.x, self._on, data.worlds.inverted)
+        return (self._gather @ elements.corner_force.numpy()[:, 0]).ravel()
+
+    def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
+        """(3 nvert,) tangent of the rubber where `push_rubber` was last, times p (3 nvert,)."""
+        self._direction.numpy()[:, 0] = p.reshape(-1, 3)
+        self._elements.multiply_corners(Launcher("cpu"), self.data.x, self._direction, self._on)
+        return (self._gather @ self._elements.corner.numpy()[:, 0]).ravel()
+
+    def read(self, *names: str) -> dict:
+        """Numbers of `newton.worlds.Worlds` by name."""
+        return {name: float(getattr(self.data.worlds, name).numpy()[0]) for name in names}
+
+    def write(self, numbers: dict) -> None:
+        """The inverse of `read`."""
+        for name, value in numbers.items():
+            getattr(self.data.worlds, name).fill_(value)
+
+
+def refuse_beyond(model: SkinModel) -> None:
+    """Raises ValueError, which names the option and what to do, where a skin has what no gradient is there
+    for."""
+    m, o = model.material, model.options
+    if o.dynamics != "quasistatic":
+        raise ValueError("gradients of implicit dynamics are not there: take dynamics='quasistatic'")
+    if o.contact_law is not None:
+        raise ValueError("gradients of a contact_law are not there: leave it out, friction is Coulomb's then")
+    for name in ("prony", "mullins", "hysteresis"):
+        if name in m.extensions:
+            raise ValueError(f"gradients of rubber with {name} are not there: leave it out of the material")
+    if o.rest_pressure:
+        fill = model.rest.natural_volume - model.liquid_volume
+        raise ValueError(
+            f"gradients of a skin filled to rest_pressure are not there: give the same as "
+            f"fill_volume={fill:.6g} and rest_pressure=0"
+        )

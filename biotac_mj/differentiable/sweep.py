@@ -1,0 +1,147 @@
+"""The gradient of a whole press: cotangents from its end to its beginning, tangents from its beginning to
+its end.
+
+The records of the steps are the checkpoints: memory grows with their number, and each step is made linear
+again when it is its turn."""
+
+import dataclasses
+
+import numpy as np
+
+from .linear import LinearStep
+from .record import Record, Trajectory
+from .skin import NUMBERS, Skin
+
+__all__ = ["Inputs", "Outputs", "pull_back", "push_forward"]
+
+
+@dataclasses.dataclass
+class Outputs:
+    """Of a press, or cotangents or tangents of it.
+
+    Attributes:
+      nodes: (nstep, nvert, 3) [m]. wrench: (nstep, ngroup, 6) of the skin on the geoms [N, N m].
+      pressure: (nstep,) of the liquid above rest [Pa].
+    """
+
+    nodes: np.ndarray
+    wrench: np.ndarray
+    pressure: np.ndarray
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> "Outputs":
+        """What a press gave out."""
+        steps, rest = trajectory.steps, trajectory.rest
+        begin = rest.pressure if rest else 0.0
+        return cls(
+            np.array([r.x for r in steps]),
+            np.array([r.wrench for r in steps]),
+            np.array([r.pressure - begin for r in steps]),
+        )
+
+
+@dataclasses.dataclass
+class Inputs:
+    """Cotangents or tangents of what a press was given.
+
+    Attributes:
+      pose: (nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in the
+        BioTac frame.
+      friction: (ngeom,). numbers: of `skin.NUMBERS`.
+    """
+
+    pose: np.ndarray
+    friction: np.ndarray
+    numbers: dict
+
+
+def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs) -> Inputs:
+    """Cotangents of the inputs from those of the outputs."""
+    steps, holds = trajectory.steps, bool(skin.data.worlds.holds.numpy()[0])
+    pose = np.zeros((len(steps), skin.geoms.count, 6))
+    friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
+    x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, _Anchors()
+    skin.factors.begin()
+
+    def back(record, x, wrench, pressure):
+        nonlocal anchors
+        step = LinearStep(skin, record)
+        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample))
+        anchors = _Anchors(record.held.sample, given["anchor"])
+        for name in NUMBERS:
+            numbers[name] += float(given[name])
+        last = given["reference"] * _slope_of_reference(record) + (given["offset"] if holds else 0.0)
+        return given, given["x_last"], float(last)
+
+    for t in reversed(range(len(steps))):
+        own = float(outputs.pressure[t])
+        given, x, pressure = back(steps[t], x + outputs.nodes[t], outputs.wrench[t], pressure + own)
+        pose[t] += given["pose"]
+        pose[max(t - 1, 0)] += given["pose_last"]
+        friction += given["friction"]
+    if trajectory.rest:
+        back(trajectory.rest, x, np.zeros((0, 6)), pressure - float(outputs.pressure.sum()))
+    return Inputs(pose, friction, numbers)
+
+
+def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
+    """Tangents of the outputs from those of the inputs, k of them at once.
+
+    Args:
+      inputs: with arrays of a leading k: pose (k, nstep, ngeom, 6), friction (k, ngeom), numbers (k,).
+
+    Returns:
+      Outputs with a leading k.
+    """
+    steps, k, holds = trajectory.steps, len(inputs.pose), bool(skin.data.worlds.holds.numpy()[0])
+    n, ngroup = skin.model.nvert, skin.geoms.ngroup
+    shape = k, len(steps)
+    out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
+    x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [_Anchors()] * k
+    begin = np.zeros(k)
+    skin.factors.begin()
+
+    def ahead(record, t):
+        step = LinearStep(skin, record)
+        wrench = np.zeros((k, record.geoms.ngroup, 6))
+        for i in range(k):
+            given = {name: inputs.numbers[name][i] for name in NUMBERS}
+            given |= {"x_last": x[i], "anchor": anchors[i].of(record.held.sample)}
+            given["reference"] = pressure[i] * _slope_of_reference(record)
+            given["offset"] = pressure[i] if holds else 0.0
+            if t is not None:
+                given |= {"pose": inputs.pose[i, t], "pose_last": inputs.pose[i, max(t - 1, 0)]}
+                given["friction"] = inputs.friction[i]
+            x[i], wrench[i], pressure[i], held = step.push(given)
+            anchors[i] = _Anchors(step.touching.sample, held)
+        return wrench
+
+    if trajectory.rest:
+        ahead(trajectory.rest, None)
+        begin = pressure.copy()
+    for t, record in enumerate(steps):
+        out.wrench[:, t] = ahead(record, t)
+        out.nodes[:, t], out.pressure[:, t] = x, pressure - begin
+    return out
+
+
+def _slope_of_reference(record: Record) -> float:
+    """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
+    reference = record.numbers["reference"]
+    return float(np.sign(record.last_pressure)) if abs(record.last_pressure) == reference else 0.0
+
+
+class _Anchors:
+    """Vectors of samples by number; of others they are zero."""
+
+    def __init__(self, sample: np.ndarray | None = None, value: np.ndarray | None = None):
+        if sample is None:
+            sample, value = np.zeros(0, int), np.zeros((0, 3))
+        self._sample, self._value = sample, value
+
+    def of(self, sample: np.ndarray) -> np.ndarray:
+        """(m, 3) of samples (m,)."""
+        out = np.zeros((len(sample), 3))
+        both, here, there = np.intersect1d(sample, self._sample, return_indices=True)
+        out[here] = self._value[there]
+        return out

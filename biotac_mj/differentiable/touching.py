@@ -1,0 +1,94 @@
+"""Which samples of a surface touch, where they are in their geom's frame, and where they stick."""
+
+import dataclasses
+
+import numpy as np
+
+from ..skin.contact.faces import Geoms
+from ..skin.data import ContactState
+
+__all__ = ["Held", "Touching", "look"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """What a surface remembers when a step begins.
+
+    Attributes:
+      sample, geom: (n,) samples and the geoms they touched. anchor: (n, 3) in those geoms' frames [m].
+    """
+
+    sample: np.ndarray
+    geom: np.ndarray
+    anchor: np.ndarray
+
+    @classmethod
+    def of(cls, state: ContactState) -> "Held":
+        """What the surface remembers now."""
+        geom = state.anchor_geom.numpy()[:, 0]
+        sample = np.flatnonzero(geom >= 0)
+        return cls(sample, geom[sample].copy(), state.anchor.numpy()[sample, 0].copy())
+
+    def give(self, state: ContactState) -> None:
+        """The inverse of `of`."""
+        geom, anchor = state.anchor_geom.numpy(), state.anchor.numpy()
+        geom[:] = -1
+        geom[self.sample, 0], anchor[self.sample, 0] = self.geom, self.anchor
+
+
+@dataclasses.dataclass(frozen=True)
+class Touching:
+    """m samples that touch, as the last evaluation of the forces found them.
+
+    Attributes:
+      sample, geom: (m,). node: (m, 3) of their faces. weight: (m, 3) barycentric.
+      area: (m,) that each stands for [m^2].
+      point, last: (m, 3) where they are, and were when the step began [m].
+      local: (m, 3) in the geom's frame.
+      old: (m,) number in `Held` of those that touched the same geom when the step began, else -1.
+      stick: (m, 3) where they stick if they do, in the geom's frame.
+    """
+
+    sample: np.ndarray
+    geom: np.ndarray
+    node: np.ndarray
+    weight: np.ndarray
+    area: np.ndarray
+    point: np.ndarray
+    last: np.ndarray
+    local: np.ndarray
+    old: np.ndarray
+    stick: np.ndarray
+
+
+def look(
+    state: ContactState, weights: np.ndarray, geoms: Geoms, x: np.ndarray, x_last: np.ndarray, held: Held
+) -> Touching:
+    """Finds them.
+
+    Args:
+      state: of the surface, after an evaluation. weights: (s, 3) of the samples of a face.
+      geoms: with poses of the end and of the beginning of the step.
+      x, x_last: (nvert, 3) nodes then [m]. held: when the step began.
+    """
+    found = state.trial_geom.numpy()[:, 0]
+    sample = np.flatnonzero(found >= 0)
+    geom, face = found[sample], sample // len(weights)
+    node, weight = state.surface.face_np[face], weights[sample % len(weights)]
+    point, last = (np.einsum("ma,mak->mk", weight, at[node]) for at in (x, x_last))
+    number = np.full(len(found), -1)
+    number[held.sample] = np.arange(len(held.sample))
+    old = number[sample]
+    old[old >= 0] = np.where(held.geom[old[old >= 0]] == geom[old >= 0], old[old >= 0], -1)
+    pos, mat, pos_last, mat_last = (
+        a.numpy()[:, 0] for a in (geoms.pos, geoms.mat, geoms.pos_last, geoms.mat_last)
+    )
+    stick = _inside(last, pos_last[geom], mat_last[geom])
+    stick[old >= 0] = held.anchor[old[old >= 0]]
+    local = _inside(point, pos[geom], mat[geom])
+    area = state.surface.area.numpy()[face] / len(weights)
+    return Touching(sample, geom, node, weight, area, point, last, local, old, stick)
+
+
+def _inside(point, pos, mat):
+    return np.einsum("mki,mk->mi", mat, point - pos)

@@ -1,0 +1,335 @@
+"""Gradients of a press against central differences, on a small skin."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from bubble import bubble
+from torch.autograd import forward_ad
+
+from biotac_mj.differentiable import Skin, press
+from biotac_mj.differentiable.linear import LinearStep
+from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.samples import differentiate_samples
+from biotac_mj.differentiable.skin import NUMBERS
+from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
+from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
+
+TIGHT = 1e-10
+
+
+def ball(friction=0.15, material="default", **options):
+    """The bubble under a ball."""
+    options = SkinOptions(**{"tolerance": TIGHT, **options})
+    return Skin(bubble(), material, options, ["sphere"], [[3e-3]], [friction])
+
+
+def path(count, stride=1e-4, depth=7e-4):
+    """Down, then along: pos (count, 1, 3), quat (count, 1, 4)."""
+    way = stride * np.arange(count)
+    down, side = np.minimum(way, depth), np.maximum(way - depth, 0)
+    pos = np.stack([3e-4 + side, down - 9e-3, 0 * side], 1)[:, None]
+    return torch.tensor(pos), torch.tensor([1.0, 0.1, 0.2, 0.3], dtype=torch.float64).repeat(count, 1, 1)
+
+
+def loss_of(pressed, seed=0):
+    """All that comes out, by chance."""
+    draw = torch.Generator().manual_seed(seed)
+    weights = [
+        torch.randn(t.shape, generator=draw, dtype=torch.float64) for t in (pressed.nodes, pressed.wrench)
+    ]
+    moments = torch.tensor([1, 1, 1, 1e2, 1e2, 1e2])
+    pull = 1e-5 * pressed.pressure.sum()
+    return 1e2 * (weights[0] * pressed.nodes).sum() + (weights[1] * moments * pressed.wrench).sum() + pull
+
+
+def differences(value, size):
+    """Slope at 0 of value(h), from steps of size and half of it: what is left is of the fourth order."""
+    coarse, fine = ((value(h) - value(-h)) / (2 * h) for h in (size, size / 2))
+    return (4 * fine - coarse) / 3
+
+
+# how far each input is moved by, along a unit vector
+STEPS = {
+    "pos": 1e-8, "quat": 1e-5, "friction": 3e-5, "youngs_modulus": 1e3, "poissons_ratio": 3e-4,
+    "contact_stiffness": 3e8, "fill_volume": 3e-12, "bulk_modulus": 1e5,
+}  # fmt: skip
+
+
+def inputs_of(count, liquid):
+    pos, quat = path(count)
+    numbers = {
+        "friction": [0.15],
+        "youngs_modulus": 1.5e6,
+        "poissons_ratio": 0.31,
+        "contact_stiffness": 2.7e11,
+    }
+    if liquid:
+        numbers |= {"fill_volume": 2e-9, "bulk_modulus": 1e7}
+    own = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    return {"pos": pos, "quat": quat, **own}
+
+
+@pytest.mark.parametrize("liquid", [False, True], ids=["dry", "liquid"])
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_every_input_against_differences(element, liquid):
+    """A press that sticks, slips and squeezes the skin on the core."""
+    skin = ball(element=element, liquid=liquid)
+    given = {name: value.requires_grad_() for name, value in inputs_of(13, liquid).items()}
+    pressed = press(skin, **given)
+    assert pressed.counts.slipped and pressed.counts.touched > 1 and not pressed.counts.lost
+    assert np.abs(skin.data.core_force).max() > 0.01
+    loss_of(pressed).backward()
+    draw = np.random.default_rng(1)
+
+    def moved(h, name, way):
+        with torch.no_grad():
+            return loss_of(press(skin, **given | {name: given[name] + h * way})).item()
+
+    for name, value in given.items():
+        way = draw.normal(size=value.shape)
+        way = torch.tensor(way / np.linalg.norm(way))
+        found = differences(functools.partial(moved, name=name, way=way), STEPS[name])
+        assert found == pytest.approx((value.grad * way).sum().item(), rel=3e-6), name
+
+
+def balanced(skin, record):
+    """The record at a balance to rounding, by Newton's method with the consistent tangent; the step there."""
+    for _ in range(8):
+        step = LinearStep(skin, record)
+        force = skin.data.force.numpy()[:, 0] * skin.model.free_mask.numpy()[:, None]
+        if np.linalg.norm(force) < 1e-10:
+            break
+        record = dataclasses.replace(record, x=record.x + step.solve(force.ravel()).reshape(-1, 3))
+    return record, step
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_one_step_to_rounding(element):
+    """Nodes and anchors after a step that sticks and slips, by the pose and the anchors before."""
+    skin = ball(element=element, liquid=True)
+    pos, _ = path(13)
+    mat = np.tile(np.eye(3), (13, 1, 1, 1))
+    steps = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False).steps
+    mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.held.sample)]
+    record, step = balanced(skin, mixed[-1])
+    draw = np.random.default_rng(5)
+    free = skin.model.free_mask.numpy()[:, None]
+    nodes, anchors = (
+        1e3 * free * draw.normal(size=record.x.shape),
+        draw.normal(size=step.touching.stick.shape),
+    )
+    slopes = step.pull(nodes, np.zeros((1, 6)), 0.0, 1e3 * anchors)
+
+    def moved(h, name, way):
+        if name == "anchor":
+            change = {"held": dataclasses.replace(record.held, anchor=record.held.anchor + h * way)}
+        else:
+            change = {"poses": record.poses | {"pos": record.poses["pos"] + h * way}}
+        there, step = balanced(skin, dataclasses.replace(record, **change))
+        after = skin.data.outer.trial_anchor.numpy()[step.touching.sample, 0]
+        return (nodes * there.x).sum() + 1e3 * (anchors * after).sum()
+
+    for name, shape in (("pose", (1, 3)), ("anchor", record.held.anchor.shape)):
+        way = draw.normal(size=shape)
+        expected = (slopes[name][..., :3] * way).sum()
+        found = differences(functools.partial(moved, name=name, way=way), 1e-8)
+        assert found == pytest.approx(expected, rel=1e-6), name
+
+
+@pytest.mark.parametrize(
+    "material, options",
+    [
+        (Material("neo_hookean", 3e5, 0.48, 0.2, liquid=False), {"element": "quadratic"}),
+        (Material("svk", 1e6, 0.3, 0.2, liquid=False, stiffening=0.5), {"element": "linear"}),
+        (Material("linear", 1e6, 0.3, 0.2), {"element": "linear", "bulk_modulus": np.inf}),
+        (Material(friction=0.2), {"element": "linear", "bulk_modulus": 1e7, "fill_volume": 5e-9}),
+    ],
+    ids=["neo_hookean", "svk", "incompressible", "filled"],
+)
+def test_laws_and_liquids(material, options):
+    """Of Young's modulus, Poisson's ratio, the path, and a filling."""
+    skin = ball(material=material, **options)
+    # the volume of what hardly yields is known to rounding alone, and with it the pressure of differences
+    exact = 3e-4 if np.isinf(skin.model.options.bulk_modulus) else 1e-5
+    pos, quat = path(6, 2e-4)
+    given = {"youngs_modulus": material.youngs_modulus, "poissons_ratio": material.poissons_ratio}
+    sizes = {"pos": 1e-8, "youngs_modulus": 3e-4 * material.youngs_modulus, "poissons_ratio": 3e-4}
+    if skin.model.has_liquid:
+        given["fill_volume"], sizes["fill_volume"] = options.get("fill_volume", 0.0), 3e-12
+    given = {
+        name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in given.items()
+    }
+    given["pos"] = pos.requires_grad_()
+    loss_of(press(skin, quat=quat, **given)).backward()
+
+    def moved(h, name):
+        with torch.no_grad():
+            return loss_of(press(skin, quat=quat, **given | {name: given[name] + h})).item()
+
+    for name, size in sizes.items():
+        found = differences(functools.partial(moved, name=name), size)
+        assert found == pytest.approx(given[name].grad.sum().item(), rel=exact), name
+
+
+SHAPES = {
+    "plane": [0], "sphere": [4e-3], "capsule": [3e-3, 4e-3], "cylinder": [4e-3, 3e-3],
+    "box": [4e-3, 3e-3, 2e-3], "mesh": [0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_samples_on_every_shape(kind):
+    """Force and anchor by place, anchor, friction and stiffness; some points lie at a kink."""
+    draw, n = np.random.default_rng(3), 200
+    hull = trimesh.creation.icosphere(subdivisions=1, radius=4e-3)
+    grids = [bake_distance_grid(hull.vertices, hull.faces)] if kind == "mesh" else ()
+    rounding = 5e-4 * (kind in ("box", "cylinder"))
+    geoms = GeomSet([kind], [SHAPES[kind]], rounding=[rounding], grids=grids)
+    way = draw.normal(size=(n, 3))
+    local = way / np.linalg.norm(way, axis=1, keepdims=True) * draw.uniform(2e-3, 3.7e-3, (n, 1))
+    if kind == "plane":
+        local[:, 2] = -0.01 * abs(local[:, 2])
+    if kind == "mesh":
+        points, face = trimesh.sample.sample_surface(hull, n, seed=4)
+        local = points - 5e-5 * hull.face_normals[face]
+    given = [local, local + 2e-5 * draw.normal(size=(n, 3)), np.full(n, 0.5), np.full(n, 2e3)]
+    units = np.array([1e-2] * 3 + [1e-5] * 3)
+
+    def felt(*given):
+        return differentiate_samples(geoms.struct, np.zeros(n, int), *given, 0.1)
+
+    own = felt(*given)
+    assert own.slips.any() or kind in ("sphere", "mesh")
+    slopes = own.by_local, own.by_stick, own.by_friction[..., None], own.by_stiffness[..., None]
+    for at, (slope, size) in enumerate(zip(slopes, (1e-9, 1e-9, 1e-5, 1e-2))):
+        way = draw.normal(size=given[at].shape)
+        ends = []
+        for h in (size, -size):
+            one = felt(*given[:at], given[at] + h * way, *given[at + 1 :])
+            ends.append(np.concatenate([one.force, one.anchor], 1))
+        found = (ends[0] - ends[1]) / (2 * size) / units
+        expected = np.einsum("noi,ni->no", slope, way.reshape(n, -1)) / units
+        error = np.abs(found - expected).max(1) / (np.abs(expected).max(1) + 1e-3)
+        assert np.percentile(error, 97) < 1e-6
+
+
+def test_tangents_and_cotangents_are_of_one_jacobian():
+    skin = ball(element="linear", liquid=True, bulk_modulus=1e5)  # others' slopes drown in that of water
+    pos, _ = path(9)
+    mat = np.tile(np.eye(3), (9, 1, 1, 1))
+    trajectory = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False)
+    draw = np.random.default_rng(2)
+    out = Outputs.of(trajectory)
+    out = Outputs(*(draw.normal(size=a.shape) for a in (1e2 * out.nodes, out.wrench, 1e-4 * out.pressure)))
+    ahead = Inputs(
+        1e-4 * draw.normal(size=(2, 9, 1, 6)),
+        draw.normal(size=(2, 1)),
+        {name: skin.own[name] * draw.normal(size=2) for name in NUMBERS},
+    )
+    there, back = push_forward(skin, trajectory, ahead), pull_back(skin, trajectory, out)
+    for i in range(2):
+        one = (there.nodes[i] * out.nodes).sum() + (there.wrench[i] * out.wrench).sum()
+        one += (there.pressure[i] * out.pressure).sum()
+        other = (ahead.pose[i] * back.pose).sum() + (ahead.friction[i] * back.friction).sum()
+        other += sum(ahead.numbers[name][i] * back.numbers[name] for name in NUMBERS)
+        assert one == pytest.approx(other, rel=1e-7)
+
+
+def test_gradcheck():
+    skin = ball(element="linear", liquid=True, bulk_modulus=1e6)  # of water the pressure has noise
+    pos, quat = path(5, 2e-4)
+    stiff = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+
+    def wrench(pos, stiff, core_pos):
+        core_quat = torch.tensor([1.0, 0.1, 0, 0], dtype=torch.float64).expand(5, 4)
+        pressed = press(skin, 1e-3 * pos, quat, 1e-3 * core_pos, core_quat, youngs_modulus=1e6 * stiff)
+        return pressed.wrench[-1], 1e-3 * pressed.pressure
+
+    pos = (1e3 * pos).requires_grad_()
+    core = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).repeat(5, 1).requires_grad_()
+    assert torch.autograd.gradcheck(wrench, (pos, stiff, core), eps=3e-6, atol=3e-5, rtol=1e-4)
+
+
+def test_sixty_steps():
+    skin = ball(element="linear", liquid=True)
+    pos, quat = path(60, 2e-5)
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    loss_of(press(skin, pos + shift, quat)).backward()
+    way = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
+
+    def moved(h):
+        with torch.no_grad():
+            return loss_of(press(skin, pos + h * way, quat)).item()
+
+    assert differences(moved, 1e-8) == pytest.approx((shift.grad @ way).item(), rel=1e-4)
+
+
+def test_forward_mode():
+    skin = ball(element="linear", liquid=True, bulk_modulus=1e6)
+    pos, quat = path(6, 2e-4)
+    given = {"pos": pos, "quat": quat, "youngs_modulus": torch.tensor(1.4e6, dtype=torch.float64)}
+    draw = torch.Generator().manual_seed(3)
+    ways = {
+        name: torch.randn(value.shape, generator=draw, dtype=torch.float64) for name, value in given.items()
+    }
+    scale = {"pos": 1e-4, "quat": 1e-2, "youngs_modulus": 1e4}
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(value, scale[name] * ways[name]) for name, value in given.items()}
+        ahead = forward_ad.unpack_dual(loss_of(press(skin, **dual))).tangent.item()
+    given = {name: value.clone().requires_grad_() for name, value in given.items()}
+    loss_of(press(skin, **given)).backward()
+    back = sum((value.grad * scale[name] * ways[name]).sum().item() for name, value in given.items())
+    assert ahead == pytest.approx(back, rel=1e-6)
+
+
+def test_worlds_are_alone():
+    skin = ball(element="linear", liquid=False)
+    pos, quat = path(6, 2e-4)
+    both = torch.stack([pos, pos + 1e-4]).requires_grad_()
+    friction = torch.tensor([[0.15], [0.4]], dtype=torch.float64)
+    pressed = press(skin, both, quat.expand(2, -1, -1, -1), friction=friction)
+    pressed.wrench.sum().backward()
+    for w in range(2):
+        one = both[w].detach().requires_grad_()
+        alone = press(skin, one, quat, friction=friction[w])
+        alone.wrench.sum().backward()
+        assert torch.equal(alone.wrench, pressed.wrench[w])
+        assert torch.allclose(one.grad, both.grad[w], rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (dict(dynamics="implicit"), "implicit dynamics are not there: take"),
+        (dict(contact_law=ContactLaw()), "contact_law are not there: leave it out"),
+        (dict(material=Material(prony=((0.1, 1.0),))), "prony are not there: leave it out"),
+        (dict(material=Material(mullins=(2.0, 1e4, 0.1))), "mullins are not there: leave it out"),
+        (dict(material=Material(hysteresis=((0.1, 0.1),))), "hysteresis are not there: leave it out"),
+        (dict(rest_pressure=500.0), "give the same as fill_volume="),
+    ],
+)
+def test_what_is_not_there_is_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        ball(**change)
+
+
+def test_an_ellipsoid_is_refused():
+    with pytest.raises(ValueError, match="ellipsoid are not there: take a mesh"):
+        Skin(bubble(), types=["ellipsoid"], sizes=[[1e-3, 1e-3, 2e-3]])
+
+
+def test_what_a_press_cannot_take_is_refused():
+    skin = ball(liquid=False)
+    pos, quat = path(3)
+    with pytest.raises(ValueError, match="cannot press with .*hardness.*choose from"):
+        press(skin, pos, quat, hardness=1.0)
+    with pytest.raises(ValueError, match="no liquid: leave fill_volume out"):
+        press(skin, pos, quat, fill_volume=1e-9)
+    with pytest.raises(ValueError, match=r"quat .*: pass \(nstep, 1, 3\)"):
+        press(skin, pos, quat[:2])
+    with pytest.raises(ValueError, match="friction has shape"):
+        press(skin, pos, quat, friction=torch.ones(4))
