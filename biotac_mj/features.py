@@ -214,7 +214,7 @@ SENSES = (
     Sense("dead taxels", '`randomise=["dead"]`', {"randomise": {"dead": 40.0}}, "electrodes", 5),
     Sense("cross-talk", '`randomise=["crosstalk"]`', {"randomise": {"crosstalk": 6.0}},
           "electrodes", 5),
-    Sense("gain of PDC", '`randomise=["pdc_gain"]`', {"randomise": {"pdc_gain": 80.0}}, "pdc", 3),
+    Sense("gain of PDC", '`randomise=["pdc_gain"]`', {"randomise": {"pdc_gain": 40.0}}, "pdc", 2),
     Sense("relaxation, felt by PDC", '`randomise=["relax"]`', {"randomise": {"relax": 70.0}},
           "pdc", 1),
     Sense("warm-up", '`randomise=["warmup"]`', {"randomise": {"warmup": 1e3}}, "electrodes", 0.5),
