@@ -106,7 +106,7 @@ def _replayed(electrodes, pdc, seed):
         sensor.advance(state, i * 0.01, 0.01, impedance, now)
         rows.append(sensor.readings(state))
     counts = {name: np.array([row[name] for row in rows], float) for name in ("electrodes", "pac", "pdc")}
-    return _held(counts["electrodes"], np.roll(counts["pac"], -1, 1).T, counts["pdc"])
+    return _held(counts["electrodes"], counts["pac"].T, counts["pdc"])
 
 
 def holds(data: pathlib.Path) -> dict:
