@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 
 import numpy as np
 import pytest
@@ -333,3 +334,47 @@ def test_what_a_press_cannot_take_is_refused():
         press(skin, pos, quat[:2])
     with pytest.raises(ValueError, match="friction has shape"):
         press(skin, pos, quat, friction=torch.ones(4))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"youngs_modulus": -1.0}, "Young's modulus -1"),
+        ({"poissons_ratio": 0.5}, "Poisson's ratio 0.5"),
+        ({"poissons_ratio": np.nan}, "poissons_ratio"),
+        ({"contact_stiffness": 0.0}, "contact_stiffness is 0.0"),
+        ({"friction": [-1.0]}, "friction is"),
+        ({"core_pos": torch.zeros(2, 3)}, "give both or neither"),
+    ],
+)
+def test_values_that_cannot_be_are_named(given, said):
+    skin = ball()
+    with pytest.raises(ValueError, match=said):
+        press(skin, *path(2), **given)
+
+
+def test_a_pose_that_is_none_is_named():
+    skin, (pos, quat) = ball(), path(2)
+    with pytest.raises(ValueError, match="quat is zero"):
+        press(skin, pos, 0 * quat)
+    with pytest.raises(ValueError, match="pos is empty or not finite"):
+        press(skin, pos * np.nan, quat)
+
+
+def test_a_press_leaves_the_skins_friction():
+    skin = ball()
+    before = press(skin, *path(9)).wrench
+    press(skin, *path(9), friction=[0.01])
+    assert torch.equal(press(skin, *path(9)).wrench, before) and skin.friction == [0.15]
+
+
+def test_two_threads_press_one_skin():
+    """One waits for the other."""
+    skin, found = ball(), []
+    alone = press(skin, *path(9)).wrench
+    threads = [threading.Thread(target=lambda: found.append(press(skin, *path(9)).wrench)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(torch.equal(wrench, alone) for wrench in found) and len(found) == 2

@@ -73,7 +73,9 @@ def press(
       ValueError: shapes that do not fit, an unknown parameter, or one that the skin has no use for.
     """
     pos, quat = (torch.as_tensor(value, dtype=torch.float64) for value in (pos, quat))
-    if core_pos is not None or core_quat is not None:
+    if (core_pos is None) != (core_quat is None):
+        raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
+    if core_pos is not None:
         pos, quat = relative_pose(core_pos, core_quat, pos, quat)
     count, alone = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
@@ -81,12 +83,18 @@ def press(
             f"pos has shape {tuple(pos.shape)} and quat {tuple(quat.shape)}: pass (nstep, {count}, 3) and "
             f"(nstep, {count}, 4), or both with a leading nworld"
         )
+    if not pos.numel() or not torch.isfinite(pos).all():
+        raise ValueError("pos is empty or not finite: give at least one step and numbers [m]")
+    if not (quat.norm(dim=-1) > 1e-100).all() or not torch.isfinite(quat).all():
+        raise ValueError("a quat is zero or not finite: give w x y z of any other length")
     if alone:
         pos, quat = pos[None], quat[None]
     nworld = len(pos)
     if friction is None:
         friction = torch.as_tensor(skin.friction)
     friction = _of_worlds("friction", friction, nworld, (count,))
+    if not ((friction >= 0) & torch.isfinite(friction)).all():
+        raise ValueError(f"friction is {friction.tolist()}: give 0 or more")
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
     worlds, changes = [], []
     for w in range(nworld):
@@ -104,7 +112,7 @@ def numbers_of(skin: Skin, parameters: dict) -> dict:
     """`skin.NUMBERS` as tensors, of the skin's material with other PARAMETERS.
 
     Raises:
-      ValueError: an unknown parameter, or one of the liquid of a dry skin.
+      ValueError: an unknown parameter, one of the liquid of a dry skin, or a value that cannot be.
     """
     model, options = skin.model, skin.model.options
     unknown = set(parameters) - set(PARAMETERS)
@@ -117,6 +125,18 @@ def numbers_of(skin: Skin, parameters: dict) -> dict:
         raise ValueError(f"the skin has no liquid: leave {' and '.join(sorted(wet))} out")
     if "bulk_modulus" in parameters and math.isinf(options.bulk_modulus):
         raise ValueError("the skin's liquid is incompressible: make the skin with a finite bulk_modulus")
+    values = {name: float(torch.as_tensor(value).detach()) for name, value in parameters.items()}
+    rubber = {name: values[name] for name in ("youngs_modulus", "poissons_ratio") if name in values}
+    dataclasses.replace(model.material, **rubber)  # raises for what no rubber has
+    for name in {"contact_stiffness", "bulk_modulus"} & set(values):
+        if not 0 < values[name] < math.inf:
+            raise ValueError(f"{name} is {values[name]}: give a positive number")
+    if not all(map(math.isfinite, values.values())):
+        raise ValueError(f"{values} cannot be: give finite numbers")
+    if "fill_volume" in values and not abs(values["fill_volume"]) < model.liquid_volume:
+        raise ValueError(
+            f"fill_volume is {values['fill_volume']}: the liquid has {model.liquid_volume:.3g} m^3"
+        )
     own = {name: getattr(model.material, name, None) for name in PARAMETERS}
     own |= {name: getattr(options, name) for name in PARAMETERS if own[name] is None}
     own = types.SimpleNamespace(**own | parameters)
@@ -179,10 +199,11 @@ class _Press(torch.autograd.Function):
         values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
         path = (a.detach().numpy() for a in (pos, mat, friction))
         incompressible = math.isinf(skin.model.options.bulk_modulus)
-        context.trajectory = trajectory = follow(skin, *path, values, incompressible)
+        with skin.lock:
+            context.trajectory = trajectory = follow(skin, *path, values, incompressible)
+            out = Outputs.of(trajectory)
         changes += [record.changes for record in trajectory.steps]
         context.mat = mat.detach()
-        out = Outputs.of(trajectory)
         return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
@@ -196,14 +217,16 @@ class _Press(torch.autograd.Function):
         ahead = Inputs(
             pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None]))
         )
-        out = push_forward(context.skin, context.trajectory, ahead)
+        with context.skin.lock:
+            out = push_forward(context.skin, context.trajectory, ahead)
         return tuple(torch.from_numpy(a[0]) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(context, nodes, wrench, pressure):
         given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
-        found = pull_back(context.skin, context.trajectory, given)
+        with context.skin.lock:
+            found = pull_back(context.skin, context.trajectory, given)
         mat = context.mat
         move, turn = torch.from_numpy(found.pose).split(3, -1)
         x, y, z = turn.unbind(-1)

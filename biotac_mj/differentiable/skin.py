@@ -1,6 +1,7 @@
 """A skin and its geoms that gradients can pass through: one world on the CPU, steps solved tightly."""
 
 import dataclasses
+import threading
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -41,6 +42,8 @@ class Skin:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
       weights: (s, 3) barycentric, of the samples of a face.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
+      friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
+      lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
 
     Raises:
       ValueError: an option whose gradient is not there, see `refuse_beyond`, or what the parts raise.
@@ -75,6 +78,8 @@ class Skin:
         self.data = SkinData(self.model)
         friction = np.full(len(types), self.model.material.friction) if friction is None else friction
         self.geoms = GeomSet(types, sizes, friction, groups, rounding, grids)
+        self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
+        self.lock = threading.RLock()
         self.nothing = GeomSet([], [])
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
         self._direction = wp.zeros_like(self.data.x)
@@ -84,11 +89,6 @@ class Skin:
         self.weights = self.model.sample.numpy()
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
-
-    @property
-    def friction(self) -> np.ndarray:
-        """(ngeom,) Coulomb's coefficients."""
-        return self.geoms.struct.friction.numpy()[:, 0].copy()
 
     def solver(self, geoms: GeomSet) -> SkinStep:
         """The step of the skin under `self.geoms` or `self.nothing`."""
