@@ -108,7 +108,7 @@ def resting(path: pathlib.Path, frames: int = 4000) -> tuple[np.ndarray, np.ndar
     rows = []
     for i in range(frames):
         sensor.advance(state, i * 0.01, 0.01, rest)
-        rows.append(np.roll(sensor.readings(state)["pac"], -1))  # the first is the next frame's already
+        rows.append(sensor.readings(state)["pac"])
     mine = np.ravel(rows)
     return blocks[quiet], mine[: len(mine) // _BLOCK * _BLOCK].reshape(-1, _BLOCK).astype(float)
 
