@@ -129,7 +129,15 @@ def test_a_kept_error_does_not_keep_the_model():
     biotac_mj.plugin.clear_errors()
 
 
-def test_an_interrupt_ends_the_loop_within_its_step():
+@pytest.fixture
+def heeded():
+    """SIGINT, which a job in the background of a shell ignores, and with it all that it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_ends_the_loop_within_its_step(heeded):
     """Wherever in a step it comes, and nothing is left half done."""
     model, wait = model_of(stepper="springs"), np.random.default_rng(0)
     data, late = mujoco.MjData(model), collections.Counter()
@@ -172,7 +180,7 @@ while True:
 """
 
 
-def test_ctrl_c_ends_a_program_that_steps():
+def test_ctrl_c_ends_a_program_that_steps(heeded):
     program = subprocess.Popen(
         [sys.executable, "-c", _LOOP], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -46,8 +46,8 @@ class CondensedStepper(FemStepper):
 
     @functools.cached_property
     def _skin(self):
-        two_way = self._config.coupling == "two-way"
-        return CondensedSkin(self._model, self._geom_set, patience=_PATIENCE if two_way else 2.5)
+        hurry = {"patience": _PATIENCE} if self._config.coupling == "two-way" else {}
+        return CondensedSkin(self._model, self._geom_set, **hurry)
 
     @property
     def _search(self):
