@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import os
 
 import h5py
 import mujoco
@@ -488,9 +489,44 @@ def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
         read(*inputs)
     assert len(made) == 6
     assert len(list(cache_folder().glob("thing-*.npz"))) == 5
-    for i in range(100):
-        read(i)
-    assert len(list(cache_folder().iterdir())) == 64
+
+
+def test_the_cache_stays_within_its_size(monkeypatch):
+    """What was used last stays, whatever its kind; what was just made always does."""
+
+    def read(kind, i):
+        return kept(kind, [i], lambda: {"a": np.zeros(100_000, np.uint8)})
+
+    monkeypatch.setenv("BIOTAC_CACHE_GB", "0.00035")
+    other = cache_folder() / "notes.txt"
+    other.parent.mkdir(parents=True, exist_ok=True)
+    other.write_text("not ours")
+    files = {}
+    for age, i in enumerate((0, 1, 2)):
+        read("plate", i)
+        (files[i],) = set(cache_folder().glob("*.npz")) - set(files.values())
+        os.utime(files[i], (age, age))
+    read("plate", 0)  # used again
+    read("grid", 3)
+    assert files[0].exists() and files[2].exists() and not files[1].exists() and other.exists()
+    monkeypatch.setenv("BIOTAC_CACHE_GB", "0")
+    read("grid", 4)
+    assert len(list(cache_folder().glob("*.npz"))) == 1
+    monkeypatch.setenv("BIOTAC_CACHE_GB", "much")
+    with pytest.raises(ValueError, match=r"^BIOTAC_CACHE_GB must be a number of gigabytes.*'much'$"):
+        read("grid", 5)
+
+
+def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
+    outer, inner, direction = pieces(coarse)
+    SurfaceCompliance(coarse, outer, inner, direction)
+    (file,) = cache_folder().glob("compliance-*.rows")
+    os.utime(file, (1, 1))
+    SurfaceCompliance(coarse, outer, inner, direction)
+    assert file.stat().st_mtime > 1
+    monkeypatch.setenv("BIOTAC_CACHE_GB", "0")
+    kept("thing", [1], lambda: {"a": np.zeros(1)})
+    assert not file.exists()
 
 
 def test_other_options_and_materials_have_other_files():

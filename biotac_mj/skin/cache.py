@@ -1,7 +1,9 @@
 """What is worth keeping between processes: arrays on disk, found by a digest of what they were made of.
 
 A file is written under a temporary name and then renamed, so that none is ever seen half written. One that is
-damaged is noticed, made again and replaced. A folder that cannot be written costs time and nothing else."""
+damaged is noticed, made again and replaced. A folder that cannot be written costs time and nothing else, and
+it does not grow for ever: every material has its own files, 100 MB where its compliance is kept, and a set of
+data draws thousands, so what was not used for longest is deleted."""
 
 import contextlib
 import functools
@@ -19,10 +21,10 @@ import numpy as np
 
 from ..files import replacing
 
-__all__ = ["cache_folder", "digest", "kept", "replace_file", "report_damage"]
+__all__ = ["cache_folder", "digest", "kept", "replace_file", "report_damage", "touch"]
 
 _FORMAT = "1"  # of the files and of what is in them
-_MOST = 64  # files of a kind: those that were used last stay
+_LARGEST = 4  # of the whole folder unless BIOTAC_CACHE_GB says otherwise [GB]
 
 
 def cache_folder() -> pathlib.Path:
@@ -73,8 +75,7 @@ def kept(kind: str, inputs: Iterable, make: Callable[[], dict[str, np.ndarray]])
         found = make()
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
-        if replace_file(path, lambda file: file.write(buffer.getbuffer())):
-            _prune(kind)
+        replace_file(path, lambda file: file.write(buffer.getbuffer()))
     return found
 
 
@@ -89,16 +90,43 @@ def _load(path, key):
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         report_damage(path)
         return None
-    with contextlib.suppress(OSError):
-        os.utime(path)
+    touch(path)
     return found
 
 
-def _prune(kind):
-    with contextlib.suppress(OSError):  # also where another process is doing the same
-        files = sorted(cache_folder().glob(f"{kind}-*.npz"), key=lambda file: file.stat().st_mtime)
-        for file in files[:-_MOST]:
-            file.unlink()
+def touch(path: pathlib.Path) -> None:
+    """Notes that a file has been used now."""
+    with contextlib.suppress(OSError):
+        os.utime(path)
+
+
+def _limit() -> float:
+    """Bytes that the folder may hold."""
+    given = os.environ.get("BIOTAC_CACHE_GB") or _LARGEST
+    try:
+        found = float(given) * 1e9
+    except ValueError:
+        found = -1.0
+    if not found >= 0:
+        raise ValueError(f"BIOTAC_CACHE_GB must be a number of gigabytes of 0 or more, not {given!r}")
+    return found
+
+
+def _prune(newest: pathlib.Path) -> None:
+    """Deletes what was used longest ago until the folder is within its limit; never the newest file. A file
+    that a process has mapped lives on until that process ends (on Windows it stays: it cannot be deleted)."""
+    files = []
+    for file in newest.parent.iterdir():
+        with contextlib.suppress(OSError):  # also where another process is doing the same
+            state = file.stat()
+            if file.suffix in (".npz", ".npy", ".rows") and file != newest:
+                files.append((state.st_mtime, state.st_size, file))
+    room = _limit() - newest.stat().st_size
+    for _, size, file in sorted(files, reverse=True):
+        room -= size
+        if room < 0:
+            with contextlib.suppress(OSError):
+                file.unlink()
 
 
 def report_damage(path: pathlib.Path) -> None:
@@ -107,10 +135,15 @@ def report_damage(path: pathlib.Path) -> None:
 
 
 def replace_file(path: pathlib.Path, write: Callable[[BinaryIO], object]) -> bool:
-    """Writes a file all at once; False where that is not possible."""
+    """Writes a file of the cache all at once and deletes old ones; False where that is not possible.
+
+    Raises:
+      ValueError: BIOTAC_CACHE_GB is no size.
+    """
     try:
         with replacing(path) as temporary, open(temporary, "wb") as file:
             write(file)
+        _prune(path)
     except OSError:
         return False
     return True

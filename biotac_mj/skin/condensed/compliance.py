@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ...threads import single_thread
-from ..cache import cache_folder, kept, replace_file, report_damage
+from ..cache import cache_folder, kept, replace_file, report_damage, touch
 from .rest_tangent import rest_tangent
 
 if typing.TYPE_CHECKING:
@@ -191,7 +191,9 @@ class SurfaceCompliance:
 
     def _read(self, path):
         try:
-            return _Rows(path, self.count, self.size)
+            rows = _Rows(path, self.count, self.size)
+            touch(path)
+            return rows
         except OSError:  # not there, or not to be read
             return None
         except ValueError:
