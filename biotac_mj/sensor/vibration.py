@@ -25,7 +25,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from biotac_mj.sensor.acquisition import SLOT_RATE, draw_normal, slots_until
+from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, draw_normal, slots_until
 from biotac_mj.sensor.materials import material_named
 
 __all__ = [
