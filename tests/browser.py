@@ -43,11 +43,11 @@ class Browser:
         self._process = subprocess.Popen([executable(), *flags, url], stdout=self._log, stderr=self._log)
         try:
             port = int(
-                self._wait(
+                self.wait(
                     lambda: (pathlib.Path(profile) / "DevToolsActivePort").read_text().split("\n")[0], 30
                 )
             )
-            page = self._wait(lambda: next(p for p in self._pages(port) if p["type"] == "page"), 30)
+            page = self.wait(lambda: next(p for p in self._pages(port) if p["type"] == "page"), 30)
             self._socket, self._count = connect(page["webSocketDebuggerUrl"], max_size=None), 0
         except BaseException:
             self.close()
@@ -58,7 +58,8 @@ class Browser:
         return json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=5))
 
     @staticmethod
-    def _wait(what, seconds):
+    def wait(what, seconds):
+        """what(), called again until it raises nothing or the time is over."""
         end = time.monotonic() + seconds
         while True:
             try:
@@ -81,6 +82,14 @@ class Browser:
         """Value of a JavaScript expression in the page."""
         return self.command("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
+    def click(self, element, share=0.5):
+        """Presses and releases the mouse on what a JavaScript expression says, `share` of its width from its
+        left."""
+        box = self.evaluate(f"(({element}).getBoundingClientRect()).toJSON()")
+        place = dict(x=box["x"] + share * box["width"], y=box["y"] + box["height"] / 2)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.command("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
+
     def picture(self):
         """(height, width, 3) uint8: what the page looks like."""
         from PIL import Image
@@ -100,7 +109,7 @@ class Browser:
             assert holds(picture), f"the page did not come to look as expected within {seconds} s"
             return picture
 
-        return self._wait(look, seconds)
+        return self.wait(look, seconds)
 
     def close(self):
         self._process.terminate()

@@ -27,6 +27,7 @@ _PRESS = {
     "indenter_face": Array((None, 3), "index"),
 }
 _WINDOW = 200  # samples that a trace of a simulation shows
+_FRAME = 0.04  # [s] between pictures
 _APART = 0.033  # [m] between two recorded sensors
 _MAP = 280, 190  # of the electrode map, along x and around the finger
 _FROM = np.array([-0.45, -0.65, 0.7])  # where the camera looks from: the tip's side, pad in sight
@@ -406,7 +407,7 @@ def play_model(
             control(data)
         mujoco.mj_step(model, data)
         plugin.check()
-        if data.time - shown > 0.04 - 1e-9:
+        if data.time - shown > _FRAME - 1e-9:
             shown = data.time
             scene.update(data)
             page.update(shown, {name: moment(name, h) for name, h in handles.items()})
@@ -472,10 +473,13 @@ def play_file(
             at = int(np.abs(times - slider.value).argmin())
         page.update(float(times[at]), {name: one.moment(times[at]) for name, one in presses.items()})
         if not playing.value:
-            clock.sleep(0.04)
+            clock.sleep(_FRAME)
         elif at + 1 < len(times):
-            clock.sleep(float(times[at + 1] - times[at]) / speed)
-            at += 1
+            # no more pictures than are seen: each is sent to every browser
+            coming = max(at + 1, int(np.searchsorted(times, times[at] + speed * _FRAME)))
+            coming = min(coming, len(times) - 1)
+            clock.sleep(float(times[coming] - times[at]) / speed)
+            at = coming
         else:
             at, done = 0, done + 1
     return page
