@@ -10,6 +10,7 @@ __all__ = ["covering"]
 def covering(*axes):
     """Every combination of the axes' values, for pytest.mark.parametrize: quick are as few as have every
     value once, the others are slow."""
+    axes = [tuple(axis) for axis in axes]
     quick = {tuple(k % len(axis) for axis in axes) for k in range(max(map(len, axes)))}
     return [
         pytest.param(

@@ -257,6 +257,7 @@ def test_speed_writes_rows(repo, tmp_path):
     assert rows[1]["peak_force_N"] > rows[0]["peak_force_N"]  # the liquid carries load
 
 
+@pytest.mark.slow
 def test_speed_against_another_checkout(repo, accuracy, capsys):
     import speed
 
