@@ -116,7 +116,7 @@ class Return:
                 self.slip[b] += (1 - r / size) * T
 
 
-@pytest.mark.parametrize("element, law", covering(["quadratic", "linear"], LAWS))
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_large_strains_and_a_turn(law, element):
     rng = np.random.default_rng(3)
     model, elastic = cube(law, element, hysteresis=BRANCHES), cube(law, element)
@@ -135,7 +135,7 @@ def test_large_strains_and_a_turn(law, element):
         )
 
 
-@pytest.mark.parametrize("element, law", covering(["quadratic", "linear"], LAWS))
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_the_tangent_is_the_forces_derivative(law, element):
     """Among points that slip and points that hold; symmetric."""
     model = cube(law, element, hysteresis=((0.7, 0.05), (0.2, 1.0)))
@@ -249,7 +249,7 @@ def test_a_step_that_fails_slips_nowhere():
     assert slip[:, :, 0].max() < 1e-12 < 1e-3 < slip[:, :, 1].max()
 
 
-@pytest.mark.parametrize("element, law", covering(["quadratic", "linear"], ["linear", "neo_hookean"]))
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["linear", "neo_hookean"]))
 def test_materials_of_worlds_differ(law, element):
     """Each world has friction of its own, also none."""
     values = (((0.0, 0.02), (0.0, 0.08)), BRANCHES, ((1.5, 0.05), (0.4, 0.01)))

@@ -75,7 +75,7 @@ def test_a_bar_with_free_sides(s, t):
     assert P[0, 0] == pytest.approx(t, rel=1e-5) and abs(P[1, 1]) < 1e-5 * abs(t)
 
 
-@pytest.mark.parametrize("element, law", covering(["quadratic", "linear"], LAWS))
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 @pytest.mark.parametrize("s", [0.9, -0.5])
 def test_force_is_the_energys_gradient(law, element, s):
     model = cube(law, element, stiffening=s)
@@ -133,7 +133,7 @@ def test_without_stiffening_nothing_is_added():
     assert not Material(stiffening=0.2).remembers
 
 
-@pytest.mark.parametrize("element, law", covering(["quadratic", "linear"], ["corotational", "neo_hookean"]))
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
 def test_worlds_stiffen_each_its_own_way(law, element):
     """Without, Yeoh's and Knowles's rubber in one batch."""
     model = bar(law, element, nu=0.4, stiffening=0.7)
