@@ -43,11 +43,11 @@ class Browser:
         self._process = subprocess.Popen([executable(), *flags, url], stdout=self._log, stderr=self._log)
         try:
             port = int(
-                self.wait(
+                self._wait(
                     lambda: (pathlib.Path(profile) / "DevToolsActivePort").read_text().split("\n")[0], 30
                 )
             )
-            page = self.wait(lambda: next(p for p in self._pages(port) if p["type"] == "page"), 30)
+            page = self._wait(lambda: next(p for p in self._pages(port) if p["type"] == "page"), 30)
             self._socket, self._count = connect(page["webSocketDebuggerUrl"], max_size=None), 0
         except BaseException:
             self.close()
@@ -58,7 +58,7 @@ class Browser:
         return json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=5))
 
     @staticmethod
-    def wait(what, seconds):
+    def _wait(what, seconds):
         """what(), called again until it raises nothing or the time is over."""
         end = time.monotonic() + seconds
         while True:
@@ -74,7 +74,7 @@ class Browser:
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=60))
+            answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == self._count:
                 return answer["result"]
 
@@ -97,7 +97,7 @@ class Browser:
         data = base64.b64decode(self.command("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def until(self, holds, seconds=60):
+    def until(self, holds, seconds=120):
         """The first picture for which holds(picture) is true.
 
         Raises:
@@ -109,7 +109,7 @@ class Browser:
             assert holds(picture), f"the page did not come to look as expected within {seconds} s"
             return picture
 
-        return self.wait(look, seconds)
+        return self._wait(look, seconds)
 
     def close(self):
         self._process.terminate()

@@ -214,15 +214,14 @@ def test_recorded_presses_are_played_beside_each_other(synthetic_press, two_reco
 def window_of_recordings(two_recordings, tmp_path):
     """A browser on the page that `biotac view` serves of two recordings."""
     words = ["view", "--web", "--port", "8935", "--recording", *map(str, two_recordings)]
-    server = subprocess.Popen([sys.executable, "-m", "biotac_mj", *words], stdout=subprocess.DEVNULL)
-    url = "http://127.0.0.1:8935"
+    server = subprocess.Popen([sys.executable, "-m", "biotac_mj", *words], stdout=subprocess.PIPE, text=True)
     try:
-        browser.Browser.wait(lambda: urllib.request.urlopen(url, timeout=5).close(), 60)
+        url = next(word for line in server.stdout for word in line.split() if word.startswith("http://"))
         with browser.Browser(url, tmp_path) as window:
             yield window
     finally:
         server.terminate()
-        server.wait(20)
+        server.communicate(timeout=20)
 
 
 def beside(picture):
@@ -234,6 +233,7 @@ def beside(picture):
     return left, len(green(picture)) - left, columns[gap + 1] - columns[gap]
 
 
+@pytest.mark.slow  # a program, a browser and its drawing: a quarter of a minute
 @pytest.mark.skipif(browser.executable() is None, reason="needs Chromium (Debian: chromium)")
 def test_a_hand_on_the_slider_moves_two_recordings_that_stand_beside_each_other(window_of_recordings):
     """The film stops where it is put; on both maps the electrodes answer, and the right skin swells."""

@@ -381,7 +381,7 @@ def play_model(
         for name, h in handles.items():
             known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
             fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
-        page = Page(fingers, **server)
+        page = _served(fingers, **server)
     scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
 
@@ -412,6 +412,13 @@ def play_model(
             scene.update(data)
             page.update(shown, {name: moment(name, h) for name, h in handles.items()})
         clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
+    return page
+
+
+def _served(fingers, **server):
+    """A Page, whose address is said: its port is another where the wanted one is taken."""
+    page = Page(fingers, **server)
+    print(f"  the page is at {page.url} until Ctrl-C", flush=True)
     return page
 
 
@@ -454,7 +461,7 @@ def play_file(
     for i, one in enumerate(presses.values()):
         one.pos[0] = _APART * i
     if page is None:
-        page = Page({name: one.finger for name, one in presses.items()}, **server)
+        page = _served({name: one.finger for name, one in presses.items()}, **server)
     times = np.unique(np.concatenate([one.time for one in presses.values()]))
     gui = page.server.gui
     playing = gui.add_checkbox("play", True, order=0.5)
