@@ -27,6 +27,7 @@ MODELS = {  # in the Menagerie
 RADIUS, DEPTH, PLACE = 3.5e-3, 1e-3, -12e-3  # [m] of the ball, how deep it goes, x of the BioTac frame
 STEPS = 25
 SIZE = 360, 300  # of a finger's picture [pixel]
+EYE = -1.0, -0.8, 0.35  # looks from before the tip onto the pad: neighbours stand beside it
 
 
 def model_of(hand):
@@ -95,7 +96,7 @@ def main():
 
             with Offscreen(model, *SIZE, gl) as screen:
                 bodies = [data.body(handle.body) for handle in handles.values()]
-                cameras = [side_view(b.xpos, b.xmat.reshape(3, 3)) for b in bodies]
+                cameras = [side_view(b.xpos, b.xmat.reshape(3, 3), EYE) for b in bodies]
                 row = np.concatenate([screen.render(data, camera) for camera in cameras], axis=1)
             pathlib.Path(args.pictures).mkdir(parents=True, exist_ok=True)
             matplotlib.image.imsave(pathlib.Path(args.pictures) / f"mount_{hand}.png", row)

@@ -65,7 +65,7 @@ ROOM = 0.15  # of the skin's thickness
 SAME_RUBBER = 8  # batches in a row on one model: its factor is made once
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _clearance(points: wp.array(dtype=vec3), geoms: Geoms, out: wp.array2d(dtype=real)):
     """Distance of the nearest of some points from each geom."""
     g, w = wp.tid()

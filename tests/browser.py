@@ -59,6 +59,7 @@ class Browser:
 
     @staticmethod
     def _wait(what, seconds):
+        """what(), called again until it raises nothing or the time is over."""
         end = time.monotonic() + seconds
         while True:
             try:
@@ -73,13 +74,21 @@ class Browser:
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=60))
+            answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == self._count:
                 return answer["result"]
 
     def evaluate(self, script):
         """Value of a JavaScript expression in the page."""
         return self.command("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def click(self, element, share=0.5):
+        """Presses and releases the mouse on what a JavaScript expression says, `share` of its width from its
+        left."""
+        box = self.evaluate(f"(({element}).getBoundingClientRect()).toJSON()")
+        place = dict(x=box["x"] + share * box["width"], y=box["y"] + box["height"] / 2)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.command("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
 
     def picture(self):
         """(height, width, 3) uint8: what the page looks like."""
@@ -88,7 +97,7 @@ class Browser:
         data = base64.b64decode(self.command("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def until(self, holds, seconds=60):
+    def until(self, holds, seconds=120):
         """The first picture for which holds(picture) is true.
 
         Raises:

@@ -1,15 +1,20 @@
 """The benchmarks run as documented, meet the bounds on stored cases and write the promised JSON."""
 
+import contextlib
+import io
 import json
 import os
+import runpy
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 import pytest
 
 
 def _run(repo, script, *arguments):
+    """A script in a process of its own."""
     env = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, [str(repo), os.environ.get("PYTHONPATH")])),
@@ -20,6 +25,23 @@ def _run(repo, script, *arguments):
         text=True,
         env=env,
     )
+
+
+def _run_here(repo, script, *arguments):
+    """A script as Python runs it, in this process: its imports are there, its kernels loaded."""
+    path, code = repo / "benchmarks" / script, 0
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch.object(sys, "argv", [str(path), *map(str, arguments)]),
+        mock.patch.object(sys, "path", [str(path.parent), *sys.path]),
+    ):
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+        except SystemExit as end:
+            code = end.code or 0
+    return subprocess.CompletedProcess(sys.argv, code, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +69,7 @@ def test_accuracy_of_stored_cases(repo, shared, tmp_path):
     for name in names:
         (cases / f"{name}.npz").symlink_to(shared / "reference" / f"{name}.npz")
     skin = shared / "data" / "nvlabs_biotac_sim"
-    done = _run(
+    done = _run_here(
         repo,
         "accuracy.py",
         "--cases",
@@ -82,7 +104,7 @@ def test_a_case_that_cannot_be_solved_is_told(repo, shared, tmp_path):
     case = dict(np.load(shared / "reference" / "L_sphere3.5_pad.npz"))
     case["indenter"] = json.dumps({**json.loads(str(case["indenter"])), "shape": "cone"})
     np.savez(tmp_path / "odd.npz", **case)
-    done = _run(
+    done = _run_here(
         repo,
         "accuracy.py",
         "--cases",
@@ -100,7 +122,7 @@ def test_a_case_that_cannot_be_solved_is_told(repo, shared, tmp_path):
 
 
 def test_no_cases(repo, tmp_path):
-    done = _run(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json")
+    done = _run_here(repo, "accuracy.py", "--cases", tmp_path, "--json", tmp_path / "out.json")
     assert done.returncode == 2
     assert "pass the folder that holds them" in done.stderr
     assert not (tmp_path / "out.json").exists()
@@ -194,7 +216,7 @@ def test_a_cylinder_without_length_is_refused(accuracy):
 
 
 def test_speed_writes_rows(repo, tmp_path):
-    done = _run(
+    done = _run_here(
         repo,
         "speed.py",
         "--device",
@@ -235,6 +257,7 @@ def test_speed_writes_rows(repo, tmp_path):
     assert rows[1]["peak_force_N"] > rows[0]["peak_force_N"]  # the liquid carries load
 
 
+@pytest.mark.slow
 def test_speed_against_another_checkout(repo, accuracy, capsys):
     import speed
 
@@ -268,11 +291,12 @@ def test_standard_path_starts_at_first_touch(repo, accuracy):
 
 
 def test_unknown_skin_is_refused(repo, tmp_path):
-    done = _run(repo, "speed.py", "--json", tmp_path / "speed.json", "--skins", "huge")
+    done = _run_here(repo, "speed.py", "--json", tmp_path / "speed.json", "--skins", "huge")
     assert done.returncode == 2
     assert "unknown skin huge: choose from coarse, default, fine" in done.stderr
 
 
+@pytest.mark.slow
 def test_startup_beside_another_checkout(repo, tmp_path):
     out = tmp_path / "out.json"
     case = ["--tiers", "condensed", "--skins", "coarse", "--fills", "0", "--runs", "1", "--threads", "1"]
@@ -328,7 +352,9 @@ def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
     np.savetxt(tmp_path / "electrodes.txt", counts, "%d")
     more = ["--force", tmp_path / "force.txt"] if loaded else []
     out = tmp_path / "out.json"
-    done = _run(repo, "sensor_presets.py", tmp_path / "electrodes.txt", "--rate", rate, "--json", out, *more)
+    done = _run_here(
+        repo, "sensor_presets.py", tmp_path / "electrodes.txt", "--rate", rate, "--json", out, *more
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads(out.read_text())["electrodes.txt"]
     np.testing.assert_allclose(found["rest"], rest, atol=20 if loaded else 4)

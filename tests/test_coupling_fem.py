@@ -8,6 +8,7 @@ import mujoco.rollout
 import numpy as np
 import pytest
 import scipy.sparse.linalg
+from grids import covering
 
 import biotac_mj
 from biotac_mj.coupling import Config, fem
@@ -102,8 +103,8 @@ def check_weight(mass, timestep, **settings):
     assert np.sqrt(np.mean(np.square(speed))) < 5e-5
 
 
-# each mass and each time step; all of both on the default skin are slow
-@pytest.mark.parametrize("mass, timestep", [(0.001, 0.0005), (0.01, 0.004), (0.1, 0.004), (1.0, 0.004)])
+# the ends of both; all of both on the default skin are slow
+@pytest.mark.parametrize("mass, timestep", [(0.001, 0.0005), (1.0, 0.004)])
 def test_a_ball_reads_its_weight(mass, timestep):
     check_weight(mass, timestep)
 
@@ -142,7 +143,7 @@ def test_a_ball_reads_its_weight_on_the_default_skin(mass, timestep, liquid):
     check_weight(mass, timestep, skin="default", liquid=liquid)
 
 
-@pytest.mark.parametrize("timestep", [0.001, 0.004])
+@pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])
 def test_a_ball_sticks_and_slips_at_mu(timestep):
     """Pressed by 0.3 N and pushed along the finger, where the pad is flat to 2 degrees."""
     mass, load, mu = 0.03, 0.3, 0.4
@@ -187,8 +188,7 @@ def momentum(model, data):
     return linear, angular
 
 
-@pytest.mark.parametrize("timestep", [0.0005, 0.002])
-@pytest.mark.parametrize("masses", [(0.02, 0.005), (0.05, 0.05)])
+@pytest.mark.parametrize("masses, timestep", covering([(0.02, 0.005), (0.05, 0.05)], [0.0005, 0.002]))
 def test_momentum_of_a_free_finger_and_a_ball_is_conserved(masses, timestep):
     """A spinning ball hits a free finger beside its centre and slides."""
     finger = (
@@ -306,7 +306,7 @@ def test_replay_copies_and_reset_are_bit_equal(both):
     saved = state_of(both, data)
     copied = mujoco.MjData(both)
     mujoco.mj_copyData(copied, both, data)
-    mujoco.mj_step(both, data, 3)
+    mujoco.mj_step(both, data, 2)
     assert (
         all(data.sensor(f"b{i}_contact_force").data[1] > 0.005 for i in range(2))
         and data.sensor("b0_electrodes").data.all()
@@ -321,24 +321,24 @@ def test_replay_copies_and_reset_are_bit_equal(both):
     restored = mujoco.MjData(both)
     mujoco.mj_setState(both, restored, saved, STATE)
     for other in (restored, copied):
-        mujoco.mj_step(both, other, 3)
+        mujoco.mj_step(both, other, 2)
         same(other)
     mujoco.mj_resetData(both, restored)
     assert np.array_equal(restored.plugin_state, mujoco.MjData(both).plugin_state)
     restored.qvel[:] = start(both).qvel
-    mujoco.mj_step(both, restored, 5)
+    mujoco.mj_step(both, restored, 4)
     same(restored)
 
 
 def test_rollout_with_two_threads_equals_the_loop(both):
     starts = np.stack([state_of(both, start(both, 0.02 * i), FULL) for i in range(3)])
     states, sensors = mujoco.rollout.rollout(
-        both, [mujoco.MjData(both), mujoco.MjData(both)], starts, nstep=3
+        both, [mujoco.MjData(both), mujoco.MjData(both)], starts, nstep=2
     )
     for i in range(3):
         data = mujoco.MjData(both)
         mujoco.mj_setState(both, data, starts[i], FULL)
-        for k in range(3):
+        for k in range(2):
             mujoco.mj_step(both, data)
             assert np.array_equal(states[i, k], state_of(both, data, FULL))
             assert np.array_equal(sensors[i, k], data.sensordata)

@@ -187,14 +187,14 @@ def test_a_small_set_is_physics(small, skin):
 
 
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
-    # three objects in one batch, as on a GPU, against each alone; only sums of other lengths differ. Solves
+    # two objects in one batch, as on a GPU, against each alone; only sums of other lengths differ. Solves
     # stop at a tolerance, so with other seeds single nodes' forces differ by up to 1e-3 N: these are chosen
-    names = ["ring_7mm", "table_edge", "sphere_7mm"]
+    names = ["ring_7mm", "table_edge"]
     motions = [plan_motions(skin, name, [[0, k + 21]], 8)[0] for k, name in enumerate(names)]
     model = SkinModel(skin, "default", SkinOptions())
     ticks = []
     both = _simulate(model, names, motions, ticks.append)
-    assert sum(ticks) == 3 * 8 and both.converged.all()
+    assert sum(ticks) == 2 * 8 and both.converged.all()
     for k, name in enumerate(names):
         alone = simulate(model, name, motions[k : k + 1])
         assert (

@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from bubble import bubble
+from grids import covering
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
@@ -74,8 +75,7 @@ def inputs_of(count, liquid):
     return {"pos": pos, "quat": quat, **own}
 
 
-@pytest.mark.parametrize("liquid", [False, True], ids=["dry", "liquid"])
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""
     skin = ball(element=element, liquid=liquid)

@@ -154,7 +154,7 @@ def test_rate_is_guessed_from_repeated_rows():
 # --- effects: synthetic base signals  ---
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_without_effect_there_is_no_disagreement(seed):
     e, rng = unloaded(seed)
     assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
@@ -257,6 +257,14 @@ def _decimal(x, rng):
     return np.rint(np.rint(x / 4095 * 500) * 4095 / 500)
 
 
+@pytest.fixture(scope="module")
+def clean():
+    """Counts of a press without effects, and what is found in them."""
+    counts, _, rng = pressed(3)
+    counts = noisy(counts, rng)
+    return counts, ids(diagnose_recording(Recording(counts, rate=RATE)))
+
+
 @pytest.mark.parametrize(
     ("name", "channel", "form"),
     [
@@ -266,13 +274,13 @@ def _decimal(x, rng):
         ("quantise", None, _decimal),
     ],
 )
-def test_forms_that_are_none_of_the_textbooks(name, channel, form):
+def test_forms_that_are_none_of_the_textbooks(clean, name, channel, form):
     """A limit that gives way, rows held for uneven times, noise in common of uneven shares, counts
     written with too few decimals: of synthetic recordings."""
-    counts, _, rng = pressed(3)
-    clean = noisy(counts, rng)
-    assert name not in ids(diagnose_recording(Recording(clean, rate=RATE)))
-    d = diagnose_recording(Recording(np.clip(np.rint(form(clean, rng)), 0, 4095), rate=RATE))
+    counts, said = clean
+    assert name not in said
+    changed = form(counts.copy(), np.random.default_rng(3))
+    d = diagnose_recording(Recording(np.clip(np.rint(changed), 0, 4095), rate=RATE))
     found = [f for f in d.findings if name in (f.id, *f.ties)]
     assert found and (channel is None or found[0].channels == (channel,)), summary(d)
 
@@ -349,15 +357,23 @@ def two_terms(force, rate):
     return force + 0.4 * total
 
 
-@pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
-def test_memory_between_force_and_electrodes(law, name):
+@pytest.fixture(scope="module")
+def loaded():
+    """Counts and force of a press without memory, in which nothing is found."""
     e, force, rng = pressed(10)
-    d = diagnose_recording(Recording(noisy(e, rng), law(force, RATE)))
+    counts = noisy(e, rng)
+    assert ids(diagnose_recording(Recording(counts, force))) == []
+    return counts, force
+
+
+@pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
+def test_memory_between_force_and_electrodes(loaded, law, name):
+    counts, force = loaded
+    d = diagnose_recording(Recording(counts, law(force, RATE)))
     found = [f for f in d.findings if name in {f.id, *f.ties}]
     assert found and found[0].verified, d.verdict
     if name == "relax":
         assert "creep" in found[0].ties  # these holds are too short to tell
-    assert ids(diagnose_recording(Recording(noisy(e, rng), force))) == []
 
 
 def test_latency_is_measured():
@@ -383,7 +399,9 @@ def test_electronics_show_in_the_noise():
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 
 
-@pytest.mark.parametrize("seed, channel", [(3, 7), (5, 2), (8, 16)])
+@pytest.mark.parametrize(
+    "seed, channel", [(3, 7), *(pytest.param(*other, marks=pytest.mark.slow) for other in ((5, 2), (8, 16)))]
+)
 def test_an_electrode_that_dies_is_said(seed, channel):
     """It keeps its level and its noise, and no longer answers."""
     e, force, rng = pressed(seed, seconds=100)

@@ -64,7 +64,7 @@ def press(effects=None, **settings):
         body="world",
         coupling="one-way",
         effects=effects,
-        options={"readings": {"noise": False}},
+        options={"readings": {"noise": False}, "skin": {"element": "linear"}},
         on_error="raise",
         **{"skin": "coarse", **settings},
     )

@@ -3,6 +3,7 @@
 import importlib.util
 
 import numpy as np
+import pytest
 
 
 def load(repo, name):
@@ -12,6 +13,7 @@ def load(repo, name):
     return module
 
 
+@pytest.mark.slow  # the README's lines are these
 def test_quickstart_ball_rests_on_the_pad(repo):
     model, data = load(repo, "quickstart").main(seconds=0.4, skin="coarse")
     # a ball at rest: the skin carries its weight, 0.1 kg x 9.81 m/s^2; the pad is -y of the BioTac

@@ -273,7 +273,10 @@ def cells(kind):
             cell = feature.cell(path)
             if not isinstance(cell, kind):
                 continue
-            marks = [] if path in QUICK or kind is Refused else [pytest.mark.slow]
+            quick = path in QUICK and (
+                path != "worlds" or feature.worlds
+            )  # equal worlds are as the CPU's one
+            marks = [] if quick or kind is Refused else [pytest.mark.slow]
             out.append(pytest.param(feature, path, id=f"{feature.name}, {path}", marks=marks))
     return out
 

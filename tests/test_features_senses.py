@@ -179,10 +179,15 @@ def test_every_path_is_walked():
 
 
 def cells():
-    """All of the table; an environment takes some seconds, so of tasks three."""
+    """All of the table; of what is `attach` inside, environments and presses, a few every day."""
     for path in SENSE_PATHS:
         for sense in SENSES:
-            quick = path != "tasks" or sense.settings.keys() & {"sensor", "thermal", "textures", "options"}
+            quick = path not in ("tasks", "press") or sense.settings.keys() & {
+                "sensor",
+                "thermal",
+                "textures",
+                "options",
+            }
             marks = () if quick else pytest.mark.slow
             yield pytest.param(path, sense, id=f"{path}-{sense.name}", marks=marks)
 

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
+from grids import covering
 
 import biotac_mj
 from biotac_mj import plugin
@@ -219,8 +220,7 @@ def test_a_pinch_settles_in_the_full_tier():
     assert handle.read(data, "status")[1] <= 8
 
 
-@pytest.mark.parametrize("tier", ["condensed", "full"])
-@pytest.mark.parametrize("depth", [2e-3, 3e-3])
+@pytest.mark.parametrize("tier, depth", covering(["condensed", "full"], [2e-3, 3e-3]))
 def test_a_body_that_starts_deep_inside_is_pushed_out_at_once(tier, depth):
     """Its force alternated; or it stayed where it was, since nobody had paid for what would push it out."""
     model, data, handle = finger_under(
@@ -247,7 +247,9 @@ def test_a_body_that_starts_deep_inside_is_pushed_out_at_once(tier, depth):
     assert gap() > 2e-3 and force[-1] == 0 and speed[-1] > 0.3
 
 
-@pytest.mark.parametrize("mass, radius, timestep", [(3.0, 0.006, 0.004), (5.0, 0.006, 0.002)])
+@pytest.mark.parametrize(
+    "mass, radius, timestep", [(3.0, 0.006, 0.004), pytest.param(5.0, 0.006, 0.002, marks=pytest.mark.slow)]
+)
 def test_heavy_bodies_come_to_rest_on_the_condensed_skin(mass, radius, timestep):
     """The step that was too dear for one solve was given up with all that the skin had carried; then each
     second one was, and the core carried what the skin had let go."""

@@ -77,13 +77,13 @@ def test_drift_is_handled_where_plain_regression_fails():
 
 
 def test_nothing_of_the_test_part_and_nothing_later_is_used():
-    counts, force = synthetic_log()
-    whole = fit_force(counts, force, 2100, network=False).prediction
+    counts, force = synthetic_log(1200)
+    whole = fit_force(counts, force, 800, network=False).prediction
     changed = force.copy()
-    changed[2100:] = 99  # its answers
-    np.testing.assert_array_equal(fit_force(counts, changed, 2100, network=False).prediction, whole)
+    changed[800:] = 99  # its answers
+    np.testing.assert_array_equal(fit_force(counts, changed, 800, network=False).prediction, whole)
     np.testing.assert_allclose(
-        fit_force(counts[:2500], force[:2500], 2100, network=False).prediction, whole[:2500], atol=1e-12
+        fit_force(counts[:1000], force[:1000], 800, network=False).prediction, whole[:1000], atol=1e-12
     )
 
 

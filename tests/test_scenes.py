@@ -461,7 +461,9 @@ def weight(data, handle):
     return handle.read(data, "contact_force")[1]
 
 
-@pytest.mark.parametrize("policy", ["", 'sleep="init"', 'sleep="allowed"'])
+@pytest.mark.parametrize(
+    "policy", ['sleep="allowed"', *(pytest.param(p, marks=pytest.mark.slow) for p in ("", 'sleep="init"'))]
+)
 def test_a_resting_body_reads_its_weight_through_sleep(policy):
     """What the skin may carry stays awake; what it cannot touch sleeps as ever."""
     ghost = f'<body pos="1 0 0"><joint type="slide" axis="1 0 0"/><geom size=".01" {GHOST}/></body>'

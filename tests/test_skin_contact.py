@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from blocks import boundary, box, faces_on, half_space, place, shell, skin
+from grids import covering
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, prepare_step, step
 from biotac_mj.skin.contact.faces import face_samples
@@ -216,8 +217,7 @@ def test_slab_on_an_incline(mu):
 # --- balance and tangent  ---
 
 
-@pytest.mark.parametrize("law", ["linear", "corotational", "neo_hookean"])
-@pytest.mark.parametrize("with_core", [False, True])
+@pytest.mark.parametrize("law, with_core", covering(["linear", "corotational", "neo_hookean"], [False, True]))
 def test_action_equals_reaction(law, with_core):
     """Force and torque of geom, core and held nodes on the skin cancel."""
     import trimesh

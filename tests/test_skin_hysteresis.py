@@ -9,6 +9,7 @@ import pytest
 from bars import LENGTH, NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import nodal_areas
 from forces import Elements, begin, commit, gradients
+from grids import covering
 
 from biotac_mj.skin import Material, SkinData, step
 from biotac_mj.skin.rubber.law import LAWS
@@ -115,8 +116,7 @@ class Return:
                 self.slip[b] += (1 - r / size) * T
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_large_strains_and_a_turn(law, element):
     rng = np.random.default_rng(3)
     model, elastic = cube(law, element, hysteresis=BRANCHES), cube(law, element)
@@ -135,8 +135,7 @@ def test_large_strains_and_a_turn(law, element):
         )
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_the_tangent_is_the_forces_derivative(law, element):
     """Among points that slip and points that hold; symmetric."""
     model = cube(law, element, hysteresis=((0.7, 0.05), (0.2, 1.0)))
@@ -250,8 +249,7 @@ def test_a_step_that_fails_slips_nowhere():
     assert slip[:, :, 0].max() < 1e-12 < 1e-3 < slip[:, :, 1].max()
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["neo_hookean", "linear"])
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["linear", "neo_hookean"]))
 def test_materials_of_worlds_differ(law, element):
     """Each world has friction of its own, also none."""
     values = (((0.0, 0.02), (0.0, 0.08)), BRANCHES, ((1.5, 0.05), (0.4, 0.01)))

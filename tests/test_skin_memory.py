@@ -9,6 +9,7 @@ import pytest
 from bars import AREA, LENGTH, NOTHING, NOW, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import nodal_areas, place, shell, skin
 from forces import Elements, begin, commit
+from grids import covering
 from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
@@ -19,8 +20,7 @@ G, TAU = 0.4, 0.7
 SERIES = ((G, TAU),)
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["linear", "svk", "corotational"])
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "svk", "linear"]))
 def test_force_of_a_stretched_bar_relaxes_as_the_series_says(law, element):
     prony = ((0.4, 0.7), (0.2, 8.0))
     model = bar(law, element, prony=prony)
@@ -71,8 +71,9 @@ def test_a_loaded_bar_creeps():
     assert data.converged.all()
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
+@pytest.mark.parametrize(
+    "element, law", covering(["linear", "quadratic"], [law for law in LAWS if law != "linear"])
+)
 def test_two_jumps_and_a_turn(law, element):
     """Large strains: P = F (S + sum of g (jumps of what remembers) exp(-their age / tau)), turned with the
     body."""
@@ -107,10 +108,13 @@ def test_two_jumps_and_a_turn(law, element):
     np.testing.assert_allclose(turned, turn @ expected, atol=1e-6 * abs(expected).max())
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
-    "beside", [{}, {"stiffening": 0.8, "hysteresis": ((0.7, 0.05), (0.2, 10.0))}, {"stiffening": -0.6}]
+    "element, law, beside",
+    covering(
+        ["linear", "quadratic"],
+        LAWS,
+        [{}, {"stiffening": 0.8, "hysteresis": ((0.7, 0.05), (0.2, 10.0))}, {"stiffening": -0.6}],
+    ),
 )
 def test_the_tangent_is_the_forces_derivative(law, element, beside):
     model = cube(law, element, prony=((G, TAU), (0.1, 3.0)), mullins=(1.6, 2e3, 0.1), **beside)
@@ -244,9 +248,10 @@ def test_worlds_remember_each_their_own():
 PATH = ((1.05, 0.1), (1.1, 0.05), (1.1, 0.4), (1.07, 0.1))  # stretches of a bar, and when
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
-@pytest.mark.parametrize("name", ["prony", "mullins"])
+@pytest.mark.parametrize(
+    "element, law, name",
+    covering(["linear", "quadratic"], ["corotational", "neo_hookean"], ["prony", "mullins"]),
+)
 def test_materials_of_worlds_differ(law, element, name):
     """Each world relaxes and softens by its own numbers, also by none."""
     values = {
@@ -268,8 +273,7 @@ def test_materials_of_worlds_differ(law, element, name):
     np.testing.assert_allclose(together[:, 0], elastic, rtol=0, atol=1e-6 * peak)
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_directions_in_single_precision(law, element):
     """The same answer with those of CUDA, with all that a material can have."""
     more = {"prony": ((G, TAU), (0.2, 0.1)), "mullins": (2.0, 2e3, 0.1), "hysteresis": ((0.5, 0.03),)}
@@ -281,8 +285,9 @@ def test_directions_in_single_precision(law, element):
     assert abs(states[1] - states[0]).max() < 1e-3 * abs(states[0]).max()
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
+@pytest.mark.parametrize(
+    "element, law", covering(["linear", "quadratic"], [law for law in LAWS if law != "linear"])
+)
 def test_stress_of_elements_is_that_on_the_surface(law, element):
     """Cauchy stress P F^T / J of homogeneous steps, P from the forces on the cube's surface, with all that a
     material can have."""

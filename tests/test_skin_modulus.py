@@ -5,6 +5,7 @@ import pytest
 from bars import AREA, LENGTH, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import box, skin
 from forces import Elements
+from grids import covering
 
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
@@ -38,8 +39,7 @@ def test_two_moduli_in_series(element):
         np.testing.assert_allclose(cauchy[sides == side], force / AREA, rtol=1e-4)
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 def test_one_factor_for_all_is_another_modulus(law, element):
     """One: the same bits. Two: the stress of twice E, with memory, softening (in energy), friction and
     stiffening in place."""
@@ -66,8 +66,7 @@ def test_one_factor_for_all_is_another_modulus(law, element):
     np.testing.assert_allclose(stress[0], stress[1], rtol=1e-10, atol=1e-10 * np.abs(stress).max())
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
 def test_the_tangent_is_the_forces_derivative(law, element):
     rng = np.random.default_rng(3)
     model = cube(law, element, nu=0.49, modulus=lambda p: rng.uniform(0.3, 3, len(p)))
@@ -127,8 +126,7 @@ def test_a_ball_feels_the_modulus_below_it():
         assert count <= few + 2
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
 def test_worlds_have_each_their_own(law, element):
     """Beside materials of their own, in all their numbers."""
     more = [

@@ -8,6 +8,7 @@ import pytest
 from bars import NOTHING, E, bar, batch, cube, deform, pull, pull_worlds
 from blocks import box, skin
 from forces import Elements, gradients
+from grids import covering
 from scipy.linalg import polar
 from scipy.optimize import minimize
 
@@ -37,8 +38,7 @@ def beyond(s, q):
     return s * q**2 if s >= 0 else (np.sqrt(1 - 4 * s * q) - 1) / (-2 * s) - q
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("s", [0.0, 0.7, -0.4])
+@pytest.mark.parametrize("element, s", covering(["linear", "quadratic"], [0.0, 0.7, -0.4]))
 def test_uniaxial_and_equibiaxial_rubber(element, s):
     """Differences of Cauchy stress of an isochoric stretch: mu (a^2 - b^2) h'(I1 - 3), with Yeoh's h' = 1 + 2
     s (I1 - 3)."""
@@ -75,8 +75,7 @@ def test_a_bar_with_free_sides(s, t):
     assert P[0, 0] == pytest.approx(t, rel=1e-5) and abs(P[1, 1]) < 1e-5 * abs(t)
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], LAWS))
 @pytest.mark.parametrize("s", [0.9, -0.5])
 def test_force_is_the_energys_gradient(law, element, s):
     model = cube(law, element, stiffening=s)
@@ -105,8 +104,7 @@ def test_small_strains_do_not_stiffen(law):
     np.testing.assert_allclose(stiff, plain, atol=1e-8 * abs(plain).max())
 
 
-@pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
-@pytest.mark.parametrize("s", [1.5, -0.5])
+@pytest.mark.parametrize("law, s", covering(["corotational", "neo_hookean"], [1.5, -0.5]))
 def test_absurd_presses_leave_a_sound_state(law, s):
     """A ball pushed at once through nearly the whole slab: whatever becomes of the step, no NaN, no inverted
     element called a balance."""
@@ -135,8 +133,7 @@ def test_without_stiffening_nothing_is_added():
     assert not Material(stiffening=0.2).remembers
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
 def test_worlds_stiffen_each_its_own_way(law, element):
     """Without, Yeoh's and Knowles's rubber in one batch."""
     model = bar(law, element, nu=0.4, stiffening=0.7)

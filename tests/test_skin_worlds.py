@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from blocks import four_nodes
+from grids import covering
 from test_skin_step import finger
 
 from biotac_mj.geometry import load_skin
@@ -335,8 +336,9 @@ def test_shapes_that_no_skin_can_have_are_refused(element, monkeypatch):
     assert data.worlds.failed.numpy().tolist() == [0, 0, 1]
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-@pytest.mark.parametrize("law", ["corotational", "svk", "neo_hookean", "linear"])
+@pytest.mark.parametrize(
+    "element, law", covering(["linear", "quadratic"], ["corotational", "svk", "neo_hookean", "linear"])
+)
 def test_elements_of_single_precision_are_those_of_double(law, element):
     """Forces to double, tangents to single precision, turned and stretched; nu 0.49 feels the mean
     dilatation."""

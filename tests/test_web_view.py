@@ -3,6 +3,8 @@ browser shows."""
 
 import asyncio
 import dataclasses
+import subprocess
+import sys
 import urllib.request
 
 import numpy as np
@@ -170,16 +172,26 @@ def test_electrode_map_shows_each_electrode_at_its_place():
     assert float(numbers[0].get("x")) == float(red.get("cx"))
 
 
-def test_recorded_presses_are_played_beside_each_other(synthetic_press, tmp_path):
-    """With their indenters, and pressure where the file has it."""
+@pytest.fixture
+def two_recordings(synthetic_press, tmp_path):
+    """Files of a press, and of one that swells to 1.6 times its height and has a pressure."""
     pressure = np.zeros(synthetic_press.vert_xpos.shape[:2], np.float32)
     pressure[-1] = 5e4
-    with_pressure = dataclasses.replace(synthetic_press, contact_pressure=pressure)
-    for name, record in (("a", synthetic_press), ("b", with_pressure)):
-        (tmp_path / name).mkdir()
-        write_skin(record, tmp_path / name / "skin.h5")
+    size = np.ones((len(pressure), 1, 3), np.float32)
+    size[:, 0, 1] = np.linspace(1, 1.6, len(pressure))
+    swelling = dataclasses.replace(
+        synthetic_press, contact_pressure=pressure, vert_xpos=size * synthetic_press.vert_xpos
+    )
     files = [tmp_path / name / "skin.h5" for name in "ab"]
-    page = web_view.play_file(*files, speed=1e3, rounds=1, port=8932)
+    for path, record in zip(files, (synthetic_press, swelling)):
+        path.parent.mkdir()
+        write_skin(record, path)
+    return files
+
+
+def test_recorded_presses_are_played_beside_each_other(synthetic_press, two_recordings):
+    """With their indenters, and pressure where the file has it."""
+    page = web_view.play_file(*two_recordings, speed=1e3, rounds=1, port=8932)
     try:
         finger = page.fingers["a"]
         assert page.fingers["b"].fields == ("contact pressure",) and not finger.fields
@@ -196,6 +208,59 @@ def test_recorded_presses_are_played_beside_each_other(synthetic_press, tmp_path
         np.testing.assert_allclose(rows[1], np.linalg.norm(synthetic_press.force, axis=1), atol=1e-9)
     finally:
         page.close()
+
+
+@pytest.fixture
+def window_of_recordings(two_recordings, tmp_path):
+    """A browser on the page that `biotac view` serves of two recordings."""
+    words = ["view", "--web", "--port", "8935", "--recording", *map(str, two_recordings)]
+    server = subprocess.Popen([sys.executable, "-m", "biotac_mj", *words], stdout=subprocess.PIPE, text=True)
+    try:
+        url = next(word for line in server.stdout for word in line.split() if word.startswith("http://"))
+        with browser.Browser(url, tmp_path) as window:
+            yield window
+    finally:
+        server.terminate()
+        server.communicate(timeout=20)
+
+
+def beside(picture):
+    """Pixels of the skins left and right of the widest gap between them."""
+    columns = np.unique(green(picture)[:, 1])
+    gap = np.diff(columns).argmax()
+    middle = (columns[gap] + columns[gap + 1]) / 2
+    left = (green(picture)[:, 1] < middle).sum()
+    return left, len(green(picture)) - left, columns[gap + 1] - columns[gap]
+
+
+@pytest.mark.slow  # a program, a browser and its drawing: a quarter of a minute
+@pytest.mark.skipif(browser.executable() is None, reason="needs Chromium (Debian: chromium)")
+def test_a_hand_on_the_slider_moves_two_recordings_that_stand_beside_each_other(window_of_recordings):
+    """The film stops where it is put; on both maps the electrodes answer, and the right skin swells."""
+    window, slider = window_of_recordings, "document.querySelector('[role=slider]')"
+    playing = "document.querySelector('input[type=checkbox]').checked"
+    fills = "[...document.querySelectorAll('svg circle')].map(c => c.getAttribute('fill'))"
+
+    def pulled_to(share, time, holds):
+        """Pixels of the two skins and colours of the maps' electrodes with the slider there."""
+        window.until(
+            lambda _: (
+                window.click(f"{slider}.parentElement.parentElement", share)
+                or (time in window.evaluate("document.body.innerText") and not window.evaluate(playing))
+            )
+        )
+        left, right, gap = beside(window.until(lambda picture: holds(*beside(picture)[:2])))
+        assert gap > 15 and left > 1500
+        colors = window.evaluate(fills)
+        assert len(colors) == 38  # the two maps
+        return left, [sum(c == "rgb(204, 38, 25)" for c in part) for part in (colors[:19], colors[19:])]
+
+    window.until(lambda _: window.evaluate(f"!!{slider}"))
+    low, none = pulled_to(0.1, "t = 0.004 s", lambda left, right: right < 0.7 * left)
+    same, red = pulled_to(0.998, "t = 0.044 s", lambda left, right: right > 0.8 * left)
+    _, again = pulled_to(0.1, "t = 0.004 s", lambda left, right: right < 0.7 * left)
+    assert none == again == [0, 0] and min(red) > 4
+    assert abs(same / low - 1) < 0.1  # the left one does not swell
 
 
 def test_a_model_is_shown_while_it_steps():

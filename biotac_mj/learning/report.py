@@ -12,7 +12,7 @@ from ..reading import Array, check_arrays, read_json, read_npz
 from ..sensor.channels import NELECTRODE, electrode_noise
 from .protocol import conformal_width, coverage_curve, interaction_errors, paired_test, quartiles
 
-__all__ = ["PAPER", "evaluate_models", "predictions_of", "report_of", "table"]
+__all__ = ["PAPER", "draw_errors", "evaluate_models", "predictions_of", "report_of", "table"]
 
 # Median RMS errors, tared counts / 2048: Narang et al., ICRA 2021, their data, real sensor.
 PAPER = {
@@ -59,7 +59,10 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
         found["tests"] = _tests(drawn[split]["errors"], result["default"])
     out = pathlib.Path(out or folder / "evaluation.json")
     out.parent.mkdir(parents=True, exist_ok=True)
-    result["figures"] = _figures(result, drawn, out)
+    figures = [out.with_name(f"{out.stem}_{what}.png") for what in ("errors", "traces")]
+    draw_errors(result, figures[0])
+    _traces(result, drawn, list(result["splits"]), figures[1])
+    result["figures"] = [str(path) for path in figures]
     with replacing(out) as temporary:
         pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
     return result
@@ -228,11 +231,7 @@ def _split(folder, split, reports):
         "train_seconds": {k: float(np.mean(v)) for k, v in seconds.items()},
         "device": reports[0]["device"],
     }
-    drawn = {
-        "errors": {n: e["each"] for n, e in errors.items()},
-        "coverage": {n: np.mean(c, axis=0) for n, c in coverage.items()},
-    }
-    return found, drawn | {"example": example}
+    return found, {"errors": {n: e["each"] for n, e in errors.items()}, "example": example}
 
 
 def _tests(errors, default):
@@ -259,57 +258,48 @@ def _average(reports):
     return np.mean(reports, axis=0).tolist()
 
 
-def _figures(result, drawn, out):
-    import matplotlib
+def draw_errors(result: dict, path: pathlib.Path | str) -> None:
+    """A picture of medians and quartiles over interactions: a row for each model, a column for each split.
+
+    Args:
+      result: of `evaluate_models`; used are data, default, and of each split noise_floor and the models'
+        median and quartiles [counts].
+    """
     from matplotlib.figure import Figure
 
-    splits = list(result["splits"])
-    names = sorted(
-        result["splits"][splits[0]]["models"],
-        key=lambda n: result["splits"][splits[-1]]["models"][n]["median"],
-    )
-    figure = Figure(figsize=(6.2 * len(splits), 9.5), layout="constrained")
-    top, bottom = figure.subplots(2, len(splits), squeeze=False)
-    for axis, below, split in zip(top, bottom, splits):
-        each = [[np.mean(v) for v in drawn[split]["errors"][n].values()] for n in names]
-        axis.boxplot(each, orientation="horizontal", tick_labels=names, showfliers=False, whis=(5, 95))
-        axis.axvline(result["splits"][split]["noise_floor"], color="C2", lw=1, label="noise of the sensor")
-        for name, value in PAPER["trajectory" if split == "trajectory" else "object"].items():
-            axis.axvline(
-                value * UNIT,
-                color="C3" if name == "pointnet" else "C0",
-                ls=":",
-                lw=1,
-                label=f"paper's {name} (real data)",
+    splits = result["splits"]
+    last = list(splits.values())[-1]["models"]
+    names = sorted(last, key=lambda name: last[name]["median"])
+    figure = Figure(figsize=(1.7 + 4.8 * len(splits), 1.2 + 0.32 * len(names)), layout="constrained")
+    for axis, (split, found) in zip(
+        figure.subplots(1, len(splits), sharey=True, squeeze=False)[0], splits.items()
+    ):
+        paper = PAPER["trajectory" if split == "trajectory" else "object"]
+        for row, name in enumerate(names):
+            one = found["models"][name]
+            color = "C1" if name == result["default"] else "C7" if name in _REFERENCES else "C0"
+            axis.axhspan(row - 0.5, row + 0.5, color="0.95" if row % 2 else "1", zorder=0)
+            axis.plot(one["quartiles"], [row, row], color=color, lw=7, alpha=0.35, solid_capstyle="butt")
+            axis.plot(one["median"], row, "o", color=color)
+            axis.annotate(
+                f"{one['median']:.1f}", (1.02, row), xycoords=("axes fraction", "data"), va="center"
             )
-        axis.set_xlim(
-            0, 1.05 * max(np.percentile(e, 90) for n, e in zip(names, each) if n not in ("tare", "physics"))
-        )
-        axis.invert_yaxis()
-        axis.set_xlabel("RMS error per interaction [counts]")
+            if name in paper:
+                axis.plot(UNIT * paper[name], row, "k*", ms=9)
+        axis.axvline(found["noise_floor"], color="C2", ls="--", lw=1)
+        axis.set(xscale="log", xlabel="RMS error of an interaction [counts]", ylim=(len(names) - 0.5, -0.5))
+        axis.set_yticks(range(len(names)), names)
+        axis.set_xticks(ticks := [3, 10, 30, 100], map(str, ticks))
         axis.set_title(
             f"unseen {'trajectory' if split == 'trajectory' else 'object: ' + split}, {result['data']} sensor"
         )
-        axis.legend(fontsize=7, loc="upper right")
-        for k, name in enumerate(names):
-            heavy = name in ("latent_projection", "pointnet", "tare", result["default"])
-            below.plot(
-                _LEVELS,
-                drawn[split]["coverage"][name],
-                lw=1.8 if heavy else 0.7,
-                label=name,
-                alpha=1 if heavy else 0.7,
-                color=matplotlib.colormaps["tab20"](k % 20),
-                ls="--" if name == "tare" else "-",
-            )
-        below.set_xlabel("absolute error at most [counts]")
-        below.set_ylabel("share of all readings")
-        below.legend(fontsize=7)
-    paths = [out.with_name(out.stem + "_errors.png"), out.with_name(out.stem + "_traces.png")]
-    with replacing(paths[0]) as temporary:
+    figure.suptitle(
+        "Medians (dots, numbers) and quartiles (bars). Orange: the best to be served; grey: to compare\n"
+        "with. Star: the paper's own, of a real sensor. Dashed: noise of the sensor.",
+        fontsize=9,
+    )
+    with replacing(pathlib.Path(path)) as temporary:
         figure.savefig(temporary, dpi=110)
-    _traces(result, drawn, splits, paths[1])
-    return [str(p) for p in paths]
 
 
 def _traces(result, drawn, splits, path):

@@ -27,6 +27,7 @@ _PRESS = {
     "indenter_face": Array((None, 3), "index"),
 }
 _WINDOW = 200  # samples that a trace of a simulation shows
+_FRAME = 0.04  # [s] between pictures
 _APART = 0.033  # [m] between two recorded sensors
 _MAP = 280, 190  # of the electrode map, along x and around the finger
 _FROM = np.array([-0.45, -0.65, 0.7])  # where the camera looks from: the tip's side, pad in sight
@@ -380,7 +381,7 @@ def play_model(
         for name, h in handles.items():
             known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
             fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
-        page = Page(fingers, **server)
+        page = _served(fingers, **server)
     scene = Scene(page.server, model, [h.body for h in handles.values()])
     rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
 
@@ -406,11 +407,18 @@ def play_model(
             control(data)
         mujoco.mj_step(model, data)
         plugin.check()
-        if data.time - shown > 0.04 - 1e-9:
+        if data.time - shown > _FRAME - 1e-9:
             shown = data.time
             scene.update(data)
             page.update(shown, {name: moment(name, h) for name, h in handles.items()})
         clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
+    return page
+
+
+def _served(fingers, **server):
+    """A Page, whose address is said: its port is another where the wanted one is taken."""
+    page = Page(fingers, **server)
+    print(f"  the page is at {page.url} until Ctrl-C", flush=True)
     return page
 
 
@@ -453,7 +461,7 @@ def play_file(
     for i, one in enumerate(presses.values()):
         one.pos[0] = _APART * i
     if page is None:
-        page = Page({name: one.finger for name, one in presses.items()}, **server)
+        page = _served({name: one.finger for name, one in presses.items()}, **server)
     times = np.unique(np.concatenate([one.time for one in presses.values()]))
     gui = page.server.gui
     playing = gui.add_checkbox("play", True, order=0.5)
@@ -472,10 +480,13 @@ def play_file(
             at = int(np.abs(times - slider.value).argmin())
         page.update(float(times[at]), {name: one.moment(times[at]) for name, one in presses.items()})
         if not playing.value:
-            clock.sleep(0.04)
+            clock.sleep(_FRAME)
         elif at + 1 < len(times):
-            clock.sleep(float(times[at + 1] - times[at]) / speed)
-            at += 1
+            # no more pictures than are seen: each is sent to every browser
+            coming = max(at + 1, int(np.searchsorted(times, times[at] + speed * _FRAME)))
+            coming = min(coming, len(times) - 1)
+            clock.sleep(float(times[coming] - times[at]) / speed)
+            at = coming
         else:
             at, done = 0, done + 1
     return page
