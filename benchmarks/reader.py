@@ -3,7 +3,8 @@
 python benchmarks/reader.py --out DIR --json OUT
 
 Ordinary touches are divided by whole touches, several times: the model is fitted, its intervals are sized on
-those kept aside, and touches of a set of another seed say how many rows they cover. What training did not
+those kept aside, and sets of other seeds, of other objects and of sensors drawn at random say how many rows
+they cover. What training did not
 have is told from those unseen touches by the mean logarithm of a touch's novelty: a skin that was filled
 further, two balls at once, an electrode that stays at rest or reads nothing. Every touch finds the sensor as
 warm as it happens to be. Everything is simulated."""
@@ -34,6 +35,7 @@ from biotac_mj.skin import SkinModel
 from biotac_mj.skin.settings import read_material
 
 OBJECTS = ("sphere_3-5mm", "sphere_7mm", "sphere_14mm", "cube_14mm")
+OTHERS = ("ring_7mm", "cylinder_short_7mm", "peg_hexagon_8mm")
 STEPS, RATE = 8, 20.0
 FILL = 2e-7  # [m3] more liquid than at rest
 BALLS = ((3.5e-3, 9e-3), (2.5e-3, 11e-3), (5e-3, 10e-3))  # [m] radius, and apart along the finger
@@ -172,18 +174,25 @@ def main(argv: list[str] | None = None) -> None:
         cases[f"two balls of {1e3 * ball:g} mm, {1e3 * apart:g} mm apart"] = warmed(two, given.seed + 5 + k)
     for what in ("rest", "nothing"):
         cases[f"an electrode reads {what}"] = dead(unseen, what, given.seed)
+    other = {"objects": {"objects": OTHERS}, "sensors": {"sensor": "random"}}
+    judged = {"touches": unseen}
+    for k, (name, more) in enumerate(other.items()):
+        folder = given.out / f"{name}-{given.seed}"
+        judged[name] = ordinary(folder, given.unseen // 2, given.tier, seed=given.seed + 10 + k, **more)
     covered, areas, errors = {}, {}, {}
     names = np.unique(data.owner)
     for seed in range(given.divisions):
         part = assign(len(names), seed, SHARES)
         reader = fit_reader(data, names[part == "train"], names[part == "validation"], seed=seed)
-        found = reader.predict(unseen.counts, unseen.tare, unseen.pdc)
-        truth = unseen.targets | {"electrodes": unseen.counts}
-        for name, value in found.value.items():
-            error = np.abs(value - truth[name])
-            there = np.isfinite(error).all(1)
-            covered.setdefault(name, []).append(float((error <= found.half[name])[there].mean()))
-            errors.setdefault(name, []).append(float(np.sqrt((error[there] ** 2).mean())))
+        for what, one in judged.items():
+            found = reader.predict(one.counts, one.tare, one.pdc)
+            truth = one.targets | {"electrodes": one.counts}
+            for name, value in found.value.items():
+                error = np.abs(value - truth[name])
+                there = np.isfinite(error).all(1)
+                inside, key = (error <= found.half[name])[there], f"{name}, unseen {what}"
+                covered.setdefault(key, []).append(float(inside.mean()))
+                errors.setdefault(key, []).append(float(np.sqrt((error[there] ** 2).mean())))
         usual = strangeness(reader, unseen)
         for name, case in cases.items():
             areas.setdefault(name, []).append(area(usual, strangeness(reader, case)))

@@ -10,6 +10,7 @@ import pytest
 from biotac_mj.cli import main
 from biotac_mj.learning.instants.force import causal_average, fit_force, ridge, shared_gain, walk_forward
 from biotac_mj.learning.instants.real import evaluate_recording
+from biotac_mj.learning.instants.transfer import label, touches_of_force, transfer_force
 from biotac_mj.recordings import load_one
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 
@@ -181,3 +182,30 @@ def test_real_press_beats_the_bars(tmp_path):
     assert (
         np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]
     ).all()
+
+
+def test_another_sensor_and_few_touches_teach_the_force():
+    """Two synthetic sensors that answer alike but for gains, rests and drift."""
+    counts, force = synthetic_log(3000, seed=1)
+    rng = np.random.default_rng(2)
+    gain, rest = rng.normal(1, 0.15, 19), rng.normal(0, 0.3, 19)
+    log_z = log_impedance(counts)
+    other = np.clip(counts_from_log_impedance(rest + log_z.mean(0) + gain * (log_z - log_z.mean(0))), 0, 4095)
+    touch = touches_of_force(force)
+    assert np.unique(touch).size > 10 and (np.diff(touch) >= 0).all()
+    half = 1500
+    labelled = np.full_like(force, np.nan)
+    labelled[:half] = label(force[:half] + rng.normal(0, 3, (half, 3)), touch[:half], 6)  # poor labels
+    assert len(np.unique(touch[np.isfinite(labelled[:, 0])])) == 6
+
+    def error(known_force):
+        found = transfer_force(counts, known_force, other, labelled, touch)
+        return np.sqrt(((found - force)[half:] ** 2).mean())
+
+    known = error(force)
+    assert known < 0.5 and known < 0.8 * error(0 * force)  # which teaches nothing
+    found = transfer_force(counts, force, other, labelled, touch)
+    sooner = transfer_force(counts, force, other[:2000], labelled[:2000], touch)
+    np.testing.assert_allclose(sooner, found[:2000])
+    with pytest.raises(ValueError, match="3 labelled touches: at least 5"):
+        label(force, touch, 3)

@@ -64,5 +64,6 @@ class Known:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(n,) distances of rows (n, k) from the nearest known ones, over how far those are apart."""
-        near, who = self._tree.query((x - self.mean) @ self.axes / self.spread, min(_NEAR, len(self.rows)))
-        return near.reshape(len(x), -1).mean(1) / self.apart[who].reshape(len(x), -1).mean(1)
+        which = np.arange(1, min(_NEAR, len(self.rows)) + 1)
+        near, who = self._tree.query((x - self.mean) @ self.axes / self.spread, which)
+        return near.mean(1) / self.apart[who].mean(1)

@@ -16,7 +16,7 @@ from ..protocol import conformal_width
 from .examples import Examples
 from .force import ridge
 from .novelty import Known, even
-from .terms import Terms
+from .terms import KINDS, Terms
 
 __all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "judge_in_time"]
 
@@ -26,12 +26,6 @@ _CODE = 8
 _SPACES = ("rows", "pressed", "level")  # of electrodes, of them and PDC, of rests
 _FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
 _RIDGE = (1e-4, 1e-3, 1e-2, 1e-1)
-# arguments of `Terms.fit`; predictions are the mean over these: none alone is safe where something new comes
-_KINDS = [
-    {"common": common, **more}
-    for common in (False, True)
-    for more in ({}, {"products": 3}, {"products": 5}, {"length": 1.0})
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,12 +93,12 @@ class Reader:
         out = 0.0
         for k, terms in enumerate(self._kinds):
             out = out + terms(x) @ self.tensors[f"{name}.{k}.weight"] + self.tensors[f"{name}.{k}.offset"]
-        return out / len(_KINDS)
+        return out / len(KINDS)
 
     @property
     def _kinds(self):
         names = [field.name for field in dataclasses.fields(Terms)]
-        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(_KINDS))]
+        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(KINDS))]
 
     def _code(self, x):
         t = self.tensors
@@ -197,7 +191,7 @@ def fit_reader(
         usual = known(rows[aside & taken])
         usual = max(usual.max(), 1.0) if name == "level" else np.quantile(usual, 0.95)
         tensors[f"{name}.usual"] = np.array(usual)
-    kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in _KINDS]
+    kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in KINDS]
     for k, terms in enumerate(kinds):
         tensors |= {f"terms.{k}.{f.name}": getattr(terms, f.name) for f in dataclasses.fields(Terms)}
         columns = terms(x)
