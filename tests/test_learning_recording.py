@@ -92,13 +92,18 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     counts, force = synthetic_log()
     counts[:, 5] = 4095  # a dead channel
     e, f = write(tmp_path, counts, force, ",")
-    result = evaluated(e, f, tmp_path / "r.json", network=False)
+    other, _ = load_one(e, force=f)
+    result = evaluated(e, f, tmp_path / "r.json", network=False, known=other, touches=5)
     assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 2100
     assert (tmp_path / "r.png").stat().st_size > 20_000
     # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less
     # what eight components take up
     assert result["reconstruction"]["models"]["pca8"]["test"]["rms"] < 1.2
     assert result["force_regression"]["models"]["drift_aware"]["rmse"][0] < 0.2
+    assert result["force_regression"]["models"]["transferred"]["rmse"][0] < 0.2
+    assert any("and 5 labelled touches" in note for note in result["notes"])
+    with pytest.raises(ValueError, match="both need forces; give them at"):
+        evaluated(e, None, tmp_path / "r2.json", network=False, known=other)
     assert any("e6 reads 0 or 4095 in 100.0 %" in note for note in result["notes"])
     result = evaluated(e, None, tmp_path / "r2.json", network=False)
     assert "force_regression" not in result and any("no force:" in note for note in result["notes"])

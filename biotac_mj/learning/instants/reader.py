@@ -147,7 +147,7 @@ class Reader:
             one.predict(np.full((2, len(ELECTRODES)), FULL_SCALE / 2), np.full(len(ELECTRODES), 2000.0))
         except (KeyError, ValueError) as error:
             raise ValueError(
-                f"{path} does not fit together ({error}): it is damaged, write it anew"
+                f"{path} does not fit together ({error}): it is damaged or an older version's, write it anew"
             ) from None
         return one
 
