@@ -13,6 +13,7 @@ from recorded import synthetic  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
+from biotac_mj.learning.instants.novelty import Known  # noqa: E402
 from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
 from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.weights import shipped  # noqa: E402
@@ -30,7 +31,7 @@ def pattern(place, force):
 
 
 def touches(count, seed, second=False):
-    """Examples of `count` presses; second: at two places at once."""
+    """Examples of `count` presses, each at its own warmth; second: at two places at once."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(count), STEPS)
     force = np.tile(np.linspace(0.2, 1, STEPS), count) * np.repeat(rng.uniform(0.5, 2, count), STEPS)
@@ -38,7 +39,8 @@ def touches(count, seed, second=False):
     change = pattern(place, force)
     if second:
         change = 0.5 * (change + pattern(np.where(place > 0, place - 0.8, place + 0.8), force))
-    tare = np.tile(REST_COUNTS["1"], (len(owner), 1))
+    warmth = rng.uniform(0, 0.3, count)[owner][:, None]
+    tare = np.rint(counts_from_log_impedance(log_impedance(REST_COUNTS["1"]) - warmth))
     counts = counts_from_log_impedance(log_impedance(tare) + change) + rng.normal(0, 2, tare.shape)
     zero = np.zeros(len(owner))
     # what no electrode tells is part of every real force: a trajectory's own error
@@ -47,7 +49,7 @@ def touches(count, seed, second=False):
         "force": np.column_stack([zero, force + own, zero + rng.normal(0, 0.01, len(owner))]),
         "place": np.column_stack([place, zero, zero]),
     }
-    return Examples(np.clip(counts, 0, 4095), tare, owner, targets, True, "synthetic", True)
+    return Examples(np.clip(counts, 0, 4095), tare, owner, targets, True, "synthetic", True, 80 * force)
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,43 @@ def test_novelty_rises_for_what_training_did_not_have(reader):
         assert (found.half["force"].mean(0) > known.half["force"].mean(0))[1:].all()
 
 
+def test_novelty_sees_a_rest_that_training_did_not_have(reader):
+    """Warmth is one number for all electrodes and was there; another pattern was not."""
+    data = touches(100, 8)
+    pattern = 0.1 * np.cos(np.arange(19))
+    found, other = (
+        reader.predict(
+            *(counts_from_log_impedance(log_impedance(x) + shift) for x in (data.counts, data.tare))
+        )
+        for shift in (0, pattern)
+    )
+    assert (found.novelty > 1).mean() < 0.12 and (other.novelty > 1).all()
+    for name in found.half:  # what is read is as certain as before: it is the change from the rest
+        np.testing.assert_allclose(other.half[name], found.half[name], rtol=0.2)
+
+
+def test_novelty_sees_pdc_that_does_not_go_with_the_electrodes(reader):
+    data = touches(100, 9)
+
+    def area(pdc):
+        found = (reader.predict(data.counts, data.tare, x).novelty for x in (data.pdc, pdc))
+        usual, strange = (np.log(x).reshape(-1, STEPS).mean(1) for x in found)
+        return (strange[:, None] > usual).mean()
+
+    assert area(2 * data.pdc) > 0.9
+    assert 0.4 < area(1.02 * data.pdc) < 0.7
+
+
+def test_distance_is_one_where_rows_lie_as_known_ones_do():
+    rng = np.random.default_rng(0)
+    x, owner = np.repeat(rng.normal(size=(200, 3)), 5, 0), np.repeat(np.arange(200), 5)
+    x = x + 0.01 * rng.normal(size=x.shape)
+    known = Known.fit(x, owner)
+    assert 0.7 < np.median(known(rng.normal(size=(400, 3)))) < 1.3
+    far = np.array([[8.0, 0, 0], [0, 8, 0]])
+    assert (known(far) > 3).all()
+
+
 def test_a_model_comes_back_from_its_file(reader, tmp_path):
     reader.save(tmp_path / "m.safetensors")
     back, data = Reader.load(tmp_path / "m.safetensors"), touches(5, 4)
@@ -100,7 +139,7 @@ def test_a_model_comes_back_from_its_file(reader, tmp_path):
     with pytest.raises(ValueError, match="holds no model that reads electrodes"):
         Reader.load(shipped("forward"))
     tensors = dict(reader.tensors)
-    del tensors["known"]
+    del tensors["rows.apart"]
     dataclasses.replace(reader, tensors=tensors).save(tmp_path / "less.safetensors")
     with pytest.raises(ValueError, match="does not fit together"):
         Reader.load(tmp_path / "less.safetensors")

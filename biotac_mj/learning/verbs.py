@@ -146,6 +146,13 @@ def _add_evaluate(verbs, verb):
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
     v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
     v.add_argument(
+        "--known",
+        metavar="FILE",
+        help="with --electrodes: another sensor's recording with force; judges what it teaches with few "
+        "touches of this one",
+    )
+    v.add_argument("--touches", type=whole(5, 10_000), default=20, help="labelled ones that go with --known")
+    v.add_argument(
         "--new-sensor",
         metavar="SET",
         help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights",
@@ -184,7 +191,7 @@ def _evaluate(args):
         raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
     if args.folder and os.path.isfile(args.folder) and not args.electrodes:
         args.folder, args.electrodes = None, args.folder
-    for name in ("force", "sensor"):
+    for name in ("force", "sensor", "known"):
         if getattr(args, name) and not args.electrodes:
             raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
     if args.weights and not args.new_sensor:
@@ -351,6 +358,8 @@ def _evaluate_recording(args):
         args.fraction,
         args.seed,
         progress=not args.quiet,
+        known=load_one(args.known)[0] if args.known else None,
+        touches=args.touches,
     )
     table = result["reconstruction"]
     print(

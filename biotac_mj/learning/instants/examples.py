@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 
 from ...recordings import Recording
-from ...sensor.channels import NELECTRODE, log_impedance
+from ...sensor.channels import CHANNELS, NELECTRODE, log_impedance
 from ..training.inverse import contact_centre
 
 __all__ = ["Examples", "from_recording", "from_set"]
@@ -21,6 +21,7 @@ class Examples:
     Attributes:
       counts: (n, 19) raw; tare: (n, 19) at rest. owner: (n,) number of the trajectory.
       targets: "force" (n, 3) [N], "place" (n, 3) [m], as far as they are known; NaN: not in this row.
+      pdc: (n,) change of PDC from rest [counts], None where it is not known.
       tared: whether the tare is measured; else ln Z is taken as it is. synthetic: no real sensor.
     """
 
@@ -31,6 +32,7 @@ class Examples:
     tared: bool
     source: str
     synthetic: bool
+    pdc: np.ndarray | None = None
 
     @property
     def log_change(self) -> np.ndarray:
@@ -89,6 +91,8 @@ def from_set(path: pathlib.Path | str) -> Examples:
             raise ValueError(f"{path} has neither forces nor contacts: make a set with `biotac generate`")
         keep = good & (rows != first)  # a tare is no reading
         now = counts[rows][:, :NELECTRODE].astype(float)
+        pdc = CHANNELS.index("pdc")
+        pressed = (counts[rows][:, pdc] - counts[first][:, pdc]).astype(float)[keep]
         return Examples(
             now[keep],
             tare[keep],
@@ -97,6 +101,7 @@ def from_set(path: pathlib.Path | str) -> Examples:
             True,
             str(data.path.name),
             not bool(np.isin(data.kind[chosen], ("recorded", "resimulated")).all()) or not measured,
+            pressed if np.isfinite(pressed).all() else None,
         )
 
 

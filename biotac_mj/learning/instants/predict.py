@@ -48,12 +48,14 @@ def predict(
     reader = Reader.load(model)
     recording, _ = load_one(source, sensor, **load)
     counts, _ = recording.counts()
-    rest = None
+    rest = pdc = None
     if tare is not None:
         if not 1 <= tare < len(counts):
             raise ValueError(f"--tare {tare}: {recording.name} has {len(counts)} rows, some must be left")
         rest = counts[:tare].mean(0)
-    return {"time": recording.time}, reader.predict(counts, rest), reader.meta
+        if recording.pdc is not None and np.isfinite(recording.pdc).all():
+            pdc = recording.pdc - recording.pdc[:tare].mean()  # of any unit that counts counts
+    return {"time": recording.time}, reader.predict(counts, rest, pdc), reader.meta
 
 
 def _forward(model, source, meta):

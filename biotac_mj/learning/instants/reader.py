@@ -2,11 +2,11 @@
 with an interval, and a score of how far a row is from what was trained on. Kept as one file."""
 
 import dataclasses
+import functools
 import json
 import pathlib
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...data.schema import SPLITS
 from ...data.splits import assign
@@ -15,23 +15,17 @@ from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
 from .force import ridge
-from .terms import Terms
+from .novelty import Known, even
+from .terms import KINDS, Terms
 
 __all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "judge_in_time"]
 
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": tuple(ELECTRODES)}
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _CODE = 8
-_NEAR = 10  # neighbours that a row is compared with
-_KNOWN = 2000  # rows that stand for what was trained on
+_SPACES = ("rows", "pressed", "level")  # of electrodes, of them and PDC, of rests
 _FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
 _RIDGE = (1e-4, 1e-3, 1e-2, 1e-1)
-# arguments of `Terms.fit`; predictions are the mean over these: none alone is safe where something new comes
-_KINDS = [
-    {"common": common, **more}
-    for common in (False, True)
-    for more in ({}, {"products": 3}, {"products": 5}, {"length": 1.0})
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +35,8 @@ class Prediction:
     Attributes:
       value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
         half widths of the intervals.
-      novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row is stranger.
+      novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row, or the tare that it
+        was read against, is stranger.
     """
 
     value: dict[str, np.ndarray]
@@ -66,8 +61,14 @@ class Reader:
         """Names of what it predicts, of TARGETS."""
         return [name for name in TARGETS if f"{name}.half" in self.tensors]
 
-    def predict(self, counts: np.ndarray, tare: np.ndarray | None = None) -> Prediction:
-        """Predictions of raw counts (n, 19); tare: (19,) or (n, 19) counts at rest, of a model that is tared.
+    def predict(
+        self, counts: np.ndarray, tare: np.ndarray | None = None, pdc: np.ndarray | None = None
+    ) -> Prediction:
+        """Predictions of raw counts (n, 19).
+
+        Args:
+          tare: (19,) or (n, 19) counts at rest, of a model that is tared. pdc: (n,) change of PDC from its
+            rest [counts]; novelty, and nothing else, takes it where training had it.
 
         Raises:
           ValueError: no tare where one is needed.
@@ -76,34 +77,44 @@ class Reader:
             raise ValueError("this model reads changes from rest: give rows at rest with --tare")
         rest = log_impedance(tare) if self.meta["tared"] else np.zeros(len(ELECTRODES))
         x = log_impedance(counts) - rest
-        strange = self._distance(x) / self.tensors["usual"]
+        strange = self._strange(x, pdc)
         value, half = {}, {}
         for name in self.targets:
             out = self._code(x) if name == "electrodes" else self._regress(name, x)
             value[name] = counts_from_log_impedance(out + rest) if name == "electrodes" else out
             half[name] = self.tensors[f"{name}.half"] * _scale(strange)[:, None]
-        return Prediction(value, half, strange)
+        novelty = strange
+        if self.meta["tared"]:  # ordinary rests say nothing, strange ones make every row strange
+            level = self._known["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
+            novelty = np.where(level > 1, np.maximum(level, strange), strange)
+        return Prediction(value, half, novelty)
 
     def _regress(self, name, x):
         out = 0.0
         for k, terms in enumerate(self._kinds):
             out = out + terms(x) @ self.tensors[f"{name}.{k}.weight"] + self.tensors[f"{name}.{k}.offset"]
-        return out / len(_KINDS)
+        return out / len(KINDS)
 
     @property
     def _kinds(self):
         names = [field.name for field in dataclasses.fields(Terms)]
-        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(_KINDS))]
+        return [Terms(*(self.tensors[f"terms.{k}.{name}"] for name in names)) for k in range(len(KINDS))]
 
     def _code(self, x):
         t = self.tensors
         return (x - t["mean"]) @ t["axes"][:, :_CODE] @ t["axes"][:, :_CODE].T + t["mean"]
 
-    def _distance(self, x):
-        """(n,) from the nearest rows that are known, over how far those are from theirs."""
-        t = self.tensors
-        near, who = cKDTree(t["known"]).query((x - t["mean"]) @ t["axes"] / t["spread"], _NEAR)
-        return near.mean(1) / t["known_distance"][who].mean(1)
+    @functools.cached_property
+    def _known(self):
+        names = [field.name for field in dataclasses.fields(Known)]
+        spaces = [space for space in _SPACES if f"{space}.rows" in self.tensors]
+        return {space: Known(*(self.tensors[f"{space}.{name}"] for name in names)) for space in spaces}
+
+    def _strange(self, x, pdc):
+        """(n,) novelty of rows, whatever their rest."""
+        space = "rows" if pdc is None or "pressed" not in self._known else "pressed"
+        seen = even(x - self.tensors["centre"], pdc if space == "pressed" else None)
+        return self._known[space](seen) / self.tensors[f"{space}.usual"]
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
@@ -136,7 +147,7 @@ class Reader:
             one.predict(np.full((2, len(ELECTRODES)), FULL_SCALE / 2), np.full(len(ELECTRODES), 2000.0))
         except (KeyError, ValueError) as error:
             raise ValueError(
-                f"{path} does not fit together ({error}): it is damaged, write it anew"
+                f"{path} does not fit together ({error}): it is damaged or an older version's, write it anew"
             ) from None
         return one
 
@@ -165,8 +176,22 @@ def fit_reader(
         )
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
     x = data.log_change
-    tensors = _space(x[fit], seed)
-    kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in _KINDS]
+    tensors = _components(x[fit])
+    tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
+    one = np.ones(len(x), bool)
+    spaces = {"rows": (even(x - tensors["centre"]), one)}
+    if data.pdc is not None:
+        spaces["pressed"] = even(x - tensors["centre"], data.pdc), one
+    if data.tared:  # one rest of each trajectory
+        first = np.isin(np.arange(len(x)), np.unique(data.owner, return_index=True)[1])
+        spaces["level"] = log_impedance(data.tare), first
+    for name, (rows, taken) in spaces.items():
+        known = Known.fit(rows[fit & taken], data.owner[fit & taken], seed)
+        tensors |= {f"{name}.{f.name}": getattr(known, f.name) for f in dataclasses.fields(Known)}
+        usual = known(rows[aside & taken])
+        usual = max(usual.max(), 1.0) if name == "level" else np.quantile(usual, 0.95)
+        tensors[f"{name}.usual"] = np.array(usual)
+    kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in KINDS]
     for k, terms in enumerate(kinds):
         tensors |= {f"terms.{k}.{f.name}": getattr(terms, f.name) for f in dataclasses.fields(Terms)}
         columns = terms(x)
@@ -176,13 +201,12 @@ def fit_reader(
             tensors |= {f"{name}.{k}.weight": weight, f"{name}.{k}.offset": offset}
     meta = {"tared": data.tared, "level": level, "source": data.source, "units": UNITS}
     meta |= {"train": len(train), "aside": len(kept), "synthetic": data.synthetic}
-    tensors |= {"usual": np.array(1.0)} | {f"{name}.half": np.zeros(1) for name in data.targets}
-    tensors["electrodes.half"] = np.zeros(1)
-    raw = Reader(meta, tensors).predict(data.counts[aside], data.tare[aside])
-    tensors["usual"] = np.array(np.quantile(raw.novelty, 0.95))
+    tensors |= {f"{name}.half": np.ones(1) for name in (*data.targets, "electrodes")}
+    pdc = None if data.pdc is None else data.pdc[aside]
+    raw = Reader(meta, tensors).predict(data.counts[aside], data.tare[aside], pdc)
     truth = data.targets | {"electrodes": data.counts}
     for name in raw.value:
-        error = (raw.value[name] - truth[name][aside]) / _scale(raw.novelty / tensors["usual"])[:, None]
+        error = (raw.value[name] - truth[name][aside]) / raw.half[name]
         there = np.isfinite(error).all(1)
         half = conformal_width(error[there], data.owner[aside][there], 1 - level)
         if not np.isfinite(half).all():
@@ -194,23 +218,10 @@ def fit_reader(
     return Reader(meta, tensors)
 
 
-def _space(x, seed):
-    """Components of rows (n, 19), and rows that stand for all of them."""
+def _components(x):
+    """Mean and principal components of rows (n, 19), the largest first."""
     mean = x.mean(0)
-    size, axes = np.linalg.eigh((x - mean).T @ (x - mean) / len(x))
-    size, axes = np.maximum(size[::-1], 0), axes[:, ::-1]
-    # what the last half of the components has is noise: less counts for nothing
-    spread = np.sqrt(size + size[len(size) // 2 :].mean() + 1e-12)
-    chosen = np.random.default_rng(seed).permutation(len(x))[:_KNOWN]
-    known = (x[chosen] - mean) @ axes / spread
-    near = cKDTree(known).query(known, _NEAR + 1)[0][:, 1:].mean(1)
-    return {
-        "mean": mean,
-        "axes": axes,
-        "spread": spread,
-        "known": known,
-        "known_distance": np.maximum(near, 1e-3 * near.mean() + 1e-9),
-    }
+    return {"mean": mean, "axes": np.linalg.eigh((x - mean).T @ (x - mean))[1][:, ::-1]}
 
 
 def _best_ridge(columns, y, owner):
@@ -255,7 +266,7 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
 
 def _scores(reader, data, test):
     rows = np.isin(data.owner, test)
-    found = reader.predict(data.counts[rows], data.tare[rows])
+    found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])
     truth = data.targets | {"electrodes": data.counts}
     out = {}
     for name, value in found.value.items():

@@ -11,6 +11,7 @@ from ...files import replacing
 from ...recordings.recording import Recording
 from ...sensor.channels import FULL_SCALE
 from .force import TRIALS, fit_force, ridge
+from .transfer import TOUCHES, label, touches_of_force, transfer_force
 
 __all__ = ["evaluate_recording"]
 
@@ -28,6 +29,8 @@ def evaluate_recording(
     seed: int = 0,
     network: bool = True,
     progress: bool = True,
+    known: Recording | None = None,
+    touches: int = TOUCHES,
 ) -> dict:
     """Evaluates one recording; writes `out` (JSON, described in docs/lab/learning.md) and a plot beside it.
 
@@ -36,6 +39,8 @@ def evaluate_recording(
       fraction: of the rows, in time, that train; everything is fitted on them alone.
       seed: of the networks.
       network: False leaves the networks out (seconds, for tests): PCA and ridge only.
+      known: another sensor with force: what it teaches, amended by so many `touches` of this one's first
+        part, is judged beside what this one's whole first part teaches.
 
     Returns:
       what is written.
@@ -73,12 +78,18 @@ def evaluate_recording(
         "reconstruction": reconstruction,
     }
     predicted = None
+    if known is not None and (known.force is None or recording.force is None):
+        raise ValueError(f"{known.name} and {recording.name}: both need forces; give them at `biotac import`")
     if recording.force is not None:
         # a bar of its own: a step of the networks is no measure of how long a trial takes
         with tqdm(total=TRIALS, desc="evaluate: force", **look) as bar:
             result["force_regression"], predicted = _force(
                 counts, recording.force, ntrain, seed, network, bar
             )
+        if known is not None:
+            errors, notes = _transferred(known, counts, recording.force, ntrain, touches)
+            result["force_regression"]["models"]["transferred"] = errors
+            result["notes"] += notes
     else:
         result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
@@ -184,15 +195,7 @@ def _force(counts, force, ntrain, seed, network, bar):
         "linear_counts": counts @ w + b,
         "drift_aware": model.prediction,
     }
-    truth = force[ntrain:]
-    spread = np.maximum(truth.var(0), 1e-12)
-    table = {}
-    for name, y in rows.items():
-        error = y[ntrain:] - truth
-        table[name] = {
-            "rmse": np.sqrt((error**2).mean(0)).tolist(),
-            "r2": (1 - (error**2).mean(0) / spread).tolist(),
-        }
+    table = {name: _errors(y[ntrain:], force[ntrain:]) for name, y in rows.items()}
     details = {
         "features": dict(zip("xyz", model.chosen)),
         "network_kept": model.network,
@@ -206,6 +209,23 @@ def _force(counts, force, ntrain, seed, network, bar):
         "shared_gain_of_ln_z_at_end": model.gain,
         "details": details,
     }, rows["drift_aware"]
+
+
+def _transferred(known, counts, force, ntrain, touches):
+    known, known_counts, notes = _usable(known)
+    touch = touches_of_force(force[:ntrain])
+    labelled = np.full_like(force, np.nan)
+    labelled[:ntrain] = label(force[:ntrain], touch, touches)
+    y = transfer_force(known_counts, known.force, counts, labelled, touch)
+    rows = np.flatnonzero(np.isfinite(labelled).all(1))
+    said = f"transferred: {known.name} and {len(np.unique(touch[rows]))} labelled touches, {len(rows)} rows"
+    return _errors(y[ntrain:], force[ntrain:]), [*notes, said]
+
+
+def _errors(predicted, truth):
+    square = ((predicted - truth) ** 2).mean(0)
+    r2 = 1 - square / np.maximum(truth.var(0), 1e-12)
+    return {"rmse": np.sqrt(square).tolist(), "r2": r2.tolist()}
 
 
 def _plot(counts, force, ntrain, reconstructed, predicted, result, path):

@@ -6,9 +6,15 @@ import numpy as np
 
 from ...sensor.channels import NELECTRODE
 
-__all__ = ["Terms"]
+__all__ = ["KINDS", "Terms"]
 
 _WAVES = 200  # random waves: more changed nothing on two recordings
+# arguments of `Terms.fit`; predictions are the mean over these: none alone is safe where something new comes
+KINDS = [
+    {"common": common, **more}
+    for common in (False, True)
+    for more in ({}, {"products": 3}, {"products": 5}, {"length": 1.0})
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

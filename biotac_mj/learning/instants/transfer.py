@@ -1,0 +1,103 @@
+"""Force of a sensor of which few touches are labelled, with another sensor's recording as what is believed
+before."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
+
+from ...sensor.channels import NELECTRODE, log_impedance
+from .force import causal_average, ridge
+from .terms import KINDS, Terms
+
+__all__ = ["TOUCHES", "label", "touches_of_force", "transfer_force"]
+
+TOUCHES = 20  # that are labelled of a new sensor
+_SMOOTH, _RELEASE = 10, 0.5  # [rows], [N]: a touch ends where the force, smoothed, has fallen by this much
+_WINDOW = 10  # time constant of the causal average [rows]
+_KNOWN_RIDGE = 1e-3  # of the other sensor's regressions
+_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of what the new one is believed to differ by
+_FOLDS = 5
+
+
+def touches_of_force(force: np.ndarray) -> np.ndarray:
+    """(n,) number of the touch that each row of force (n, 3) [N] belongs to: from one minimum of its size to
+    the next, so that a press that is never quite released is many touches."""
+    size = gaussian_filter1d(np.linalg.norm(force, axis=1), _SMOOTH)
+    lowest, _ = find_peaks(-size, prominence=_RELEASE)
+    return np.searchsorted(lowest, np.arange(len(force)), "right")
+
+
+def label(force: np.ndarray, touch: np.ndarray, count: int = TOUCHES) -> np.ndarray:
+    """Force (n, 3) with NaN but in so many whole touches, spread over the time; touch: (n,) of each row.
+
+    Raises:
+      ValueError: too few touches to learn from.
+    """
+    whole = np.unique(touch)[:-1]  # the last one may be cut
+    count = min(count, len(whole))
+    if count < _FOLDS:
+        raise ValueError(
+            f"{count} labelled touches: at least {_FOLDS} whole ones are needed to choose how much of the "
+            "other sensor is believed; label more, or record longer"
+        )
+    chosen = whole[np.linspace(0, len(whole) - 1, count).round().astype(int)]
+    return np.where(np.isin(touch, chosen)[:, None], force, np.nan)
+
+
+def transfer_force(
+    known_counts: np.ndarray,
+    known_force: np.ndarray,
+    counts: np.ndarray,
+    force: np.ndarray,
+    touch: np.ndarray,
+) -> np.ndarray:
+    """(n, 3) [N], the force of every row of a new sensor.
+
+    Every kind of regression is fitted to the known sensor; the new one's labels say, for each component,
+    whether that is where to begin, and what to add: a ridge on what is left. Touches left out choose, and
+    weigh the kinds. Each sensor's ln Z is taken from its mean: rests differ.
+
+    Args:
+      known_counts: (m, 19), known_force: (m, 3) [N], of the other sensor.
+      counts: (n, 19) of the new one; its rows up to the last that is labelled say where its mean is.
+      force: (n, 3) [N], NaN where it is not known. touch: number of each row's touch, at least up to the
+        last that is labelled.
+    """
+    rows = np.flatnonzero(np.isfinite(force).all(1))
+    fold = np.unique(touch[rows], return_inverse=True)[1] % _FOLDS
+    from_known, log_z = log_impedance(known_counts), log_impedance(counts)
+    from_known = from_known - from_known.mean(0)
+    log_z = log_z - log_z[: rows[-1] + 1].mean(0)
+    out, total = 0.0, 0.0
+    for kind in KINDS:
+        terms = Terms.fit(from_known, **kind)
+        weight, offset = ridge(_columns(terms, from_known), known_force, _KNOWN_RIDGE)
+        columns = _columns(terms, log_z)
+        prediction, error = _amended(columns, columns @ weight + offset, force[rows], rows, fold)
+        out, total = out + prediction / error, total + 1 / error
+    return out / total
+
+
+def _columns(terms, log_z):
+    now = terms(log_z)
+    return np.hstack([now, causal_average(now[:, :NELECTRODE], _WINDOW)])
+
+
+def _amended(columns, believed, force, rows, fold):
+    """Prediction of all rows (n, 3), and its mean square on touches left out (3,)."""
+    starts = (np.zeros_like(believed), believed)
+    error = np.zeros((len(starts), len(_RIDGE), 3))
+    for i, start in enumerate(starts):
+        left = force - start[rows]
+        for k in range(_FOLDS):
+            train, test = rows[fold != k], rows[fold == k]
+            for j, strength in enumerate(_RIDGE):
+                weight, offset = ridge(columns[train], left[fold != k], strength)
+                error[i, j] += ((columns[test] @ weight + offset - left[fold == k]) ** 2).sum(0)
+    best = error.reshape(-1, 3).argmin(0)
+    out = np.empty_like(believed)
+    for c, which in enumerate(best):
+        start, strength = starts[which // len(_RIDGE)][:, c], _RIDGE[which % len(_RIDGE)]
+        weight, offset = ridge(columns[rows], (force[:, c] - start[rows])[:, None], strength)
+        out[:, c] = start + (columns @ weight + offset)[:, 0]
+    return out, error.reshape(-1, 3).min(0) / len(rows) + 1e-12
