@@ -5,12 +5,13 @@
     python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
-pieces of either half and further forms. Other authors' recordings: --half second, --half third
-(`recordings_foreign_second.py`, `recordings_foreign_third.py`; --counts of the latter: rounds). --left-out
-names each author's by weights fitted on the others' alone. A run goes on where its JSON ends.
+pieces of either half and further forms. Other authors' recordings: --half second, third, fourth
+(`recordings_foreign_second.py` and so on; --counts of the third: rounds; the fourth's are as many as they
+are). --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
+import functools
 import hashlib
 import json
 import pathlib
@@ -18,6 +19,7 @@ import time
 
 import numpy as np
 import recordings_foreign as first
+import recordings_foreign_fourth as fourth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
 import recordings_foreign_third as third
 
@@ -414,10 +416,44 @@ def authors_left_out(rows: list, named: float, unknown: float) -> list:
     return out
 
 
+def pieces(half: str, data: str, counts: str) -> list:
+    """(key, kinds, author, function that makes case and clean counts) of an author's pieces, in mixed order,
+    so that a run that was stopped holds some of each."""
+    if half == "fourth":
+        sources, cases = fourth.sources(data), fourth.PLAN
+
+        def make(base, effects, seed):
+            piece = fourth.make(sources, base, effects, seed)
+            clean = piece.pop("clean")
+            return foreign.Case(**piece), clean
+
+        def key(base, effects, seed):
+            return base, "+".join(f"{kind}{form}" for kind, form in effects), seed
+
+        author, kinds = fourth, [tuple(kind for kind, _ in effects) for _, effects, _ in cases]
+    else:
+        author = {"second": foreign, "third": third}.get(half, first)
+        which = (half,) if author is first else ()
+        sources = author.bases(data, *which)
+        cases = author.plan(*which, *map(int, counts.split(",")))
+        make = functools.partial(author.make, *which, sources)
+
+        def key(base, effects, seed):
+            return base, "+".join(effects), seed
+
+        kinds = [effects for _, effects, _ in cases]
+    return [
+        (key(*cases[i]), kinds[i], author.__name__, functools.partial(make, *cases[i]))
+        for i in np.random.default_rng(0).permutation(len(cases))
+    ]
+
+
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind", "mixed", "second", "third"), default="practice")
+    args.add_argument(
+        "--half", choices=("practice", "blind", "mixed", "second", "third", "fourth"), default="practice"
+    )
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
@@ -446,19 +482,13 @@ def main(argv=None):
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
     done = {tuple(r["key"]) for r in rows}
-    generator = {"second": foreign, "third": third}.get(args.half, first)
-    half = (args.half,) if generator is first else ()
-    sources = generator.bases(args.data, *half)
-    cases = generator.plan(*half, *map(int, args.counts.split(",")))
-    # in mixed order, so that a run that was stopped holds some of each
-    for base, effects, seed in (cases[i] for i in np.random.default_rng(0).permutation(len(cases))):
-        key = (base, "+".join(effects), seed)
-        if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
+    for key, kinds, author, make in pieces(args.half, args.data, args.counts):
+        if key in done or args.only and not set(args.only) & {*kinds, "none" if not kinds else ""}:
             continue
-        case, clean = generator.make(*half, sources, base, effects, seed)
+        case, clean = make()
         if len(case.counts) < MIN_ROWS:  # refused
             continue
-        rows.append({"key": key, "by": generator.__name__, **judge(case, clean)})
+        rows.append({"key": key, "by": author, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))
