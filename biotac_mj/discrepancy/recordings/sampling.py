@@ -18,6 +18,7 @@ _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
+_CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
@@ -75,10 +76,16 @@ def quantised(session: Session) -> list[Finding]:
     x, _, _ = _rows(session)
     if np.any(x != np.rint(x)):
         return []
-    blocks = np.array_split(x.astype(int), BLOCKS)
-    step = np.array([_spacing(c) for c in x.T.astype(int)])
+    x = x.astype(int)
+    blocks = np.array_split(x, BLOCKS)
+    lattice = np.array([_lattice([c]) for c in x.T])
+    lattice = np.maximum(lattice, _lattice(x.T))  # where each takes too few values
+    step = np.where(lattice > 1, lattice, [_spacing(c) for c in x.T])
     coarse, told = np.flatnonzero(step >= 2), np.isfinite(step)
-    if not len(coarse) or 1 < len(coarse) < 0.5 * told.sum():  # levels that lie far apart look alike
+    # levels that lie far apart look alike, but are no multiples of anything
+    if 1 < len(coarse) < 0.5 * told.sum():
+        coarse = np.flatnonzero(lattice > 1)
+    if not len(coarse):
         return []
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
@@ -96,6 +103,14 @@ def quantised(session: Session) -> list[Finding]:
             BLOCKS,
         )
     ]
+
+
+def _lattice(columns):
+    """Step of the lattice that all codes of columns of integers (n,) lie on; 1 where it may be chance."""
+    gaps = np.concatenate([np.diff(np.unique(x)) for x in columns])
+    step = int(np.gcd.reduce(gaps)) if len(gaps) else 1
+    # each further code would lie on the lattice by chance once in `step` times
+    return step if step > 1 and (len(gaps) - 1) * np.log(step) > _CHANCE else 1
 
 
 def _spacing(x):
