@@ -251,7 +251,7 @@ CLUES = {
     "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1, "uneven": -1},
     "one": {"nats": 1, "size": 1, "turns": -1, "lead": 1, "stands": 1, "apart": 1},
     "jump": {"edge": 1, "alone": 1},
-    "answer": {"nats": 1, "spread": -1, "factor": 1, "sharp": 1},
+    "answer": {"nats": 1, "spread": -1, "lead": 1, "sharp": 1},
     "order": {"nats": 1, "ratio": 1, "left": -1},
     "samples": {"nats": 1},
     "single": {"nats": 1, "alone": 1},

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
+from scipy.stats import poisson
 
 from ...sensor.channels import electrode_noise
 from ..evidence import sign_flip
@@ -325,8 +326,8 @@ def _spiked(session):
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
-    number = bad[session.fit].sum(0)
-    minutes = session.fit.sum() / session.recording.rate / 60
+    number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    minutes = len(x) / session.recording.rate / 60
     found = []
     for k in np.flatnonzero(number >= 4):
         mask = np.zeros(x.shape, bool)
@@ -340,12 +341,13 @@ def _spiked(session):
                 {"rate": (rate, _NAN, _NAN)},
                 mask,
                 f"{number[k]} samples leave their neighbours by more than ten times the noise",
-                _by_block(mask[session.fit, k], 1e-5),
+                _by_block(mask[:, k], 1e-5),
                 BLOCKS,
             )
         )
-        found[-1].p = 0.5 ** int(number[k])  # each is an event of its own
-        found[-1].clues["alone"] = float(np.log(number[k] / (1 + np.sort(number)[-3])))
+        others = 1 + np.sort(number)[-4]  # a cable may carry three
+        found[-1].p = float(poisson.sf(number[k] - 1, others))
+        found[-1].clues["alone"] = float(np.log(number[k] / others))
     return found
 
 
@@ -375,7 +377,7 @@ def lost(session: Session) -> list[Finding]:
     x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
     noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
-    if np.median(noise) < 0.7 or not session.loaded:  # at rest nothing is missed
+    if np.median(noise) < 0.7:
         return []
     # ends of least-squares lines of h rows on the left and on the right of every gap between rows
     line = np.vander(np.arange(h), 2)
@@ -397,6 +399,7 @@ def lost(session: Session) -> list[Finding]:
     places = [
         i for i in places if not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
     ]
+    places = _in_order(places, x, left[:-h], right[h:], h)
     if not places:
         return []
     change = (right[h:] - left[:-h])[places]
@@ -404,7 +407,7 @@ def lost(session: Session) -> list[Finding]:
     alike = np.abs(change.mean(1)) > 2 * change.std(1)
     found = []
     for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
-        if not mine.any():
+        if not mine.any() or name == "lost_rows" and not session.model().moved:  # at rest nothing is missed
             continue
         chosen = np.array(places)[mine]
         at = rows[chosen + h]
@@ -439,6 +442,24 @@ def lost(session: Session) -> list[Finding]:
         }
         found.append(f)
     return found
+
+
+def _in_order(places, x, left, right, h):
+    """Places at which rows are missing, and not those of rows that come again, or that were written last
+    first: from there it jumps back to what lies beside another place."""
+    _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
+    again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * h) > 0.4
+    size = np.array([np.linalg.norm(right[i] - left[i]) for i in places])
+    out = []
+    for a, i in enumerate(places):
+        others = [j for b, j in enumerate(places) if b != a]
+        back = [
+            np.linalg.norm(left[i] - left[j]) + np.linalg.norm(right[i] - right[j]) < 0.25 * size[a]
+            for j in others
+        ]
+        if not any(back) and not again[i : i + 2 * h].any():
+            out.append(i)
+    return out
 
 
 def _less(times, steps):
