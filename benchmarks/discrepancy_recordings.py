@@ -257,11 +257,11 @@ CLUES = {
     "single": {"nats": 1, "alone": 1},
     "still": {"nats": 1, "share": 1},
     "limit": {"nats": 1, "blocks": 1, "share": 1, "runs": 1},
-    "lost": {"times": 1, "score": 1, "electrodes": 1},
+    "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
-    "pairs": {"rest": 1, "louder": -1, "loaded": -1},
+    "pairs": {"rest": 1},
     "common": {"factor": 1, "rest": -1},
     "size": {"apart": 1, "stands": 1, "counts": 1},
     "late": {"gain": 1, "size": 1},
@@ -334,15 +334,15 @@ def _nameable(row):
 
 def fit(rows: list) -> dict:
     """Weights of the confidence's score, by family, and what a score has been worth: the rate of right names,
-    never falling with it, of scores by weights that had not seen their author; and the rate of the surest
+    never falling with it, of scores by weights that had not seen their form; and the rate of the surest
     half of the names of what was hidden, which none exceeds."""
     out, said = {}, []
     for name, signs in CLUES.items():
-        mine = [n | {"by": r["by"]} for r in rows for n in _nameable(r) if n["family"] == name]
+        mine = [n | {"form": _form(r)} for r in rows for n in _nameable(r) if n["family"] == name]
         if not mine:
             continue
         w = _logistic(mine, signs)
-        score = _left_out(mine, signs, "by")
+        score = _left_out(mine, signs, "form")
         right = np.array([n["right"] is not None for n in mine])
         worth = _isotonic(score, right)
         out[name] = {
@@ -362,18 +362,22 @@ def fit(rows: list) -> dict:
     return out | {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
 
 
+def _form(row):
+    """What one author did in one way, or a base without an effect."""
+    return (row["by"], *row["truth"], *row["forms"], row["base"] if not row["truth"] else "")
+
+
 def _isotonic(score, right):
     """[[score, rate], ...] of right names, never falling: adjacent violators pooled, with one wrong name more
     than were seen above all and one right name below all."""
     order = np.argsort(score)
-    blocks = [[score[order[0]], 1.0, 1]]  # mean score, right, number
+    blocks = [[score[order[0]], score[order[0]], 1.0, 1]]  # first and last score, right, number
     for s, r in [*zip(score[order], right[order]), (score[order[-1]], False)]:
-        blocks.append([s, float(r), 1])
-        while len(blocks) > 1 and blocks[-1][1] * blocks[-2][2] <= blocks[-2][1] * blocks[-1][2]:
-            s, r, n = blocks.pop()
-            a = blocks[-1]
-            blocks[-1] = [(a[0] * a[2] + s * n) / (a[2] + n), a[1] + r, a[2] + n]
-    return [[float(s), r / n] for s, r, n in blocks]
+        blocks.append([s, s, float(r), 1])
+        while len(blocks) > 1 and blocks[-1][2] * blocks[-2][3] <= blocks[-2][2] * blocks[-1][3]:
+            _, last, r, n = blocks.pop()
+            blocks[-1] = [blocks[-1][0], last, blocks[-1][2] + r, blocks[-1][3] + n]
+    return [[float(edge), r / n] for first, last, r, n in blocks for edge in (first, last)]
 
 
 def _usual(rows, clues):

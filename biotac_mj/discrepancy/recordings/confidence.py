@@ -1,6 +1,6 @@
-"""What a finding's clues say of its being right: a logistic function for every family, fitted on practice
-recordings and made as sure as it is of forms and authors left out (`benchmarks/recordings_foreign.py`,
-`benchmarks/discrepancy_recordings.py --fit`)."""
+"""What a finding's clues say of its being right: a score for every family, and the rate of right names among
+practice findings with such a score, by weights that had not seen their author
+(`benchmarks/discrepancy_recordings.py --fit`)."""
 
 import json
 import pathlib

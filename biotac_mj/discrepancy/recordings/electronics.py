@@ -424,6 +424,8 @@ def _coupling(pair, alive, sd, least):
     K[i, j] = np.where(np.abs(pair) > least, pair, 0) * sd[i] * sd[j] / (sd[i] ** 2 + sd[j] ** 2)
     K += K.T
     half = K[np.triu_indices(19, 1)]
+    if not half.any():  # many pairs, none of which stands out by itself
+        return K, (0.0,)
     p = electrode_positions()
     distance = np.linalg.norm(p[:, None] - p[None], axis=2)[np.triu_indices(19, 1)]
     near = {length: np.exp(-distance / length) for length in (2.0, 4.0, 6.0)}
