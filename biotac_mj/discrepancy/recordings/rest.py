@@ -14,7 +14,7 @@ from .session import Session
 
 __all__ = ["UNKNOWN", "Rest", "rest"]
 
-UNKNOWN = 0.15  # p up to which something is said to be there that has no name
+UNKNOWN = 0.2  # p up to which something is said to be there that has no name
 
 
 @dataclasses.dataclass
