@@ -5,12 +5,13 @@
     python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
-pieces of either half and further forms. Other authors' recordings: --half second, --half third
-(`recordings_foreign_second.py`, `recordings_foreign_third.py`; --counts of the latter: rounds). --left-out
-names each author's by weights fitted on the others' alone. A run goes on where its JSON ends.
+pieces of either half and further forms. Other authors' recordings: --half second, third, fourth
+(`recordings_foreign_second.py` and so on; --counts of the third: rounds; the fourth's are as many as they
+are). --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
+import functools
 import hashlib
 import json
 import pathlib
@@ -18,6 +19,7 @@ import time
 
 import numpy as np
 import recordings_foreign as first
+import recordings_foreign_fourth as fourth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
 import recordings_foreign_third as third
 
@@ -100,7 +102,7 @@ def judge(case, clean: np.ndarray) -> dict:
         "named": named,
         "weak": weak,
         "unknown": d.rest.significant,
-        "loaded": d.session.loaded,
+        "left": d.rest.kind,
         "rest": d.rest.clues,
         "closed": closed(d, case, clean),
         "views": {k: (v["before"], v["after"]) for k, v in d.gap.items()},
@@ -249,26 +251,27 @@ CLUES = {
     "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1, "uneven": -1},
     "one": {"nats": 1, "size": 1, "turns": -1, "lead": 1, "stands": 1, "apart": 1},
     "jump": {"edge": 1, "alone": 1},
-    "answer": {"nats": 1, "spread": -1, "factor": 1, "sharp": 1},
+    "answer": {"nats": 1, "spread": -1, "lead": 1, "sharp": 1},
     "order": {"nats": 1, "ratio": 1, "left": -1},
     "samples": {"nats": 1},
     "single": {"nats": 1, "alone": 1},
     "still": {"nats": 1, "share": 1},
     "limit": {"nats": 1, "blocks": 1, "share": 1, "runs": 1},
-    "lost": {"times": 1, "score": 1, "electrodes": 1},
+    "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
-    "pairs": {"rest": 1, "louder": -1, "loaded": -1},
+    "pairs": {"rest": 1},
     "common": {"factor": 1, "rest": -1},
-    "size": {"factor": 1, "counts": 1, "stands": 1, "blocks": 1},
+    "size": {"apart": 1, "stands": 1, "counts": 1},
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "size": 1, "blocks": 1, "explained": 1},
 }
 # of what is left: each may be what no name fits
 LEFT = {
     "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again"),
-    "left_unloaded": (
+    "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_still": (
         "counts1",
         "level3",
         "stands",
@@ -283,7 +286,6 @@ LEFT = {
 }
 DOUBT, FAR = 1.0, 1.5  # names on either side, and how far: standard deviations of every clue
 RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
-SPREAD = 0.5  # of a family's rate about the others', in log odds, before it is seen
 LEAST = 0.25  # spread of a clue of what is left
 TOP = 0.5  # share of the names, the surest, whose rate no confidence may exceed
 
@@ -331,68 +333,75 @@ def _nameable(row):
 
 
 def fit(rows: list) -> dict:
-    """Weights of the confidence's logistic functions, by family, made as sure as they are of forms and of
-    authors that were left out: log odds a s + b + one number for each family, drawn to nothing, fitted to
-    the scores s of names left out (Platt); and the rate of the surest, which none exceeds."""
-    from scipy.optimize import minimize
-
-    out, score, family, y, own = {}, [], [], [], []
+    """Weights of the confidence's score, by family, and what a score has been worth: the rate of right names,
+    never falling with it, of scores by weights that had not seen their form; and the rate of the surest
+    half of the names of what was hidden, which none exceeds."""
+    out, said = {}, []
     for name, signs in CLUES.items():
-        mine = [
-            n | {"form": (*r["truth"], *r["forms"], r["base"] if not r["truth"] else ""), "by": r["by"]}
-            for r in rows
-            for n in _nameable(r)
-            if n["family"] == name
-        ]
+        mine = [n | {"form": _form(r)} for r in rows for n in _nameable(r) if n["family"] == name]
         if not mine:
             continue
         w = _logistic(mine, signs)
+        score = _left_out(mine, signs, "form")
+        right = np.array([n["right"] is not None for n in mine])
+        worth = _isotonic(score, right)
         out[name] = {
             "intercept": float(w[0]),
             "weights": dict(zip(signs, w[1:].tolist())),
+            "worth": worth,
             "cases": len(mine),
-            "right": sum(n["right"] is not None for n in mine),
+            "right": int(right.sum()),
         }
-        for key in ("form", "by"):
-            score += np.clip(_left_out(mine, signs, key), -6, 6).tolist()
-            family += [name] * len(mine)
-            y += [n["right"] is not None for n in mine]
-            own += [n["right"] != "natural" for n in mine]
-    names = list(out)
-    score, y = np.array(score), np.array(y, float)
-    which = np.array([names.index(f) for f in family])
+        # what a sensor has by itself is told surely, and says nothing of the forms of others
+        said += [
+            (np.interp(s, *zip(*worth)), n["right"]) for s, n in zip(score, mine) if n["right"] != "natural"
+        ]
+    said = sorted((s for s in said if s[0] > 0.5), key=lambda s: -s[0])
+    top = [right is not None for _, right in said[: round(TOP * len(said))]]
+    out["most"] = (sum(top) + 1) / (len(top) + 2)
+    return out | {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
 
-    def loss(w):
-        t = w[0] * score + w[1] + w[2:][which]
-        return np.sum(np.logaddexp(0, t) - y * t) + np.sum(w[2:] ** 2) / (2 * SPREAD**2)
 
-    start = np.r_[1.0, np.zeros(1 + len(names))]
-    bounds = [(0.2, 1.0), *[(None, None)] * (1 + len(names))]
-    w = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
-    said = w[0] * score + w[1] + w[2:][which]
-    # what a sensor has by itself is told surely, and says nothing of the forms of others
-    named = (said > 0) & np.array(own)
-    top = named & (said >= np.quantile(said[named], 1 - TOP))
-    for name, more in zip(names, w[2:]):
-        known = out[name]
-        known["intercept"] = float(w[0] * known["intercept"] + w[1] + more)
-        known["weights"] = {k: float(w[0] * v) for k, v in known["weights"].items()}
-    out["most"] = float((y[top].sum() + 1) / (top.sum() + 2))
-    return out | {
-        name: _usual([r for r in rows if r["loaded"] == (name == "left_loaded")], LEFT[name]) for name in LEFT
-    }
+def _form(row):
+    """What one author did in one way, or a base without an effect."""
+    return (row["by"], *row["truth"], *row["forms"], row["base"] if not row["truth"] else "")
+
+
+def _isotonic(score, right):
+    """[[score, rate], ...] of right names, never falling: adjacent violators pooled, with one wrong name more
+    than were seen above all and one right name below all."""
+    order = np.argsort(score)
+    blocks = [[score[order[0]], score[order[0]], 1.0, 1]]  # first and last score, right, number
+    for s, r in [*zip(score[order], right[order]), (score[order[-1]], False)]:
+        blocks.append([s, s, float(r), 1])
+        while len(blocks) > 1 and blocks[-1][2] * blocks[-2][3] <= blocks[-2][2] * blocks[-1][3]:
+            _, last, r, n = blocks.pop()
+            blocks[-1] = [blocks[-1][0], last, blocks[-1][2] + r, blocks[-1][3] + n]
+    return [[float(edge), r / n] for first, last, r, n in blocks for edge in (first, last)]
 
 
 def _usual(rows, clues):
-    """What is usual of recordings without an effect: clue -> (median, spread of the upper side), and how far
-    the most unusual clue of each lies."""
-    from biotac_mj.discrepancy.recordings.confidence import beyond
+    """What is usual of recordings without an effect: clue -> (median, change with the logarithm of the
+    seconds, spread of the upper side), and how far the most unusual clue of each lies."""
+    from biotac_mj.discrepancy.recordings.confidence import farthest
 
-    x = np.array([[r["rest"][k] for k in clues] for r in rows if not r["truth"]])
-    middle, high = np.quantile(x, [0.5, 0.9], axis=0)
-    usual = np.column_stack([middle, np.maximum((high - middle) / 1.28, LEAST)])
-    far = [max(beyond(v, *u) for v, u in zip(row, usual)) for row in x]
-    return {"usual": dict(zip(clues, usual.tolist())), "others": sorted(far)}
+    rest = [r["rest"] for r in rows if not r["truth"]]
+    x = np.array([[r[k] for k in clues] for r in rest])
+    seconds = np.array([r["seconds"] for r in rest])
+    slope = _slopes(x, seconds)
+    middle, high = np.quantile(x - np.outer(seconds, slope), [0.5, 0.9], axis=0)
+    usual = np.column_stack([middle, slope, np.maximum((high - middle) / 1.28, LEAST)])
+    known = dict(zip(clues, usual.tolist()))
+    return {"usual": known, "others": sorted(farthest(r, known) for r in rest)}
+
+
+def _slopes(x, t):
+    """(c,) medians of the slopes between pairs of rows x (n, c) that lie apart in t (n,), 0 of too few."""
+    i, j = np.triu_indices(len(t), 1)
+    apart = np.abs(t[i] - t[j]) > 0.3 * max(np.ptp(t), 1e-9)
+    if len(t) < 8 or np.ptp(t) < 0.5:
+        return np.zeros(x.shape[1])
+    return np.median((x[i] - x[j])[apart] / (t[i] - t[j])[apart, None], axis=0)
 
 
 def authors_left_out(rows: list, named: float, unknown: float) -> list:
@@ -410,14 +419,48 @@ def authors_left_out(rows: list, named: float, unknown: float) -> list:
                 if n["family"] in weights
             ]
             names = [{"channels": ["e1"] * 19} | n for n in said if n["confidence"] >= named]
-            out.append(r | {"named": names, "unknown": unusual(r["rest"], r["loaded"], weights) <= unknown})
+            out.append(r | {"named": names, "unknown": unusual(r["rest"], r["left"], weights) <= unknown})
     return out
+
+
+def pieces(half: str, data: str, counts: str) -> list:
+    """(key, kinds, author, function that makes case and clean counts) of an author's pieces, in mixed order,
+    so that a run that was stopped holds some of each."""
+    if half == "fourth":
+        sources, cases = fourth.sources(data), fourth.PLAN
+
+        def make(base, effects, seed):
+            piece = fourth.make(sources, base, effects, seed)
+            clean = piece.pop("clean")
+            return foreign.Case(**piece), clean
+
+        def key(base, effects, seed):
+            return base, "+".join(f"{kind}{form}" for kind, form in effects), seed
+
+        author, kinds = fourth, [tuple(kind for kind, _ in effects) for _, effects, _ in cases]
+    else:
+        author = {"second": foreign, "third": third}.get(half, first)
+        which = (half,) if author is first else ()
+        sources = author.bases(data, *which)
+        cases = author.plan(*which, *map(int, counts.split(",")))
+        make = functools.partial(author.make, *which, sources)
+
+        def key(base, effects, seed):
+            return base, "+".join(effects), seed
+
+        kinds = [effects for _, effects, _ in cases]
+    return [
+        (key(*cases[i]), kinds[i], author.__name__, functools.partial(make, *cases[i]))
+        for i in np.random.default_rng(0).permutation(len(cases))
+    ]
 
 
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
-    args.add_argument("--half", choices=("practice", "blind", "mixed", "second", "third"), default="practice")
+    args.add_argument(
+        "--half", choices=("practice", "blind", "mixed", "second", "third", "fourth"), default="practice"
+    )
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"
     )
@@ -446,19 +489,13 @@ def main(argv=None):
     path = pathlib.Path(args.json)
     rows = json.loads(path.read_text())["cases"] if path.exists() else []
     done = {tuple(r["key"]) for r in rows}
-    generator = {"second": foreign, "third": third}.get(args.half, first)
-    half = (args.half,) if generator is first else ()
-    sources = generator.bases(args.data, *half)
-    cases = generator.plan(*half, *map(int, args.counts.split(",")))
-    # in mixed order, so that a run that was stopped holds some of each
-    for base, effects, seed in (cases[i] for i in np.random.default_rng(0).permutation(len(cases))):
-        key = (base, "+".join(effects), seed)
-        if key in done or args.only and not set(args.only) & {*effects, "none" if not effects else ""}:
+    for key, kinds, author, make in pieces(args.half, args.data, args.counts):
+        if key in done or args.only and not set(args.only) & {*kinds, "none" if not kinds else ""}:
             continue
-        case, clean = generator.make(*half, sources, base, effects, seed)
+        case, clean = make()
         if len(case.counts) < MIN_ROWS:  # refused
             continue
-        rows.append({"key": key, "by": generator.__name__, **judge(case, clean)})
+        rows.append({"key": key, "by": author, **judge(case, clean)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))

@@ -123,3 +123,13 @@ def test_the_third_author_shares_a_case_and_nothing_else(second):
     cases = third.plan(2)
     assert len(cases) == len(set(cases)) == 220 and cases[:110] == third.plan()
     assert {e for _, effects, _ in cases for e in effects} == set(third.EFFECTS) <= set(second.ACCEPTED)
+
+
+def test_the_fourth_author_shares_nothing(second):
+    text = (BENCHMARKS / "recordings_foreign_fourth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    fourth = importlib.import_module("recordings_foreign_fourth")
+    assert len({fourth.name(entry) for entry in fourth.PLAN}) == len(fourth.PLAN) == 141
+    used = {pair for _, effects, _ in fourth.PLAN for pair in effects}
+    assert used == {(kind, form) for kind, forms in fourth.EFFECTS.items() for form in range(len(forms))}
+    assert {kind for kind, _ in used} <= set(second.ACCEPTED)

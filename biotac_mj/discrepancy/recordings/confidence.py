@@ -1,14 +1,15 @@
-"""What a finding's clues say of its being right: a logistic function for every family, fitted on practice
-recordings and made as sure as it is of forms and authors left out (`benchmarks/recordings_foreign.py`,
-`benchmarks/discrepancy_recordings.py --fit`)."""
+"""What a finding's clues say of its being right: a score for every family, and the rate of right names among
+practice findings with such a score, by weights that had not seen their author
+(`benchmarks/discrepancy_recordings.py --fit`)."""
 
 import json
-import math
 import pathlib
+
+import numpy as np
 
 from .findings import Finding
 
-__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "beyond", "family", "probability", "unusual"]
+__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "farthest", "probability", "unusual"]
 
 FAMILIES = {
     "shared": ("warmup", "thermal"),
@@ -60,22 +61,25 @@ def confidence(finding: Finding) -> float:
     return min(probability(family(finding), clues(finding)), _WEIGHTS["most"])
 
 
-def unusual(given: dict, loaded: bool, weights: dict = _WEIGHTS) -> float:
-    """p of the clues of what is left (`rest.py`): the share of practice recordings without an effect of which
-    some clue lies as far above what is usual."""
-    known = weights["left_loaded" if loaded else "left_unloaded"]
-    far = max(beyond(given.get(k, 0.0), *usual) for k, usual in known["usual"].items())
-    others = known["others"]
-    return (1 + sum(o >= far for o in others)) / (1 + len(others))
+def unusual(given: dict, kind: str, weights: dict = _WEIGHTS) -> float:
+    """p of the clues of what is left (`rest.py`): the share of practice recordings without an effect, of the
+    same kind, of which some clue lies as far above what is usual."""
+    known = weights[kind]
+    far = farthest(given, known["usual"])
+    return (1 + sum(o >= far for o in known["others"])) / (1 + len(known["others"]))
 
 
-def beyond(value: float, middle: float, spread: float) -> float:
-    """How far above what is usual, in spreads."""
-    return min(max((value - middle) / spread, 0.0), _FAR)
+def farthest(given: dict, usual: dict) -> float:
+    """How far the most unusual clue lies above what is usual of a recording as long, in spreads."""
+    seconds = given["seconds"]
+    return max(
+        min(max((given.get(k, 0.0) - middle - slope * seconds) / spread, 0.0), _FAR)
+        for k, (middle, slope, spread) in usual.items()
+    )
 
 
 def probability(family: str, given: dict, weights: dict = _WEIGHTS) -> float:
-    """Of a family's clues."""
+    """Of a family's clues: the rate of right names at their score, between the rates that were seen."""
     known = weights[family]
     total = known["intercept"] + sum(w * given.get(k, 0.0) for k, w in known["weights"].items())
-    return 1 / (1 + math.exp(-max(min(total, 30.0), -30.0)))
+    return float(np.interp(total, *zip(*known["worth"])))

@@ -23,6 +23,9 @@ __all__ = ["coloured", "correlated", "humming", "noisy"]
 _NAN = float("nan")
 _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
+_SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
+# times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
+_RHYTHM = 8.0
 # channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
 _FACTOR = 3.0
 _LOUDER = 0.5  # than the law, as a logarithm: what touches do within rows is in the noise
@@ -31,6 +34,8 @@ _WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or
 _PAIRS = 0.25
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
+# logarithm of times the next electrode that one is noisier: 0.1 in most real recordings
+_APART = 0.2
 # of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
 _QUIET = 0.4
 # logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
@@ -208,11 +213,12 @@ def _line(session):
     wide = median_filter(power, (2 * max(10, size // 40) + 1, 1), mode="nearest")  # a line is no band
     above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
-    low = max(1.15 * band, 8 * rate / size, 2.0)
-    inside = (f > low) & (f < 0.49 * rate)
+    inside = (f > max(_SLOWEST, 8 * rate / size)) & (f < 0.49 * rate)
     if inside.sum() < 20:
         return None
     ratio = power / np.maximum(smooth, 1e-9)
+    # where the load moves, a line has to stand out by far more than a movement's rhythm does
+    ratio /= np.where(f > 1.15 * band, 1.0, _RHYTHM)[:, None]
     together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
     best = None
     for who, score in [(tuple(range(19)), together * 3), *(((k,), ratio[:, k]) for k in range(19))]:
@@ -232,21 +238,26 @@ def _line(session):
     frequency = float(fine[int(np.argmax(lines))])
     wave = np.column_stack([np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t)])
     step = np.diff(wave, axis=0)
-    block = np.arange(len(y)) * BLOCKS // len(y)
-    gain, local = np.empty(BLOCKS), []
+    # of at least four periods: a line may be there for a part of the time
+    blocks = int(np.clip(frequency * n / rate / 4, BLOCKS, 4 * BLOCKS))
+    block = np.arange(len(y)) * blocks // len(y)
+    gain, local = np.empty(blocks), []
     noise = np.maximum(np.median(np.abs(y), axis=0) / 0.6745, 0.5)
-    for b in range(BLOCKS):
-        rest = block != b
-        # the phase of the neighbours: a line whose frequency wanders is still one
-        near = rest & (np.abs(block - b) <= 2)
-        w, *_ = np.linalg.lstsq(step[near], np.clip(y[near], -4 * noise, 4 * noise), rcond=None)
+    clipped = np.clip(y, -4 * noise, 4 * noise)
+    for b in range(blocks):
+        # the phase of the neighbours: a line whose frequency wanders is still one; the weaker side's, for it
+        # may begin or end here
+        sides = [(block >= b - 2) & (block < b), (block > b) & (block <= b + 2)]
+        fits = [np.linalg.lstsq(step[near], clipped[near], rcond=None)[0] for near in sides if near.any()]
+        w = min(fits, key=lambda w: np.sum((w / noise) ** 2))
         local.append(w)
-        mine = np.clip(y[~rest], -4 * noise, 4 * noise) / noise
-        left = mine - step[~rest] @ w / noise
+        mine = clipped[block == b] / noise
+        left = mine - step[block == b] @ w / noise
         gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / len(channels)
     p = sign_flip(gain)
-    amplitude = np.median([np.hypot(*w) for w in local], axis=0)
-    if p > 0.01 or np.median(gain) < 1:
+    # it may have been switched on late, or come and go
+    amplitude = np.quantile([np.hypot(*w) for w in local], 0.75, axis=0)
+    if p > 0.01 or np.quantile(gain, 0.75) < 1:
         return None
     who = list(channels)
 
@@ -413,6 +424,8 @@ def _coupling(pair, alive, sd, least):
     K[i, j] = np.where(np.abs(pair) > least, pair, 0) * sd[i] * sd[j] / (sd[i] ** 2 + sd[j] ** 2)
     K += K.T
     half = K[np.triu_indices(19, 1)]
+    if not half.any():  # many pairs, none of which stands out by itself
+        return K, (0.0,)
     p = electrode_positions()
     distance = np.linalg.norm(p[:, None] - p[None], axis=2)[np.triu_indices(19, 1)]
     near = {length: np.exp(-distance / length) for length in (2.0, 4.0, 6.0)}
@@ -471,11 +484,13 @@ def noisy(session: Session) -> list[Finding]:
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
-    found = []
-    for e in np.argsort(-own)[:4]:
-        if not own[e] > max(np.log(1.6), 3 * spread) or np.quantile(level[:, e], 0.85) < _LEAST:
+    found, order = [], np.argsort(-own)
+    for e, following in zip(order[:4], order[1:]):
+        # every recording has one that is the noisiest, but not by much
+        apart = own[e] - own[following]
+        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(level[:, e], 0.85) < _LEAST:
             continue
-        excess = ratio[:, e] - np.quantile(ratio, 0.7, axis=1)
+        excess = ratio[:, e] - np.median(ratio, axis=1)
         p = sign_flip(excess)
         if p > 0.01:
             continue
@@ -491,7 +506,7 @@ def noisy(session: Session) -> list[Finding]:
                 session.recording.time[-1],
                 note=f"{factor:.1f} times as noisy as the other electrodes' law says",
                 clues={
-                    "factor": float(own[e]),
+                    "apart": float(apart),
                     "stands": float(own[e] / spread),
                     "blocks": float(np.mean(excess > 0)),
                     "counts": float(np.log(np.quantile(level[:, e], 0.85))),

@@ -18,6 +18,7 @@ _LIVELY = 3.0  # [counts] within windows, of half of the electrodes: with less t
 _DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
 _WINDOW = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
 _SPLITS = 28  # times tried
+_LARGEST = 5.0  # factor: more comes of a side in which nothing moves
 _ROUNDS = 4  # of reweighting: an electrode that changes is an outlier for as long
 
 
@@ -65,8 +66,13 @@ def gains(session: Session, refused: set) -> Finding | None:
         else:
             edge = float(np.log(max(e.times for e in sharp[k])))
         if abs(c) < _DEAD:
-            return _dead(session, k, when[0], gain, p)
-        return _gain_finding(session, k, i, c, spread, when, gain, p, edge)
+            finding = _dead(session, k, when[0], gain, p)
+        else:
+            finding = _gain_finding(session, k, i, c, spread, when, gain, p, edge)
+        # where the load goes elsewhere all electrodes change what they make of it
+        others = [max(fits[j].nats, 1.0) for j in order if j != i]
+        finding.clues["lead"] = float(np.log(fit.nats / max(others, default=1.0)))
+        return finding
     return None
 
 
@@ -133,6 +139,8 @@ class _Regression:
         self.nats, self.late, self.when = -np.inf, None, None
         for late, when in tried:
             c, beta = self.changed(~late, late)
+            if abs(c) > _LARGEST:
+                continue
             nats = plain - self.cost(beta)[~late].sum() - self.cost(c * beta)[late].sum()
             if nats > self.nats:
                 self.nats, self.late, self.when = nats, late, when

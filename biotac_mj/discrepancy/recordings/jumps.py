@@ -11,11 +11,12 @@ from .session import Session
 __all__ = ["Edge", "edges", "jumped"]
 
 _LINE = 6  # rows of a line
+_AROUND = 36  # rows on either side
 _STAYS = 30  # rows after which it is still there
 _HELD = 3  # rows from one that is read to the next, at most
 _CLEAR = 6.0  # of the noise, at least
 # times what happens on the electrode's own rows around: at most 5.6 in real recordings, of what stays
-_TIMES = 6.0
+_TIMES = 4.5
 _ALONE = 3.0  # times what any other electrode does there
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 
@@ -43,7 +44,9 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
     step = right[h:] - left[:-h]
     size = np.abs(step) / noise / np.sqrt(2 * (end**2).sum())
-    times = size / np.maximum(percentile_filter(size, 85, size=(61, 1)), 1)
+    around = np.ones((2 * _AROUND + 1, 1))
+    around[_AROUND - h : _AROUND + h + 1] = 0  # not the jump itself
+    times = size / np.maximum(percentile_filter(size, 85, footprint=around), 1)
     near = maximum_filter1d(size, 3, axis=0)
     first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
     alone = size / np.maximum(np.where(near >= first, second, first), 1)

@@ -52,7 +52,8 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
-        if k is not None and course.kind == "smooth" and not m.parted and _stands(m, k)[1] < _APART:
+        short = m.moved and not m.parted
+        if k is not None and course.kind == "smooth" and short and _stands(m, k)[1] < _APART:
             continue  # in so short a time an electrode creeps with the load as well, but others do, too
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]

@@ -39,8 +39,8 @@ class Model:
     Attributes:
       used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;
       inside (m,) bool, bins fitted; slope (c,) [counts]; noise (c,) of a bin [ln Z]; dimensions of the load,
-      0 of an unloaded sensor; activity (c,) RMS change within windows [ln Z];
-      precision (c + products, same).
+      0 of an unloaded sensor; activity (c,) RMS change within windows [ln Z]; moved: whether by as much as a
+      load; precision (c + products, same).
     """
 
     def __init__(self, counts: np.ndarray, good: np.ndarray, fit: np.ndarray, rate: float, fresh: float):
@@ -85,8 +85,8 @@ class Model:
         lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
         # a load moves electrodes by tens of counts within seconds; noise, filtered or not, does not
-        moved = np.median(np.sort(self.activity * self.slope)[-6:])
-        if not self.parted or moved < _MOVED:
+        self.moved = bool(np.median(np.sort(self.activity * self.slope)[-6:]) >= _MOVED)
+        if not (self.parted and self.moved):
             self.dimensions = 0
         q = self.dimensions
         if not q:

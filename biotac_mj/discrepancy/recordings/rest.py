@@ -14,17 +14,18 @@ from .session import Session
 
 __all__ = ["UNKNOWN", "Rest", "rest"]
 
-UNKNOWN = 0.15  # p up to which something is said to be there that has no name
+UNKNOWN = 0.2  # p up to which something is said to be there that has no name
 
 
 @dataclasses.dataclass
 class Rest:
-    """significant; text; cells: dicts (channel, from, to, counts) of what departs, the largest first; clues:
-    numbers that the decision is made of; p: share of real recordings without an effect that are as
-    unusual."""
+    """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
+    (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
+    of; p: share of real recordings without an effect that are as unusual."""
 
     significant: bool
     text: str
+    kind: str
     cells: list
     clues: dict
     p: float
@@ -57,7 +58,9 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     clues |= _whole(session)
-    p = unusual(clues, session.loaded)
+    # without a load, or where it is not told from a drift, something else is usual
+    kind = "loaded" if session.loaded else "moving" if m.moved else "still"
+    p = unusual(clues, f"left_{kind}")
     if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
         p = 1.0
     listed = []
@@ -79,7 +82,7 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
             f"{c['from']:.0f} s to {c['to']:.0f} s"
             for c in listed
         )
-    return Rest(p <= UNKNOWN, text, listed, clues, p)
+    return Rest(p <= UNKNOWN, text, f"left_{kind}", listed, clues, p)
 
 
 def _whole(session):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
+from scipy.stats import poisson
 
 from ...sensor.channels import electrode_noise
 from ..evidence import sign_flip
@@ -18,6 +19,7 @@ _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
+_CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
@@ -75,10 +77,16 @@ def quantised(session: Session) -> list[Finding]:
     x, _, _ = _rows(session)
     if np.any(x != np.rint(x)):
         return []
-    blocks = np.array_split(x.astype(int), BLOCKS)
-    step = np.array([_spacing(c) for c in x.T.astype(int)])
+    x = x.astype(int)
+    blocks = np.array_split(x, BLOCKS)
+    lattice = np.array([_lattice([c]) for c in x.T])
+    lattice = np.maximum(lattice, _lattice(x.T))  # where each takes too few values
+    step = np.where(lattice > 1, lattice, [_spacing(c) for c in x.T])
     coarse, told = np.flatnonzero(step >= 2), np.isfinite(step)
-    if not len(coarse) or 1 < len(coarse) < 0.5 * told.sum():  # levels that lie far apart look alike
+    # levels that lie far apart look alike, but are no multiples of anything
+    if 1 < len(coarse) < 0.5 * told.sum():
+        coarse = np.flatnonzero(lattice > 1)
+    if not len(coarse):
         return []
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
@@ -96,6 +104,14 @@ def quantised(session: Session) -> list[Finding]:
             BLOCKS,
         )
     ]
+
+
+def _lattice(columns):
+    """Step of the lattice that all codes of columns of integers (n,) lie on; 1 where it may be chance."""
+    gaps = np.concatenate([np.diff(np.unique(x)) for x in columns])
+    step = int(np.gcd.reduce(gaps)) if len(gaps) else 1
+    # each further code would lie on the lattice by chance once in `step` times
+    return step if step > 1 and (len(gaps) - 1) * np.log(step) > _CHANCE else 1
 
 
 def _spacing(x):
@@ -310,8 +326,8 @@ def _spiked(session):
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
-    number = bad[session.fit].sum(0)
-    minutes = session.fit.sum() / session.recording.rate / 60
+    number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    minutes = len(x) / session.recording.rate / 60
     found = []
     for k in np.flatnonzero(number >= 4):
         mask = np.zeros(x.shape, bool)
@@ -325,12 +341,13 @@ def _spiked(session):
                 {"rate": (rate, _NAN, _NAN)},
                 mask,
                 f"{number[k]} samples leave their neighbours by more than ten times the noise",
-                _by_block(mask[session.fit, k], 1e-5),
+                _by_block(mask[:, k], 1e-5),
                 BLOCKS,
             )
         )
-        found[-1].p = 0.5 ** int(number[k])  # each is an event of its own
-        found[-1].clues["alone"] = float(np.log(number[k] / (1 + np.sort(number)[-3])))
+        others = 1 + np.sort(number)[-4]  # a cable may carry three
+        found[-1].p = float(poisson.sf(number[k] - 1, others))
+        found[-1].clues["alone"] = float(np.log(number[k] / others))
     return found
 
 
@@ -360,7 +377,7 @@ def lost(session: Session) -> list[Finding]:
     x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
     noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
-    if np.median(noise) < 0.7 or not session.loaded:  # at rest nothing is missed
+    if np.median(noise) < 0.7:
         return []
     # ends of least-squares lines of h rows on the left and on the right of every gap between rows
     line = np.vander(np.arange(h), 2)
@@ -382,6 +399,7 @@ def lost(session: Session) -> list[Finding]:
     places = [
         i for i in places if not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
     ]
+    places = _in_order(places, x, left[:-h], right[h:], h)
     if not places:
         return []
     change = (right[h:] - left[:-h])[places]
@@ -389,7 +407,7 @@ def lost(session: Session) -> list[Finding]:
     alike = np.abs(change.mean(1)) > 2 * change.std(1)
     found = []
     for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
-        if not mine.any():
+        if not mine.any() or name == "lost_rows" and not session.model().moved:  # at rest nothing is missed
             continue
         chosen = np.array(places)[mine]
         at = rows[chosen + h]
@@ -424,6 +442,24 @@ def lost(session: Session) -> list[Finding]:
         }
         found.append(f)
     return found
+
+
+def _in_order(places, x, left, right, h):
+    """Places at which rows are missing, and not those of rows that come again, or that were written last
+    first: from there it jumps back to what lies beside another place."""
+    _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
+    again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * h) > 0.4
+    size = np.array([np.linalg.norm(right[i] - left[i]) for i in places])
+    out = []
+    for a, i in enumerate(places):
+        others = [j for b, j in enumerate(places) if b != a]
+        back = [
+            np.linalg.norm(left[i] - left[j]) + np.linalg.norm(right[i] - right[j]) < 0.25 * size[a]
+            for j in others
+        ]
+        if not any(back) and not again[i : i + 2 * h].any():
+            out.append(i)
+    return out
 
 
 def _less(times, steps):
