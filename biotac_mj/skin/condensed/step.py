@@ -20,7 +20,9 @@ _NEAR = 0.03  # error below which parts of a hard step take contact's exact stif
 _SLOW = 8  # from this iteration on contact's exact stiffness is taken, and the skin creeps if it must
 _LAG = 1.0  # of a skin that begins to creep: it resists like rubber that is stiffer by so much
 _QUICKER, _SLOWER = 3.0, 4.0  # by which that shrinks where a whole step is good, and grows where none is
-_AT_ONCE = 0.01  # lag that is none
+_AT_ONCE, _FIXED = 0.01, 1e5  # lag that is none, and with which skin is stiffer than contact
+# of the residual where the force jumps, as at the edges of a mesh, so that a step goes no further than this
+_ROUGH, _JUMP = 1e-3, 0.01
 _PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
@@ -328,7 +330,7 @@ class Step:
         self.W, shift = self._scaled()
         u = self.W @ f + shift
         g = self._evaluate(u)
-        self.converged, self.lumped, self.error, lag = False, None, math.inf, 0.0
+        self.converged, self.lumped, self.error, lag, alpha = False, None, math.inf, 0.0, 1.0
         for number in range(_MAX_NEWTON):
             springs = self._springs()
             slow = number >= _SLOW
@@ -349,7 +351,7 @@ class Step:
             slope, work = float(r @ du), float(df @ du)
             left = max(abs(slope), work) if coupled else max(slope, 0.0)
             self.error = (1 + lag) * math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
-            if self.error < _TOLERANCE and not lag:
+            if self.error < (_ROUGH if alpha < _JUMP else _TOLERANCE) and not lag:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
                 return f + df
@@ -357,17 +359,19 @@ class Step:
             if lag and slope <= 0:
                 lag, g = _SLOWER * lag, self._evaluate(u)
                 continue
-            f, u, g, whole = self._search(f, u, df, du, slope, lag * work)
-            if slow and not (whole and (lag or self.error < last)):
+            f, u, g, alpha, found = self._search(f, u, df, du, slope, lag * work)
+            if slow and not (found and alpha == 1.0 and (lag or self.error < last)):
                 lag = max(_SLOWER * lag, _LAG)
+                if lag > _FIXED:
+                    break
             else:
                 lag = lag / _QUICKER if lag > _AT_ONCE and self.error > _TOLERANCE else 0.0
         return f
 
     def _search(self, f, u, df, du, slope, held):
         """Along the step to where the residual's work, but for what viscosity holds at its end, is at most
-        half of what it was (Illinois' regula falsi where the step overshoots); whether that is the whole
-        step."""
+        half of what it was (Illinois' regula falsi where the step overshoots); its length, and whether it is
+        found."""
         along = math.copysign(1.0, slope) * du
         low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
@@ -376,7 +380,7 @@ class Step:
             g = self._evaluate(new_u)
             now = float((g - new_f) @ along) - alpha * held
             if abs(now) <= 0.5 * abs(slope):
-                return new_f, new_u, g, alpha == 1.0
+                return new_f, new_u, g, alpha, True
             if now > 0:
                 if high is None:
                     break
@@ -385,7 +389,7 @@ class Step:
                 high, at_high, at_low = alpha, now, at_low if high is None else at_low / 2
             alpha = low + (high - low) * at_low / (at_low - at_high)
             alpha = min(max(alpha, low + 0.05 * (high - low)), high - 0.05 * (high - low))
-        return new_f, new_u, g, False
+        return new_f, new_u, g, alpha, False
 
     # --- results  ---
 
