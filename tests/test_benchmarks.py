@@ -333,6 +333,18 @@ def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatc
     assert json.loads((tmp_path / "out.json").read_text()) == both
 
 
+@pytest.mark.parametrize("number", [3218, 3524])
+def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, number):
+    """Newton's method alone goes round in circles in these random presses: an ellipsoid slips off the skin,
+    a cylinder turns in it."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import robustness
+
+    (row,) = robustness.press_batch("coarse", 2001, "condensed", "cpu", 1, number)
+    assert row["most_N"] > 0.4 and row["steps"] > 20
+    assert not row["failures"] and not row["infeasible"] and not row["nan"] and row["exception"] is None
+
+
 @pytest.mark.parametrize("loaded", [False, True])
 def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
     """Synthetic: three minutes of a sensor that warms up, with and without force on it."""

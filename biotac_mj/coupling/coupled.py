@@ -13,7 +13,7 @@ __all__ = ["DEEPER", "TELEPORT", "Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
-_MOST_ITERATIONS = 30  # of the skin's solver in a step, after which the model that came closest must do
+_LONG, _MOST_ITERATIONS = 30, 60  # of the skin's solver at once and in a step: then the closest model must do
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 
@@ -74,7 +74,8 @@ class Coupled:
         pose = self._within_reach(pose)
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
         self._iterations += result.iterations
-        self.may_go = result.converged and self._iterations < _MOST_ITERATIONS
+        quick = result.iterations < _LONG and self._iterations < _MOST_ITERATIONS
+        self.may_go = result.converged and quick
         self.use(pose, result)
 
     @property

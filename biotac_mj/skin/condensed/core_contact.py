@@ -131,23 +131,28 @@ class Meeting:
 
     Attributes:
       face: (n,) numbers of the faces. node: (k,) numbers of their free nodes.
-      gap: (n nsample,) at displacements `at` (k,) along the nodes' directions [m].
-      weight: (n nsample, k) of the nodes in each sample. stiffness: (n nsample,) [N/m].
+      gap: (n, nsample) at displacements `at` (k,) along the nodes' directions [m].
+      corner: (n, 3) numbers among the nodes, k of one that is held. sample: (nsample, 3) its weights.
+      stiffness: (n,) of each sample of a face [N/m].
     """
 
     face: np.ndarray
     node: np.ndarray
     gap: np.ndarray
     at: np.ndarray
-    weight: np.ndarray
+    corner: np.ndarray
+    sample: np.ndarray
     stiffness: np.ndarray
 
     def force(self, u: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Forces (k,) at displacements u (k,), and the weights and stiffness of the samples that touch."""
-        gap = self.gap + self.weight @ (u - self.at)
-        closed = np.flatnonzero(gap < 0)
-        B, k = self.weight[closed], self.stiffness[closed]
-        return B.T @ (-k * gap[closed]), (B, k)
+        moved = np.append(u - self.at, 0.0)[self.corner]
+        gap = self.gap + moved @ self.sample.T
+        face, sample = np.nonzero(gap < 0)
+        B = np.zeros((len(face), len(u) + 1))
+        B[np.arange(len(face))[:, None], self.corner[face]] = self.sample[sample]
+        B, k = B[:, :-1], self.stiffness[face]
+        return B.T @ (-k * gap[face, sample]), (B, k)
 
 
 class CoreContact:
@@ -249,13 +254,5 @@ class CoreContact:
         node = np.flatnonzero(used[:-1])
         place = np.full(len(self.node) + 1, len(node))
         place[node] = np.arange(len(node))
-        nsample = len(self._sample)
-        weight = np.zeros((len(face), nsample, len(node) + 1))
-        column = place[corner]
-        for c in range(3):
-            weight[np.arange(len(face))[:, None], np.arange(nsample), column[:, c : c + 1]] = self._sample[
-                :, c
-            ]
-        weight = weight[:, :, :-1].reshape(len(face) * nsample, len(node))
         at = np.einsum("ij,ij->i", u[self.node[node]], self.direction[node])
-        return Meeting(face, node, gap.ravel(), at, weight, np.repeat(self._stiffness[face], nsample))
+        return Meeting(face, node, gap, at, place[corner], self._sample, self._stiffness[face])

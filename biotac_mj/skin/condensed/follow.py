@@ -72,10 +72,7 @@ def _go(skin, memory, pos, mat, effort, first=1.0):
             to, pose = 1.0, (pos, mat)
         effort.allow(_ONE)
         moved = (to - at) * length
-        # symmetric stiffness comes from further away, the exact one out of where that goes round in circles
-        new = skin.attempt(memory, u, *pose, effort, moved) or (
-            not skin.search.deep(*pose) and skin.attempt(memory, u, *pose, effort, moved, exact=True)
-        )
+        new = skin.attempt(memory, u, *pose, effort, moved)
         if new:
             found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]

@@ -111,6 +111,10 @@ class Compliance:
             out -= (self._share * float(self._a @ p)) * self._a
         return out
 
+    def stiffer(self, share: float) -> "Compliance":
+        """That of a skin that gives a share of what this one does."""
+        return Compliance(self._rest, share * self._scale, share * self._share, self._a)
+
     def part(self, on: np.ndarray, dtype: type = float) -> np.ndarray:
         """W over the coordinates `on` (k,): (k, k)."""
         out = self._rest.take(on, 0).take(on, 1).astype(dtype, copy=False)

@@ -266,7 +266,6 @@ class CondensedSkin:
         mat: np.ndarray,
         effort: Effort,
         moved: float | None = None,
-        exact: bool = False,
         near: Memory | None = None,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
@@ -276,7 +275,6 @@ class CondensedSkin:
           effort: what it may cost.
           moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
           near: see `solve`.
-          exact: take contact's exact stiffness from the start, and not near balance only.
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -286,7 +284,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort, moved, exact, near)
+        step = self._step(memory, u, pos, mat, motion, effort, moved, near)
         try:
             for _ in range(4):
                 step.run()
@@ -321,10 +319,10 @@ class CondensedSkin:
             struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort, moved=None, exact=False, near=None):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None, near=None):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, moved, exact, near)
+        return Step(self, memory, u, pos, mat, motion, effort, moved, near)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -14,9 +14,15 @@ __all__ = ["MAX_CONTACTS", "MAX_FORCES", "Effort", "Memory", "Outcome", "Step"]
 MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-4  # of the residual in the energy norm: the error of single steps is heard as chatter
-_MAX_NEWTON, _PASSES = 30, 4
+_MAX_NEWTON, _PASSES = 60, 4
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
-_NEAR, _SLOW = 0.03, 8  # error below which contact's exact stiffness is taken, where a step is slow from here
+_NEAR = 0.03  # error below which parts of a hard step take contact's exact stiffness
+_SLOW = 8  # from this iteration on contact's exact stiffness is taken, and the skin creeps if it must
+_LAG = 1.0  # of a skin that begins to creep: it resists like rubber that is stiffer by so much
+_QUICKER, _SLOWER = 3.0, 4.0  # by which that shrinks where a whole step is good, and grows where none is
+_AT_ONCE, _FIXED = 0.01, 1e5  # lag that is none, and with which skin is stiffer than contact
+# of the residual where the force jumps, as at the edges of a mesh, so that a step goes no further than this
+_ROUGH, _JUMP = 1e-3, 0.01
 _PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
 
@@ -138,12 +144,11 @@ class Step:
         motion: np.ndarray,
         effort: Effort,
         moved: float | None = None,
-        exact: bool = False,
         near: Memory | None = None,
     ):
         self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
-        self.coupled, self.near = moved is not None, math.inf if exact else _NEAR
+        self.coupled = moved is not None
         moved = moved if self.coupled else 2 * np.abs(motion).max(initial=0.0)
         self.reach = _REACH + moved
         self.share = min(1.0, 1.5 * moved / max(u.max(), -u.min(), 1e-9))
@@ -316,17 +321,20 @@ class Step:
         s._x[:, 0] = s.rest + u
 
     def _newton(self, f):
-        """Balanced forces, from forces f."""
+        """Balanced forces, from forces f.
+
+        Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each
+        iteration is a step of time of rubber with viscosity, which resists its motion as rubber stiffer by
+        the lag would. It slides and snaps to where real skin comes to rest; near there the steps grow and
+        are Newton's again, so what is found is a balance without viscosity."""
         self.W, shift = self._scaled()
         u = self.W @ f + shift
         g = self._evaluate(u)
-        self.converged, self.lumped, self.error = False, None, math.inf
+        self.converged, self.lumped, self.error, lag, alpha = False, None, math.inf, 0.0, 1.0
         for number in range(_MAX_NEWTON):
             springs = self._springs()
-            fits = exact_fits(springs)
-            if self.near == math.inf and not fits:
-                break  # as the try before this one went
-            exact = fits and self.error <= self.near and (self.coupled or number >= _SLOW)
+            slow = number >= _SLOW
+            exact = (slow or self.coupled and self.error <= _NEAR) and exact_fits(springs)
             coupled = self.coupled or exact
             if exact:
                 self.skin.faces.differ()
@@ -334,31 +342,45 @@ class Step:
                 self.skin.faces.couple()
             if not self.effort.spend(len(f), cost(len(springs.on), coupled)):
                 break
-            r = g - f
-            df, du, self.lumped = solve(self.W, springs, r, self.lumped, coupled)
-            slope = float(r @ du)
-            left = max(abs(slope), float(df @ du)) if coupled else max(slope, 0.0)
-            self.error = math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
-            if self.error < _TOLERANCE:
+            r, last = g - f, self.error
+            if lag:
+                df, du, _ = solve(self.W.stiffer(1 / (1 + lag)), springs, r, None, coupled)
+                df, self.lumped = df / (1 + lag), None
+            else:
+                df, du, self.lumped = solve(self.W, springs, r, self.lumped, coupled)
+            slope, work = float(r @ du), float(df @ du)
+            left = max(abs(slope), work) if coupled else max(slope, 0.0)
+            self.error = (1 + lag) * math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
+            if self.error < (_ROUGH if alpha < _JUMP else _TOLERANCE) and not lag:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
                 return f + df
             self.iterations += 1
-            f, u, g = self._search(f, u, df, du, slope, coupled)
+            if lag and slope <= 0:
+                lag, g = _SLOWER * lag, self._evaluate(u)
+                continue
+            f, u, g, alpha, found = self._search(f, u, df, du, slope, lag * work)
+            if slow and not (found and alpha == 1.0 and (lag or self.error < last)):
+                lag = max(_SLOWER * lag, _LAG)
+                if lag > _FIXED:
+                    break
+            else:
+                lag = lag / _QUICKER if lag > _AT_ONCE and self.error > _TOLERANCE else 0.0
         return f
 
-    def _search(self, f, u, df, du, slope, coupled):
-        """Along the step to where the residual's work is at most half of what it was (Illinois' regula falsi
-        where the step overshoots)."""
-        along = -du if coupled and slope < 0 else du
+    def _search(self, f, u, df, du, slope, held):
+        """Along the step to where the residual's work, but for what viscosity holds at its end, is at most
+        half of what it was (Illinois' regula falsi where the step overshoots); its length, and whether it is
+        found."""
+        along = math.copysign(1.0, slope) * du
         low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
         for _ in range(10):
             new_f, new_u = f + alpha * df, u + alpha * du
             g = self._evaluate(new_u)
-            now = float((g - new_f) @ along)
+            now = float((g - new_f) @ along) - alpha * held
             if abs(now) <= 0.5 * abs(slope):
-                break
+                return new_f, new_u, g, alpha, True
             if now > 0:
                 if high is None:
                     break
@@ -367,7 +389,7 @@ class Step:
                 high, at_high, at_low = alpha, now, at_low if high is None else at_low / 2
             alpha = low + (high - low) * at_low / (at_low - at_high)
             alpha = min(max(alpha, low + 0.05 * (high - low)), high - 0.05 * (high - low))
-        return new_f, new_u, g
+        return new_f, new_u, g, alpha, False
 
     # --- results  ---
 
