@@ -108,7 +108,15 @@ def _calibrate(args):
     from ..calibration import verbs
 
     check_device(args.device)
-    verbs.calibrate_verb(args)
+    verbs.calibrate_verb(args, _forces_of)
+
+
+def _forces_of(*given):
+    try:
+        from ..differentiable.fit import forces_of
+    except ModuleNotFoundError:
+        return None, "differences (gradients need PyTorch, pip install 'biotac-mj[learning]')"
+    return forces_of(*given)
 
 
 def add_compare(verbs: argparse._SubParsersAction) -> None:
@@ -175,4 +183,4 @@ def _compare(args):
     from ..calibration import verbs
 
     check_device(args.device)
-    verbs.compare_verb(args)
+    verbs.compare_verb(args, _forces_of)
