@@ -80,6 +80,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         progress=not args.quiet,
         finer=finer,
         forces=forces,
+        starts=args.starts,
     )
     write_json(result, out / "calibration.json")
     write_picture(result, out / "calibration.png")

@@ -124,16 +124,24 @@ def calibrate(
     parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
     max_iterations: int = 20,
     progress: bool = False,
+    starts: int = 1,
 ) -> Calibration:
     """`calibration.calibrate` by gradients, on the CPU: Gauss and Newton's method from the start.
 
     Args:
-      configuration, material, indentation, max_iterations, progress: see there.
+      configuration, material, indentation, max_iterations, progress, starts: see there.
       parameters: E, nu, mu, fill_volume, bulk_modulus, contact_stiffness.
 
     Raises:
       ValueError: what `calibration.calibrate` and `Skin` raise, or a parameter by which there is no gradient.
     """
     return calibrate_with(
-        configuration, material, indentation, parameters, max_iterations, progress=progress, forces=Forces()
+        configuration,
+        material,
+        indentation,
+        parameters,
+        max_iterations,
+        progress=progress,
+        forces=Forces(),
+        starts=starts,
     )
