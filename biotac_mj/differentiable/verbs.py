@@ -49,7 +49,7 @@ def estimate_verb(args: argparse.Namespace) -> None:
             + (f"; {one.lost} steps lost" if one.lost else "")
         )
     _write(args.out, recording, rows, found)
-    print(f"written: {args.out}; +- are 95 %, force is that of {args.material} rubber")
+    print(f"written: {args.out}; +- are 95 % for a sensor like the simulated one, of {args.material} rubber")
 
 
 def _rest(args, counts):
