@@ -1,12 +1,14 @@
-"""Gradients of a press, measured: the time of a backward pass beside the forward one, and a fit by gradients
-beside the one by differences.
+"""Gradients of a press, measured: the time of a backward pass beside the forward one, gradients beside
+central differences on random slides, and a fit by gradients beside the one by differences.
 
     python benchmarks/differentiable.py --json OUT
 
-All data are synthetic: forces of a simulated skin with known constants, with white noise."""
+Slides go on where they were stopped. All data are synthetic: forces of a simulated skin with known constants,
+with white noise."""
 
 import argparse
 import dataclasses
+import functools
 import json
 import pathlib
 import time
@@ -15,8 +17,16 @@ import numpy as np
 import torch
 
 from biotac_mj import differentiable
-from biotac_mj.calibration import calibrate, configuration, parameter, plan_shear, simulate
+from biotac_mj.calibration import (
+    calibrate,
+    configuration,
+    parameter,
+    plan_indentation,
+    plan_shear,
+    simulate,
+)
 from biotac_mj.calibration.forward import steps_of
+from biotac_mj.geometry.indenters import INDENTERS
 from biotac_mj.geometry.rigid import quaternion
 from biotac_mj.skin import Material
 
@@ -24,10 +34,12 @@ TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5)
 START = dataclasses.replace(TRUTH, youngs_modulus=1.5e6, poissons_ratio=0.32, friction=0.6)
 FILL = 2e-8  # [m^3]
 NOISE = 2e-3  # [N]
+COSINE = 0.9999  # below which a slide is named
+DIFFERENCE = 1e-5  # of what a slide's gradient is held against, in its units
 
 
 def measure_passes(element: str, liquid: bool) -> dict:
-    """Seconds of a press forward and backward; both take the same steps."""
+    """Seconds of the processor for a press forward and backward; both take the same steps."""
     way = plan_shear(skin="coarse")
     steps, geoms = steps_of(way)
     body = configuration("shell_with_core", element=element, liquid=liquid)
@@ -36,18 +48,91 @@ def measure_passes(element: str, liquid: bool) -> dict:
     quat = torch.tensor(quaternion(steps.mat))
     out = {"element": element, "liquid": liquid, "steps": len(pos)}
     for _ in range(2):  # the first makes factors and compiles
-        begin = time.perf_counter()
+        begin = time.process_time()
         pressed = differentiable.press(
             skin, pos, quat, youngs_modulus=torch.tensor(1.2e6, requires_grad=True)
         )
-        middle = time.perf_counter()
+        middle = time.process_time()
         (pressed.wrench**2).sum().backward()
-        out |= {"forward_s": middle - begin, "backward_s": time.perf_counter() - middle}
+        out |= {"forward_s": middle - begin, "backward_s": time.process_time() - middle}
     return out | {"ratio": out["backward_s"] / out["forward_s"], **dataclasses.asdict(pressed.counts)}
 
 
+SLIDES, DIRECTIONS = 30, 4
+
+
+def measure_slide(seed: int) -> dict:
+    """Cosine of a gradient with central differences, over a press and a slide drawn by seed.
+
+    Numbers moved by: all of the path, the end of its slide [mm], ln E, nu, ln mu and ln of the contact's
+    stiffness; with liquid its filling [10 mm^3] and ln of its modulus. Differences are taken along random
+    directions of these, and the cosine is that of the projections. A direction has a kink where contact
+    changes otherwise on one side of the difference than on the other."""
+    draw = np.random.default_rng([seed, 30])
+    liquid = bool(seed // 2 % 2)
+    turn, name = draw.uniform(0, 2 * np.pi), INDENTERS[seed % len(INDENTERS)]
+    way = plan_indentation(
+        name,
+        (draw.uniform(-0.0145, -0.006), draw.uniform(-0.7, 0.7)),
+        draw.uniform(0.6e-3, 2.4e-3),
+        draw.uniform(0.4e-3, 1e-3),
+        (np.cos(turn), 0.0, np.sin(turn)),
+        samples=10,
+    )
+    steps, geoms = steps_of(way)
+    body = configuration(
+        "shell_with_core", element=("linear", "quadratic")[seed % 2], liquid=liquid, tolerance=1e-9
+    )
+    start = {
+        "youngs_modulus": draw.uniform(0.6e6, 2e6),
+        "poissons_ratio": draw.uniform(0.3, 0.42),
+        "friction": draw.uniform(0.1, 0.5),
+        "contact_stiffness": 2e11,
+    }
+    if liquid:
+        start |= {"fill_volume": draw.uniform(0, 2e-8), "bulk_modulus": 1e7}
+    skin = differentiable.Skin(body.geometry, TRUTH, body.options, **geoms)
+    quat = torch.tensor(quaternion(steps.mat))
+    slid = torch.linspace(-1, 1, len(quat), dtype=torch.float64).clamp(min=0)[:, None, None]
+    weights = {k: torch.tensor(draw.normal(size=(*n,))) for k, n in (
+        ("wrench", (len(quat), 1, 6)), ("nodes", (skin.model.nvert, 3))
+    )}  # fmt: skip
+
+    def loss(moved):
+        own = {
+            k: v + m * 1e-8 if k == "fill_volume" else v + m if k == "poissons_ratio" else v * m.exp()
+            for (k, v), m in zip(start.items(), moved[6:])
+        }
+        friction = own.pop("friction")[None]
+        pos = torch.tensor(steps.pos) + 1e-3 * (moved[:3] + slid * moved[3:6])
+        pressed = differentiable.press(skin, pos, quat, friction=friction, **own)
+        wrench = pressed.wrench * torch.tensor([1, 1, 1, 1e2, 1e2, 1e2])
+        total = (weights["wrench"] * wrench).sum() + 1e2 * (weights["nodes"] * pressed.nodes[-1]).sum()
+        return total + 1e-4 * pressed.pressure.sum(), pressed
+
+    at = torch.zeros(6 + len(start), dtype=torch.float64, requires_grad=True)
+    value, pressed = loss(at)
+    value.backward()
+    ways = np.linalg.qr(np.random.default_rng([seed, 31]).normal(size=(len(at), DIRECTIONS)))[0].T
+    gradient, slope, kinks = ways @ at.grad.numpy(), [], 0
+    with torch.no_grad():
+        for way in torch.tensor(ways):
+            (ahead, there), (back, here) = loss(DIFFERENCE * way), loss(-DIFFERENCE * way)
+            slope.append((ahead - back).item() / (2 * DIFFERENCE))
+            kinks += there.changes != here.changes
+    slope = np.array(slope)
+    return {
+        "seed": seed, "indenter": name, "element": body.options.element, "liquid": liquid,
+        "core": bool(np.abs(skin.data.core_force).max() > 1e-3), "steps": len(quat),
+        "cosine": float(gradient @ slope / np.linalg.norm(gradient) / np.linalg.norm(slope)),
+        "error": float(np.linalg.norm(gradient - slope) / np.linalg.norm(slope)),
+        "kinks": kinks, "gradient": gradient.tolist(), "differences": slope.tolist(),
+        **dataclasses.asdict(pressed.counts),
+    }  # fmt: skip
+
+
 def measure_fits(names: list, fill: float) -> dict:
-    """Both fits of the same data from the same start, one after the other."""
+    """Fits of the same data from the same start, one after the other, in seconds of the processor."""
     body = configuration("shell_with_core", liquid=bool(fill), bulk_modulus=1e7)
     exact = dataclasses.replace(body.options, tolerance=1e-6, max_newton=200, contact_stiffness=2e11)
     way = plan_shear(skin="coarse")
@@ -58,10 +143,14 @@ def measure_fits(names: list, fill: float) -> dict:
     if fill:
         body = dataclasses.replace(body, options=dataclasses.replace(exact, fill_volume=fill / 2))
     out = {"parameters": [p.name for p in names]}
-    for name, fit in (("gradients", differentiable.calibrate), ("differences", calibrate)):
-        begin = time.perf_counter()
+    several = functools.partial(differentiable.calibrate, starts=4)
+    fits = {"gradients": differentiable.calibrate, "differences": calibrate}
+    if fill:
+        fits["four_starts"] = several
+    for name, fit in fits.items():
+        begin = time.process_time()
         found = fit(body, START, data, names)
-        seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
         error = found.standard_error.tolist()
         out[name] = {"seconds": seconds, "value": found.value.tolist(), "standard_error": error}
         out[name] |= {"rms_N": found.rms, "evaluations": found.evaluations}
@@ -71,12 +160,21 @@ def measure_fits(names: list, fill: float) -> dict:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parser.add_argument("--only", choices=("passes", "fit", "fill"), nargs="*")
+    parts = "passes", "slides", "fit", "fill"
+    parser.add_argument("--only", choices=parts, nargs="*", default=parts)
     given = parser.parse_args()
-    only, out = given.only or ("passes", "fit", "fill"), {}
+    only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
     if "passes" in only:
         kinds = [("linear", False), ("linear", True), ("quadratic", False), ("quadratic", True)]
         out["passes"] = [measure_passes(*kind) for kind in kinds]
+    if "slides" in only:
+        rows = out.setdefault("slides", [])
+        for seed in range(len(rows), SLIDES):
+            rows.append(measure_slide(seed))
+            given.json.write_text(json.dumps(out, indent=1))
+        cosines = np.array([row["cosine"] for row in rows])
+        out["slides_below"] = [row["seed"] for row in rows if row["cosine"] < COSINE]
+        print(f"cosines: median {np.median(cosines)}, least {cosines.min()}")
     if "fit" in only:
         out["fit"] = measure_fits(["E", "nu", "mu"], 0.0)
     if "fill" in only:

@@ -306,6 +306,10 @@ _GRADIENTS = [
     ("nodes, wrench, pressure of every step", "`Pressed`", "yes, backwards and forwards"),
     ("electrodes and PDC without rounding, by nodes, pressure and the film's constants", "`impedance`, "
      "`electrode_counts`, `pdc_counts`", "yes; not what acts in time (warm-up, drift, low-pass, latency)"),
+    ("fits: slopes by these gradients, else by differences, said in the output",
+     "`biotac calibrate`, `biotac compare`", "yes; not the refits of `diagnose`"),
+    ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
+     "one geom that comes straight; attitude and drag are not sought"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
     ("rubber with prony, mullins or hysteresis; contact_law; implicit dynamics", "`Skin`", "refused by name"),
     ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),

@@ -181,6 +181,7 @@ LOGS = (
     "diagnose --quiet --electrodes electrodes.txt",
     "evaluate --quiet --electrodes electrodes.txt",
     "contact-patch electrodes.txt",
+    "estimate electrodes.txt --quiet",
     "import-data electrodes.txt --out out",
 )
 WITH_FORCE = (
@@ -703,6 +704,7 @@ NUMBERS = {
     "train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a limit:0,-1 device:gpu",
     "evaluate trained": "fraction:nan,a seed:-1",
     "contact-patch electrodes.txt": "tare:a,1.5 row:a",
+    "estimate electrodes.txt": "rest:0,a row:a,99999 rate:0,nan indenter:cone material:jelly",
     "resimulate electrodes.txt": "at-most:0,nan,a block:0,-1 batch:0 workers:-1 seed:-1 device:gpu,cuda:0 "
     "mount:a,nan",
     "predict forward.safetensors electrodes.txt": "tare:0,a,1.5 rate:0,nan",
@@ -763,6 +765,7 @@ OUT_FILES = {
     "evaluate electrodes.txt": "--save",
     "view": "--render",
     "predict forward.safetensors electrodes.txt": "--out",
+    "estimate electrodes.txt": "--out",
 }
 
 

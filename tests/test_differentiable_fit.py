@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from biotac_mj import differentiable
-from biotac_mj.calibration import configuration, parameter, plan_indentation, simulate
-from biotac_mj.differentiable.fit import Forces
+from biotac_mj import cli, differentiable
+from biotac_mj.calibration import calibrate, configuration, parameter, plan_indentation, simulate
+from biotac_mj.calibration.indentation import write_indentation
+from biotac_mj.differentiable.fit import Forces, forces_of
 from biotac_mj.skin import Material
+from biotac_mj.skin.settings import read_material
 
 TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5, liquid=False)
 START = dataclasses.replace(TRUTH, youngs_modulus=1.5e6, friction=0.6)
@@ -43,3 +45,63 @@ def test_recovers_stiffness_and_friction(shell, data):
 def test_what_has_no_gradient_is_named(shell, data):
     with pytest.raises(ValueError, match="gradients by stick_ratio are not there: fit with calibration"):
         differentiable.calibrate(shell, START, data, ["E", "stick_ratio:0.01:0.5"])
+
+
+def test_differences_where_there_is_no_gradient(shell, data):
+    """And what the verb says of it."""
+    E, other = parameter("E"), parameter("stick_ratio:0.01:0.5")
+    relaxing = dataclasses.replace(TRUTH, prony=((0.1, 1.0),))
+    for material, wanted, device, said in (
+        (TRUTH, E, "cpu", "gradients"),
+        (TRUTH, other, "cpu", "differences (gradients by stick_ratio are not there)"),
+        (relaxing, E, "cpu", "differences (gradients of rubber with prony are not there)"),
+        (TRUTH, E, "cuda:0", "differences (gradients on cuda:0 are not there)"),
+    ):
+        forces, how = forces_of(shell, material, [wanted], data, device)
+        assert how == said and (forces is None) == how.startswith("differences")
+
+
+def test_the_verb_fits_by_gradients(data, tmp_path, capsys):
+    write_indentation(data, tmp_path / "way.csv")
+    given = [
+        "calibrate",
+        str(tmp_path / "way.csv"),
+        "--indenter",
+        "sphere_7mm",
+        "--fit",
+        "E",
+        "mu",
+        "--quiet",
+    ]
+    exact = '{"skin": {"contact_stiffness": 2e11}}'
+    start = '{"youngs_modulus": 1.5e6, "poissons_ratio": 0.38, "friction": 0.6, "liquid": false}'
+    given += ["--options", exact, "--material", start, "--out", str(tmp_path)]
+    assert cli.main(given) == 0
+    said = capsys.readouterr().out
+    assert "slopes by gradients" in said and "the fit converged" in said
+    fitted = read_material(tmp_path / "calibration.json")
+    assert fitted.youngs_modulus == pytest.approx(TRUTH.youngs_modulus, rel=2e-3)
+    assert fitted.friction == pytest.approx(TRUTH.friction, rel=2e-3)
+
+
+def test_several_starts_leave_a_jump_behind(shell, data):
+    """Forces that jump where friction passes a value just beside the best on the wrong side."""
+    draw = np.random.default_rng(1)
+    wanted = [parameter("E"), parameter("mu")]
+    slopes = draw.normal(size=(*data.force.shape, 2))
+    best = np.array([p.scaled(v) for p, v in zip(wanted, (1.2e6, 0.5))])
+    flat = slopes.reshape(-1, 2)
+    step = draw.normal(size=len(flat))
+    step -= flat @ np.linalg.lstsq(flat, step, rcond=None)[0] - flat @ [0.0, 0.02]
+    edge = best[1] - 0.01
+
+    def forces(_configuration, _material, parameters, values, _indentation, _device):
+        at = np.array([p.scaled(v) for p, v in zip(parameters, values)])
+        force = data.force + slopes @ (at - best)
+        return force + (at[1] < edge) * step.reshape(force.shape), slopes, 0
+
+    start = dataclasses.replace(TRUTH, friction=0.4)
+    once = calibrate(shell, start, data, wanted, forces=forces)
+    several = calibrate(shell, start, data, wanted, forces=forces, starts=6)
+    assert once.rms > 0.5 and several.rms < 1e-3 and several.evaluations > once.evaluations
+    assert several.value == pytest.approx([1.2e6, 0.5], rel=1e-4)

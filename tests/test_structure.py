@@ -26,7 +26,7 @@ LAYERS = {
     "batch": "coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "batch",
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
-    "differentiable": "geometry skin sensor threads calibration",
+    "differentiable": "geometry skin sensor threads calibration recordings files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "arguments sensor geometry files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards versions press.approach "

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..fields import check_entries
 from ..files import replacing
+from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5, reading
 from ..sensor.channels import check_force
 
@@ -92,7 +93,7 @@ def plan_indentation(
     slide_direction: tuple | np.ndarray = (1, 0, 0),
     direction: tuple | np.ndarray | None = None,
     samples: int = 24,
-    skin: str = "coarse",
+    skin: str | SkinGeometry = "coarse",
 ) -> Indentation:
     """An indentation to be simulated, its forces zero: from first touch of the resting skin down, then along
     it.
@@ -124,7 +125,8 @@ def plan_indentation(
         timestep=1.0,
         hold=0.0,
     )
-    path = plan_path(load_skin(skin), make_indenter(indenter), options)
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    path = plan_path(geometry, make_indenter(indenter), options)
     tip = np.array([path.position(*travel) for travel in zip(path.depth, path.slid)])
     time = 0.02 * np.arange(len(tip))
     return Indentation(indenter, indenter, time, tip, path.quat, np.zeros((len(tip), 3)))

@@ -2,6 +2,7 @@
 
 import argparse
 import pathlib
+from collections.abc import Callable
 
 import tqdm
 
@@ -34,8 +35,13 @@ def _body(name, skin, liquid, options):
     return configuration(name, skin, modulus, **{"liquid": liquid, **plain(given.get("skin") or {})})
 
 
-def calibrate_verb(args: argparse.Namespace) -> None:
-    """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be."""
+def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
+    """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be.
+
+    Args:
+      forces_of: (configuration, material, parameters, indentation, device) -> what `calibrate` takes as its
+        forces, and what its slopes are by.
+    """
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
     parameters = [parameter(text) for text in args.fit]
@@ -63,23 +69,29 @@ def calibrate_verb(args: argparse.Namespace) -> None:
     else:
         data = read_indentation(args.data, args.indenter, args.direction)
     finer = refined(body.geometry) if args.correct else None
+    start = read_material(args.material)
+    forces, how = forces_of(body, start, parameters, data, args.device)
     result = calibrate(
         body,
-        read_material(args.material),
+        start,
         data,
         parameters,
         device=args.device,
         progress=not args.quiet,
         finer=finer,
+        forces=forces,
+        starts=args.starts,
     )
     write_json(result, out / "calibration.json")
     write_picture(result, out / "calibration.png")
     print(calibration_table(result))
+    print(f"slopes by {how}")
     print(f"wrote {out / 'calibration.json'} and {out / 'calibration.png'}")
 
 
-def compare_verb(args: argparse.Namespace) -> None:
-    """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be.
+def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
+    """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be. forces_of: see
+    `calibrate_verb`.
 
     Called again with the same settings and folder it goes on where it was stopped.
     """
@@ -143,7 +155,7 @@ def compare_verb(args: argparse.Namespace) -> None:
             kept.get(
                 body.name,
                 Comparison,
-                lambda body=body: _compared(body, given, calibration, cases, kept, args),
+                lambda body=body: _compared(body, given, calibration, cases, kept, args, forces_of),
             )
         )
     write_json({"reference": reference, "paper": PAPER, "configurations": results}, out / "compare.json")
@@ -157,11 +169,13 @@ def compare_verb(args: argparse.Namespace) -> None:
     print(f"wrote {out / 'compare.json'}")
 
 
-def _compared(body, given, calibration, cases, kept, args):
+def _compared(body, given, calibration, cases, kept, args, forces_of):
     """Calibrates a configuration, unless its material is given, and evaluates it."""
     fitted = None
     if not given:
-        settings = dict(device=args.device, progress=not args.quiet)
+        wanted = [parameter(name) for name in ("E", "nu", "mu")]
+        forces, _ = forces_of(body, material("paper"), wanted, calibration, args.device)
+        settings = dict(device=args.device, progress=not args.quiet, forces=forces)
         fitted = kept.get(
             f"calibration of {body.name}",
             Calibration,

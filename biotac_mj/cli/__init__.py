@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from ..arguments import Parser
 from .diagnosing import add_diagnose
-from .fitting import add_calibrate, add_compare
+from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
 from .pressing import add_import_mesh, add_mount, add_press, add_samples, add_view
 from .sets import add_data, add_generate
@@ -46,6 +46,7 @@ def parser() -> Parser:
         add_import_mesh,
         add_calibrate,
         add_compare,
+        add_estimate,
         add_diagnose,
     )
     for add in (*own, add_generate, add_data):

@@ -1,12 +1,13 @@
-"""The verbs `biotac calibrate` and `compare`."""
+"""The verbs `biotac calibrate`, `compare` and `estimate`."""
 
 import argparse
 
-from ..arguments import SEED, check_device, device, output_folder, real, whole
+from ..arguments import SEED, check_device, device, output_file, output_folder, real, whole
+from ..recordings.verbs import add_load_arguments
 from .common import add_options, add_verb
 from .names import CONFIGURATIONS, INDENTER_HELP, INDENTERS, MATERIALS, SKINS
 
-__all__ = ["add_calibrate", "add_compare"]
+__all__ = ["add_calibrate", "add_compare", "add_estimate"]
 
 
 def add_calibrate(verbs: argparse._SubParsersAction) -> None:
@@ -92,6 +93,12 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help="parameters, with bounds if you like",
     )
     verb.add_argument(
+        "--starts",
+        type=whole(1, 100),
+        default=1,
+        help="finish the fit from so many points and keep the best: where forces jump, one may end beside it",
+    )
+    verb.add_argument(
         "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."
     )
     verb.add_argument(
@@ -108,7 +115,15 @@ def _calibrate(args):
     from ..calibration import verbs
 
     check_device(args.device)
-    verbs.calibrate_verb(args)
+    verbs.calibrate_verb(args, _forces_of)
+
+
+def _forces_of(*given):
+    try:
+        from ..differentiable.fit import forces_of
+    except ModuleNotFoundError:
+        return None, "differences (gradients need PyTorch, pip install 'biotac-mj[learning]')"
+    return forces_of(*given)
 
 
 def add_compare(verbs: argparse._SubParsersAction) -> None:
@@ -175,4 +190,51 @@ def _compare(args):
     from ..calibration import verbs
 
     check_device(args.device)
-    verbs.compare_verb(args)
+    verbs.compare_verb(args, _forces_of)
+
+
+def add_estimate(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "estimate",
+        _estimate,
+        "Find the contact, its place and force with intervals, that makes the simulated electrodes read what "
+        "a recording says.",
+    )
+    verb.add_argument(
+        "file", metavar="FILE", help="a recording as `biotac show` reads it, or a row of counts"
+    )
+    verb.add_argument(
+        "--recording", metavar="NAME", help="which, where the file has several (default: the first)"
+    )
+    add_load_arguments(verb)
+    verb.add_argument(
+        "--rest", type=whole(1, 10**6), default=1, help="first rows whose mean is the sensor untouched"
+    )
+    verb.add_argument(
+        "--sensor", metavar="NAME", help="whose rest it is where the file has no row untouched, as in 1"
+    )
+    verb.add_argument(
+        "--row", type=int, nargs="+", help="which rows (default: the one that differs most from rest)"
+    )
+    verb.add_argument(
+        "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
+    )
+    verb.add_argument("--skin", default="coarse", help=f"mesh: {', '.join(SKINS)}, or a file")
+    verb.add_argument(
+        "--material",
+        default="default",
+        help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json; force goes with its modulus",
+    )
+    add_options(verb)
+    verb.add_argument(
+        "--out", type=output_file(), default="out/estimate.csv", metavar="FILE", help=".csv or .json"
+    )
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _estimate(args):
+    from ..differentiable import verbs
+
+    verbs.estimate_verb(args)

@@ -8,16 +8,16 @@ import torch
 
 from ..calibration import Calibration, Configuration, Indentation, Parameter
 from ..calibration import calibrate as calibrate_with
-from ..calibration.forward import steps_of
+from ..calibration.forward import Steps, steps_of
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
 from .record import follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, push_forward
 
-__all__ = ["Forces", "calibrate"]
+__all__ = ["Forces", "calibrate", "forces_of"]
 
-_PRECISION = 1e-6  # of the slopes, which only steer
+_PRECISION = 1e-4  # of the slopes, which only steer
 
 
 class Forces:
@@ -41,14 +41,7 @@ class Forces:
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Forces (n, 3) [N], their derivatives by the scaled parameters (n, 3, p), steps that were lost."""
         names = [p.name for p in parameters]
-        missing = sorted(set(names) - {"friction", *PARAMETERS})
-        if missing:
-            raise ValueError(
-                f"gradients by {', '.join(missing)} are not there: fit with calibration.calibrate, or choose "
-                f"from friction, {', '.join(PARAMETERS)}"
-            )
-        steps, geoms = steps_of(indentation)
-        skin = self._skin(configuration, material, geoms)
+        steps, skin = self.prepare(configuration, material, parameters, indentation)
         values = torch.tensor(values, dtype=torch.float64)
         others = [name for name in names if name != "friction"]
 
@@ -77,8 +70,22 @@ class Forces:
         force = np.array([trajectory.steps[i].wrench[0, :3] for i in steps.ends])
         return force, np.moveaxis(change, 0, -1), sum(r.changes.lost for r in trajectory.steps)
 
-    def _skin(self, configuration, material, geoms):
-        key = configuration.name, configuration.options, material
+    def prepare(
+        self,
+        configuration: Configuration,
+        material: Material,
+        parameters: list[Parameter],
+        indentation: Indentation,
+    ) -> tuple[Steps, Skin]:
+        """The way in steps, and the skin that goes it."""
+        missing = sorted({p.name for p in parameters} - {"friction", *PARAMETERS})
+        if missing:
+            raise ValueError(
+                f"gradients by {', '.join(missing)} are not there: fit with calibration.calibrate, or choose "
+                f"from friction, {', '.join(PARAMETERS)}"
+            )
+        steps, geoms = steps_of(indentation)
+        key = configuration.name, configuration.options, material, indentation.indenter
         if key not in self._skins:
             self._skins[key] = Skin(
                 configuration.geometry,
@@ -88,7 +95,26 @@ class Forces:
                 modulus=configuration.modulus,
                 precision=_PRECISION,
             )
-        return self._skins[key]
+        return steps, self._skins[key]
+
+
+def forces_of(
+    configuration: Configuration,
+    material: Material,
+    parameters: list[Parameter],
+    indentation: Indentation,
+    device: str = "cpu",
+) -> tuple[Forces | None, str]:
+    """What `calibration.calibrate` takes as its forces, and what its slopes are by: gradients, or where these
+    are not there, None and differences with the reason."""
+    if device != "cpu":
+        return None, f"differences (gradients on {device} are not there)"
+    forces = Forces()
+    try:
+        forces.prepare(configuration, material, parameters, indentation)
+    except ValueError as error:
+        return None, f"differences ({str(error).partition(':')[0]})"
+    return forces, "gradients"
 
 
 def calibrate(
@@ -98,16 +124,24 @@ def calibrate(
     parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
     max_iterations: int = 20,
     progress: bool = False,
+    starts: int = 1,
 ) -> Calibration:
     """`calibration.calibrate` by gradients, on the CPU: Gauss and Newton's method from the start.
 
     Args:
-      configuration, material, indentation, max_iterations, progress: see there.
+      configuration, material, indentation, max_iterations, progress, starts: see there.
       parameters: E, nu, mu, fill_volume, bulk_modulus, contact_stiffness.
 
     Raises:
       ValueError: what `calibration.calibrate` and `Skin` raise, or a parameter by which there is no gradient.
     """
     return calibrate_with(
-        configuration, material, indentation, parameters, max_iterations, progress=progress, forces=Forces()
+        configuration,
+        material,
+        indentation,
+        parameters,
+        max_iterations,
+        progress=progress,
+        forces=Forces(),
+        starts=starts,
     )
