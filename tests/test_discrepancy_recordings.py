@@ -412,6 +412,19 @@ def test_an_electrode_that_dies_is_said(seed, channel):
     assert any(f.id == "stuck" and f.channels == (channel,) for f in d.findings), d.verdict
 
 
+@pytest.mark.parametrize("value", [0, 4095, None])
+@pytest.mark.parametrize("share", [0.35, 0.8])
+def test_a_broken_wire_is_said(value, share):
+    """At an end of what it reads, or at its last value, and where it breaks when most is over."""
+    e, _, rng = pressed(4)
+    counts = noisy(e, rng)
+    start = int(share * len(counts))
+    counts[start:, 11] = counts[start, 11] if value is None else value
+    d = diagnose_recording(Recording(counts, rate=RATE))
+    (found,) = [f for f in d.findings if f.id == "stuck"]
+    assert found.channels == (11,) and abs(found.start - start / RATE) < 1.0
+
+
 def test_single_channels_stick_and_spike():
     e, rng = unloaded(3)
     stuck = noisy(e, rng)

@@ -1,8 +1,18 @@
-"""White noise of a record, from its quietest parts."""
+"""White noise of a record, from its quietest parts, and what a sound electrode has."""
 
 import numpy as np
 
-__all__ = ["noise_level"]
+from ..sensor.channels import electrode_noise
+
+__all__ = ["noise_level", "sound_noise"]
+
+_ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
+
+
+def sound_noise(counts: np.ndarray) -> np.ndarray:
+    """Standard deviation of a sound electrode's noise at these counts [counts]: of rounding at least, which
+    is all that is left at the ends of what it can read, where a broken wire leaves it."""
+    return np.maximum(electrode_noise(counts), _ROUNDING)
 
 
 def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: float = 0.05) -> np.ndarray:

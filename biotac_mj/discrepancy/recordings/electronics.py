@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from ...geometry.electrodes import electrode_positions
-from ...sensor.channels import electrode_noise
 from ..evidence import sign_flip
+from ..noise import sound_noise
 from .courses import BLOCKS
 from .findings import Finding
 from .session import Session
@@ -93,19 +93,20 @@ def coloured(session: Session) -> Finding | None:
     block = np.arange(len(parts)) * BLOCKS // len(parts)
     ratio = np.array(
         [
-            np.median(
-                np.log(
-                    np.quantile(middle[block == b], 0.3, axis=0)
-                    / np.maximum(np.quantile(high[block == b], 0.3, axis=0), 0.01 * floor)
-                )[alive]
+            np.median(np.log(low / above))
+            for low, above in (
+                [
+                    np.maximum(np.quantile(part[block == b][:, alive], 0.3, axis=0), 0.01 * floor)
+                    for part in (middle, high)
+                ]
+                for b in range(BLOCKS)
             )
-            for b in range(BLOCKS)
         ]
     )
     p, value = sign_flip(ratio), float(np.median(ratio))
     pole = _pole(value, bands)
     # a filter takes noise away, where a wave adds some and values that are held keep theirs, in steps
-    law = electrode_noise(np.median(x, axis=0))
+    law = sound_noise(np.median(x, axis=0))
     quiet = np.log(law * np.sqrt((window**2).sum()) / np.sqrt(np.maximum(high.mean(0), 0.01 * floor)))
     step = np.abs(np.diff(x, axis=0))
     step = step[: len(step) // 24 * 24].reshape(-1, 24, 19)
@@ -325,9 +326,7 @@ def correlated(session: Session) -> Finding | None:
         common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
     size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
     error, last = 1 / np.sqrt(size), session.recording.time[-1]
-    louder = float(
-        np.median(np.log(sd / electrode_noise(np.median(session.counts[session.fit], axis=0)))[alive])
-    )
+    louder = float(np.median(np.log(sd / sound_noise(np.median(session.counts[session.fit], axis=0)))[alive]))
     clues = {
         "factor": float(np.log(max(common.mean(), 0.01))),
         "rest": float(np.log(max(others.mean(), 0.01))),
@@ -479,7 +478,7 @@ def noisy(session: Session) -> list[Finding]:
     cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
     # a quarter of the samples moves least: no load in them
     level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
-    law = electrode_noise(np.median(session.counts[session.fit], axis=0))
+    law = sound_noise(np.median(session.counts[session.fit], axis=0))
     ratio = np.log(np.maximum(level, 0.3) / law)
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
 from scipy.stats import poisson
 
-from ...sensor.channels import electrode_noise
 from ..evidence import sign_flip
-from ..noise import noise_level
+from ..noise import noise_level, sound_noise
 from .courses import BLOCKS
 from .findings import Finding
 from .session import Session
@@ -188,7 +187,7 @@ def _dithered(session):
     typical = np.nanmedian(uneven[:, told], axis=0)
     usual = np.maximum(np.median(step, axis=0), 0.5)
     jump = step > 3 * usual
-    law = electrode_noise(np.median(r.electrodes[rows], axis=0))
+    law = sound_noise(np.median(r.electrodes[rows], axis=0))
     height = [np.median(step[jump[:, e], e]) / law[e] for e in told if jump[:, e].any()]
     # a median over rows jumps as well, by less than noise does
     if np.median(typical) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
@@ -245,14 +244,15 @@ def _still(session):
     x = whole[rows]
     bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
     level = uniform_filter1d(x, _STILL, axis=0)[1:-1]
-    size = np.sqrt(np.maximum(uniform_filter1d(bend, _STILL, axis=0), 0)) / electrode_noise(level)
-    lively = np.where(size > 0.2 * np.quantile(size, 0.9, axis=0), size, np.nan)
-    usual = np.nanmedian(lively, axis=0)
-    usual = np.minimum(usual, np.median(usual))  # spikes and bursts are not a channel's noise
+    law = sound_noise(level)
+    size = np.sqrt(np.maximum(uniform_filter1d(bend, _STILL, axis=0), 0)) / law
+    lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
+    usual, loud = (_middle(values, lively) for values in (size, law))
+    usual = np.fmin(usual, np.nanmedian(usual))  # spikes and bursts are not a channel's noise
     # without noise a constant reading is no news
-    alive = usual * np.median(electrode_noise(level), axis=0) > _ALIVE
+    alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
     quiet = (size < _QUIET * usual) & alive
-    share = quiet[: (rows < session.fit.sum()).sum()].mean(0)
+    share = quiet.mean(0)
     found = []
     # where several stand still at times it is nothing of one channel
     for k in np.flatnonzero(share > np.maximum(_SHARE, 6 * np.sort(share)[-3])):
@@ -269,6 +269,11 @@ def _still(session):
         mask[:, k] = at[before]
         found += _stood(session, int(k), mask, rate)
     return found
+
+
+def _middle(values, on):
+    """Median of values (n, 19) over the samples that are `on`, NaN where none is."""
+    return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
 
 
 def _stood(session, k, mask, rate):
@@ -291,9 +296,8 @@ def _stood(session, k, mask, rate):
             rest[a : a + n, k] = False
         if not rest.any() or (side == 0 and (found or length.max() < 0.25 * rate)):
             continue
-        flags = rest[session.fit, k]
-        if not flags.any():
-            continue
+        # nothing is fitted here, so what begins in the rows kept aside is told from these alone
+        flags = rest[session.fit, k] if rest[session.fit, k].any() else rest[:, k]
         value = float(np.median(values[mine]))
         spread = float(np.ptp(values[mine])) / 2 + 0.5
         name, key = ("saturate", "level") if side else ("stuck", "value")
@@ -306,7 +310,7 @@ def _stood(session, k, mask, rate):
                 {key: (value, value - spread, value + spread)},
                 rest,
                 f"{rest[:, k].mean():.1%} of the samples stand still at {value:.0f} counts, {text}",
-                _by_block(_stretch(rest[session.fit, k]), 0.003),
+                _by_block(_stretch(flags), 0.003),
                 BLOCKS,
             )
         )
