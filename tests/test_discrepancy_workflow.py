@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
+from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import STAGES, Run, memory
@@ -503,3 +504,11 @@ def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
     assert low < 0.08 < high
     assert "low-pass" in capsys.readouterr().out and "<img" in (tmp_path / "report/report.html").read_text()
     assert load_simulator(tmp_path / "report/sensor_amended.yaml").effects[0][0].id == "lowpass"
+
+
+def test_what_to_do_next_with_an_unknown():
+    table = {"ids": [], "matrix": [], "nats": []}
+    for tier, again in (("condensed", True), ("full", False)):
+        text = next_experiment([], table, True, tier)
+        assert ("--tier full" in text) == again and "repeat some trajectories" in text
+        assert next_experiment([], table, False, tier).startswith("none needed")

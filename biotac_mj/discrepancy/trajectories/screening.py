@@ -137,13 +137,23 @@ def isolability(
     return {"ids": ids, "matrix": M.tolist(), "nats": size, "notes": notes}
 
 
-def next_experiment(effects: list, isolability: dict) -> str:
+def next_experiment(effects: list, isolability: dict, unknown: bool, tier: str) -> str:
+    """What to do next, in words.
+
+    Args:
+      effects: as in the report, the one that explains most first.
+      isolability: see `isolability`.
+      unknown: whether something is left that no effect explains.
+      tier: of the skin with which the recording was compared.
+    """
     pairs = [(e, t) for e in effects for t in e["ties"]]
     if not pairs:
         pairs = [
             (e, next((o for o in e["confusable"] if o in isolability["ids"]), None)) for e in effects[:1]
         ]
     out = []
+    if tier == "condensed" and (effects or unknown):
+        out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")
     for effect, other in pairs[:3]:
         if other is None:
             continue
@@ -161,4 +171,6 @@ def next_experiment(effects: list, isolability: dict) -> str:
         name = next((e.name for e in CATALOGUE if e.id == other), other)
         how = text or "vary load, speed and hold together less"
         out.append(f"to tell {effect['name']} from {name}: {how}{own}")
-    return "; ".join(out) or "none needed: nothing was named, or nothing is tied"
+    if unknown and not effects:
+        out.append("repeat some trajectories unchanged: what does not come again is no effect of the sensor")
+    return "; ".join(out) or "none needed: nothing is tied, and nothing is left"

@@ -198,7 +198,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         gap_after,
         closed,
         table,
-        next_experiment(effects, table),
+        next_experiment(effects, table, bool(remainder) and _wrong(after), comparison.sim.tier),
         notes + table.pop("notes"),
         current,
         comparison,
