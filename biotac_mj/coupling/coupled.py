@@ -174,8 +174,11 @@ class Coupled:
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
-        self._placed = jump is None or _size(jump) > max(TELEPORT, _size(self.drift))
-        if self._placed:
+        self._placed = False
+        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+            if self.instance.is_clear(*self.here):
+                return self.instance.most_energy(np.zeros_like(self.wrench0))
+            self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
         return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())
