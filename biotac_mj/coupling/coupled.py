@@ -71,7 +71,13 @@ class Coupled:
         pose = self.target
         if share < 1.0 and self.asked is not None:
             pose = displace(*self.asked, share * displacement(*pose, *self.asked))
-        pose = self._within_reach(pose)
+        self._solve(self._within_reach(pose))
+
+    def arrive(self) -> None:
+        """Solves the skin where its bodies are sure to come."""
+        self._solve(self.target)
+
+    def _solve(self, pose):
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
         self._iterations += result.iterations
         quick = result.iterations < _LONG and self._iterations < _MOST_ITERATIONS

@@ -307,7 +307,8 @@ class Instance:
             known = clearance(0.0)
             if known is None:
                 return None
-            allowed, low = np.minimum(np.maximum(np.minimum(known, least) - room, _FITS), known), 0.0
+            deepest = np.maximum(np.minimum(known, least) - room, _FITS)
+            allowed, low = np.minimum(deepest, known - _FITS), 0.0  # what slides there is not held
             near = (known - allowed).min()
             for share in np.linspace(0.0, 1.0, _LOOKS + 1)[1:]:
                 deep = (allowed - clearance(share)).max()

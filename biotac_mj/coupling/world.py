@@ -116,7 +116,7 @@ class World:
             rounds = 1
             for skin in skins:
                 skin.aim(np.zeros(self.model.nv))
-                skin.go()
+                skin.arrive()
             self._forces(skins, outside)
         for skin in skins:
             skin.conclude(rounds)

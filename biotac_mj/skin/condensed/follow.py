@@ -26,7 +26,20 @@ def follow(
     skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray, near: Memory | None = None
 ) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
-    once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
+    once where that can be, else in parts; and the displacements (nvert, 3) [m].
+
+    Where geoms are so deep inside the core that no skin fits, it follows them to where one does; `reached` is
+    then the share of their way into the skin."""
+    skin.pose(memory, pos, mat)
+    if not skin.search.deep(pos, mat):
+        return _follow(skin, memory, pos, mat, near)
+    shallow, outside = skin.search.shallow(pos, mat), skin.search.outside(pos, mat)
+    out, u = _follow(skin, memory, shallow, mat, None)
+    share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
+    return dataclasses.replace(out, converged=False, reached=share * out.reached), u
+
+
+def _follow(skin, memory, pos, mat, near):
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
     motion, first = skin.pose(memory, pos, mat), 1.0
@@ -38,13 +51,12 @@ def follow(
         if found:
             return found
         first = min(1.0, max(_SHARE, _SHORT / max(far, 1e-12)))
-    deep = skin.search.deep(pos, mat)
     if skin.untouched(pos, mat):  # the skin lets go
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
     known = None
     if memory.started:
         out, u, blocked = _go(skin, memory, pos, mat, effort, first)
-        if deep or not blocked and out.reached > 0:
+        if not blocked and out.reached > 0:
             return out, u
         if far <= _PART and len(memory.force):
             known = out, u
