@@ -214,9 +214,12 @@ def test_what_is_withheld_gives_nothing_to_bodies_that_turn_far_in_a_step(integr
 def test_a_pinch_settles_in_the_full_tier():
     """All but two of its steps found no balance: way and depth were those of the force before it, and the
     friction that of all the way through the air."""
-    model, data, handle = pinched("implicitfast")
-    assert most_energy(model, data, 0.1) < 1.02
-    assert handle.read(data, "status")[1] <= 8
+    lost = 0
+    for integrator in ("implicitfast", "implicit", "Euler"):
+        model, data, handle = pinched(integrator)
+        assert most_energy(model, data, 0.1) < 1.02
+        lost += handle.read(data, "status")[1]
+    assert lost <= 18  # of 75
 
 
 @pytest.mark.parametrize("tier", ["condensed", "full"])
@@ -323,3 +326,32 @@ def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     assert (np.linalg.norm(np.diff(aside[:, :3], axis=0), axis=1) > 0.05).all()
     up = follow((x, z) for x, z in zip(np.linspace(-0.002, 0, 10), np.linspace(0.0119, 0.0135, 10)))
     assert (up[:, 3] == 1).all() and (np.diff(up[:, 1]) < 0).all()
+
+
+@pytest.mark.parametrize("mass, friction, most", [(0.02, 1.0, 0), (2.335e-3, 2.0, 9)])
+def test_a_light_ball_that_rolls_settles(mass, friction, most):
+    """It turns by 0.3 rad a step, where a skin's tangents are far from exact: rounds came closer by so little
+    that they were taken for too bold, and were shortened until they stood still."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".005" integrator="implicitfast"/><worldbody>'
+        '<site name="tip" quat="1 -1 0 0"/><body name="ball"><freejoint/>'
+        f'<geom size=".00237" mass="{mass}" friction="0"/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(
+        spec,
+        site="tip",
+        tier="condensed",
+        skin="coarse",
+        material="paper",
+        friction=friction,
+        readings="none",
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = -0.00997067, 0.00157612, 0.01077133, 0.7071068, 0.7071068, 0, 0
+    data.qvel[:] = 0.14719, 0, 0, 0.683, -0.353, -0.458
+    touched = 0
+    for _ in range(40):
+        mujoco.mj_step(model, data)
+        touched += handle.read(data, "contact_force").any()
+    assert touched > 12 and handle.read(data, "status")[1] <= most

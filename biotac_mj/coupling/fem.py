@@ -203,6 +203,7 @@ class FemStepper:
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
             load=d.contact_load(),
+            cost=float(d.iterations[0]) / (_WORK / 2),
         )
 
     # --- a skin at rest  ---

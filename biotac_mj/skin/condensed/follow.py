@@ -30,18 +30,22 @@ def follow(
 
     Where geoms are so deep inside the core that no skin fits, it follows them to where one does; `reached` is
     then the share of their way into the skin."""
-    skin.pose(memory, pos, mat)
-    if not skin.search.deep(pos, mat):
-        return _follow(skin, memory, pos, mat, near)
-    shallow, outside = skin.search.shallow(pos, mat), skin.search.outside(pos, mat)
-    out, u = _follow(skin, memory, shallow, mat, None)
-    share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
-    return dataclasses.replace(out, converged=False, reached=share * out.reached), u
-
-
-def _follow(skin, memory, pos, mat, near):
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
+    skin.pose(memory, pos, mat)
+    if not skin.search.deep(pos, mat):
+        out, u = _follow(skin, memory, pos, mat, near, effort)
+    else:
+        shallow, outside = skin.search.shallow(pos, mat), skin.search.outside(pos, mat)
+        share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
+        known = memory if memory.started else _outside(skin, shallow, mat)
+        out, u = _follow(skin, known, shallow, mat, None, effort)
+        out = dataclasses.replace(out, converged=False, reached=share * out.reached)
+    return dataclasses.replace(out, cost=effort.spent / most), u
+
+
+def _follow(skin, memory, pos, mat, near, effort):
+    most = effort.left
     motion, first = skin.pose(memory, pos, mat), 1.0
     turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
     far = np.abs(motion).max(initial=0.0) + _LEVER * turned
@@ -62,7 +66,7 @@ def _follow(skin, memory, pos, mat, near):
             known = out, u
             if effort.left < _SPENT * most:
                 return known
-        effort = Effort(most / 2)
+        effort.renew(most / 2)
     # the way there, if there is one, leads through the core or does not begin; or nobody knows it
     out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
     # a skin that presses is not given up for one that hardly touches yet
