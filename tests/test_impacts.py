@@ -215,9 +215,12 @@ def test_what_is_withheld_gives_nothing_to_bodies_that_turn_far_in_a_step(integr
 def test_a_pinch_settles_in_the_full_tier():
     """All but two of its steps found no balance: way and depth were those of the force before it, and the
     friction that of all the way through the air."""
-    model, data, handle = pinched("implicitfast")
-    assert most_energy(model, data, 0.1) < 1.02
-    assert handle.read(data, "status")[1] <= 8
+    lost = 0
+    for integrator in ("implicitfast", "implicit", "Euler"):
+        model, data, handle = pinched(integrator)
+        assert most_energy(model, data, 0.1) < 1.02
+        lost += handle.read(data, "status")[1]
+    assert lost <= 18  # of 75
 
 
 @pytest.mark.parametrize("tier, depth", covering(["condensed", "full"], [2e-3, 3e-3]))
@@ -267,3 +270,90 @@ def test_heavy_bodies_come_to_rest_on_the_condensed_skin(mass, radius, timestep)
     weight = mass * np.linalg.norm(model.opt.gravity)
     assert handle.read(data, "contact_force")[1] == pytest.approx(weight, rel=0.01) and data.ncon == 0
     assert converged == 1 and failed < 8 and withheld == 0
+
+
+def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_yet():
+    """Its first step in touch was taken for one in which somebody had pressed it in, and lent it energy."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".01" integrator="implicit" cone="elliptic"/><worldbody>'
+        '<site name="tip" quat="1 -1 0 0"/><body name="box"><freejoint/>'
+        '<geom type="box" size=".008293 .004844 .007986" mass=".001115" friction="0"/></body>'
+        "</worldbody></mujoco>"
+    )
+    biotac_mj.attach(
+        spec,
+        site="tip",
+        tier="condensed",
+        skin="coarse",
+        material={"youngs_modulus": 8e6},
+        liquid=True,
+        friction=0.371493,
+        readings="none",
+    )
+    model = spec.compile()
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    data = mujoco.MjData(model)
+    data.qpos[:] = -0.0276994, -0.0033384, 0.0185314, -0.225419, -0.0676020, -0.113161, -0.965303
+    data.qvel[:] = 0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781
+    energy = []
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+        energy.append(data.energy.sum())
+    assert max(energy) < 1.05 * energy[0]
+
+
+@pytest.mark.parametrize("nv", [0, 1])
+def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
+    """The skin stayed with one force where the sphere had first met the core, and called it balanced."""
+    spare = '<joint type="slide"/><geom size=".001" pos="0 0 1"/>' if nv else ""
+    model, data, handle = finger_under(
+        f'<body name="ball" mocap="true"><geom size=".0067"/></body><body>{spare}</body>',
+        0.004,
+        skin="coarse",
+        tier="condensed",
+        friction=2.0,
+    )
+
+    def follow(way):
+        seen = []
+        for x, z in way:
+            data.mocap_pos[0] = x, 0, z
+            mujoco.mj_step(model, data)
+            seen.append([*handle.read(data, "contact_force")[:3], *handle.read(data, "status")[[0, 6]]])
+        return np.array(seen)
+
+    follow((0.0, z) for z in np.linspace(0.0155, 0.0115, 20))
+    aside = follow((0.002 * np.sin(0.3 * k), 0.0115) for k in range(16))
+    assert (aside[:, 3] == 0).all() and (aside[:, 4] < 1).all()  # no skin fits between
+    assert (np.linalg.norm(np.diff(aside[:, :3], axis=0), axis=1) > 0.05).all()
+    up = follow((x, z) for x, z in zip(np.linspace(-0.002, 0, 10), np.linspace(0.0119, 0.0135, 10)))
+    assert (up[:, 3] == 1).all() and (np.diff(up[:, 1]) < 0).all()
+
+
+@pytest.mark.parametrize("mass, friction, most", [(0.02, 1.0, 0), (2.335e-3, 2.0, 9)])
+def test_a_light_ball_that_rolls_settles(mass, friction, most):
+    """It turns by 0.3 rad a step, where a skin's tangents are far from exact: rounds came closer by so little
+    that they were taken for too bold, and were shortened until they stood still."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".005" integrator="implicitfast"/><worldbody>'
+        '<site name="tip" quat="1 -1 0 0"/><body name="ball"><freejoint/>'
+        f'<geom size=".00237" mass="{mass}" friction="0"/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(
+        spec,
+        site="tip",
+        tier="condensed",
+        skin="coarse",
+        material="paper",
+        friction=friction,
+        readings="none",
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = -0.00997067, 0.00157612, 0.01077133, 0.7071068, 0.7071068, 0, 0
+    data.qvel[:] = 0.14719, 0, 0, 0.683, -0.353, -0.458
+    touched = 0
+    for _ in range(40):
+        mujoco.mj_step(model, data)
+        touched += handle.read(data, "contact_force").any()
+    assert touched > 12 and handle.read(data, "status")[1] <= most

@@ -704,10 +704,10 @@ def test_a_geom_deep_in_the_core_squeezes_the_skin_as_far_as_it_goes(coarse, sta
     assert squeezed(deep) > 20 and 0 < deep.reached < 1
     depth = (deep.memory.geom_pos[0] - start) @ direction
     assert 1.5e-3 < depth < 4e-3
-    if started:
-        assert depth == pytest.approx(deep.reached * 7e-3 - 1e-3, abs=1e-9)
+    assert depth == pytest.approx(deep.reached * 6e-3, rel=0.05)  # of its way in
     again = skin.solve(deep.memory, (start + 6e-3 * direction)[None], EYE)
-    assert squeezed(again) == pytest.approx(squeezed(deep), rel=0.05) and again.reached < 0.05
+    assert squeezed(again) == pytest.approx(squeezed(deep), rel=0.05)
+    assert again.reached == pytest.approx(deep.reached, abs=1e-3) and not again.converged
     out = skin.solve(again.memory, (start + 1e-3 * direction)[None], EYE)
     slow = walk(skin, start + np.outer(np.arange(1, 6) * 2e-4, direction))[-1]
     assert out.converged and squeezed(out) == pytest.approx(squeezed(slow), rel=0.05)
@@ -791,8 +791,7 @@ def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch)
     assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
 
 
-def test_a_skin_between_two_geoms_reaches_one_share_of_their_motion(coarse):
-    """One goes deep into the core, the other away: both poses are those of the same share."""
+def test_what_leaves_a_skin_arrives_though_another_geom_is_too_deep_in_the_core(coarse):
     start, direction = touch(coarse.geometry)
     side, normal = surface_point(coarse.geometry, -8e-3, 1.2)
     skin = CondensedSkin(coarse, GeomSet(["sphere", "sphere"], [(RADIUS,), (2e-3,)], [0.5, 0.5], [0, 1]))
@@ -802,7 +801,11 @@ def test_a_skin_between_two_geoms_reaches_one_share_of_their_motion(coarse):
     last = np.stack([start + 8e-3 * direction, side + 1.2e-3 * normal])
     out = skin.solve(memory, last, mats)
     assert squeezed(out) > 10 and 0 < out.reached < 1
-    assert np.allclose(out.memory.geom_pos, first + out.reached * (last - first), atol=1e-12)
+    assert (out.memory.geom_pos[1] == last[1]).all()
+    back = (out.memory.geom_pos - last)[0]
+    assert -back @ direction > 2e-3  # as far as a skin fits
+    again = skin.solve(out.memory, last, mats)
+    assert np.allclose(again.memory.geom_pos, out.memory.geom_pos) and not again.converged
     assert (np.linalg.norm(out.wrench[:, :3], axis=1) > 0.05).all()
 
 

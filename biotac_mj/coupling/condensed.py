@@ -92,6 +92,7 @@ class CondensedStepper(FemStepper):
             measured=out.measured,
             reached=out.reached,
             load=out.load,
+            cost=out.cost,
         )
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:

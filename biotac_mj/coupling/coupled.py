@@ -5,6 +5,7 @@ import numpy as np
 
 from ..geometry.rigid import displace, displacement, rotation
 from .instance import LEVER, Instance
+from .integrator import FixedPoint
 from .stepper import SkinResult
 from .structs import DataView
 
@@ -13,9 +14,11 @@ __all__ = ["DEEPER", "TELEPORT", "Coupled"]
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
-_LONG, _MOST_ITERATIONS = 30, 60  # of the skin's solver at once and in a step: then the closest model must do
+# of what a hard solve may cost, at once and in a step: then the closest model must do
+_LONG, _MOST = 0.4, 0.8
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
+_SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
 class Coupled:
@@ -45,8 +48,9 @@ class Coupled:
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
         self.asked = self.result = None
+        self._rounds = FixedPoint()
         self.written, self.settled = False, True
-        self.push, self.off, self.may_go, self._iterations = 1.0, np.inf, True, 0
+        self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
         self.drift = self.horizon * (self.jacobian @ data.qvel)
 
@@ -69,12 +73,28 @@ class Coupled:
     def go(self, share: float = 1.0) -> None:
         """Solves the skin where its bodies go, or a share of the way from where it was solved."""
         pose = self.target
-        if share < 1.0 and self.asked is not None:
-            pose = displace(*self.asked, share * displacement(*pose, *self.asked))
-        pose = self._within_reach(pose)
+        if self.asked is not None:
+            pose = self._beyond(share)
+        self._solve(self._within_reach(pose))
+
+    def _beyond(self, share):
+        """Where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as of
+        what rolls, lead there by parts), and a share of the way that these do not explain."""
+        done, left = (
+            (displacement(*to, *start) * _SCALE).ravel()
+            for to, start in ((self.asked, self.pose), (self.target, self.asked))
+        )
+        motion = self._rounds.next(done, left, share)
+        return displace(*self.pose, motion.reshape(-1, 6) / _SCALE)
+
+    def arrive(self) -> None:
+        """Solves the skin where its bodies are sure to come."""
+        self._solve(self.target)
+
+    def _solve(self, pose):
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
-        self._iterations += result.iterations
-        quick = result.iterations < _LONG and self._iterations < _MOST_ITERATIONS
+        self._cost += result.cost
+        quick = result.cost < _LONG and self._cost < _MOST
         self.may_go = result.converged and quick
         self.use(pose, result)
 
@@ -174,8 +194,11 @@ class Coupled:
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
-        self._placed = jump is None or _size(jump) > max(TELEPORT, _size(self.drift))
-        if self._placed:
+        self._placed = False
+        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+            if self.instance.is_clear(*self.here):
+                return self.instance.most_energy(np.zeros_like(self.wrench0))
+            self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
         return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())

@@ -203,6 +203,7 @@ class FemStepper:
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
             load=d.contact_load(),
+            cost=float(d.iterations[0]) / (_WORK / 2),
         )
 
     # --- a skin at rest  ---
@@ -226,9 +227,10 @@ class FemStepper:
             and self._search.clear(geom_pos, geom_mat, CLEAR)
         )
 
-    def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool:
-        """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone."""
-        return self._model.device.is_cuda or self._search.clear(geom_pos, geom_mat, self._reach)
+    def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:
+        """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone; None where
+        it is not known."""
+        return None if self._model.device.is_cuda else self._search.clear(geom_pos, geom_mat, self._reach)
 
     def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
         """(ngeom,) of geoms at (ngeom, 3), (ngeom, 3, 3) from where they are too deep inside the core for any

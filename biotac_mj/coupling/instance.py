@@ -273,21 +273,25 @@ class Instance:
     def clear_share(self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
         """Share of the way from one pose of the bodies to another, about as far as nothing touches the skin
         at rest; 1 where that is not known."""
+        way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
+        if self.is_clear(pos, mat) is not False:
+            return 1.0
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            if self.is_clear(*displace(pos0, mat0, middle * way)):
+                low = middle
+            else:
+                high = middle
+        return low
+
+    def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
+        """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
+        that is not known."""
         skin = self.setup.skin
         if not hasattr(skin.stepper, "is_clear"):
-            return 1.0
-        way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
+            return None
         with skin.lock:
-            if skin.stepper.is_clear(*self.touching.geom_pose(pos, mat)):
-                return 1.0
-            for _ in range(_BISECTIONS):
-                middle = 0.5 * (low + high)
-                pose = displace(pos0, mat0, middle * way)
-                if skin.stepper.is_clear(*self.touching.geom_pose(*pose)):
-                    low = middle
-                else:
-                    high = middle
-        return low
+            return skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
 
     def share_down(self, pos0: np.ndarray, mat0: np.ndarray, way: np.ndarray, room: float) -> float | None:
         """Share of a way (ngroup, 6) of the bodies from poses at which the skin is known, on which none goes
@@ -303,7 +307,8 @@ class Instance:
             known = clearance(0.0)
             if known is None:
                 return None
-            allowed, low = np.minimum(np.maximum(np.minimum(known, least) - room, _FITS), known), 0.0
+            deepest = np.maximum(np.minimum(known, least) - room, _FITS)
+            allowed, low = np.minimum(deepest, known - _FITS), 0.0  # what slides there is not held
             near = (known - allowed).min()
             for share in np.linspace(0.0, 1.0, _LOOKS + 1)[1:]:
                 deep = (allowed - clearance(share)).max()

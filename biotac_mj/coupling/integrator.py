@@ -122,12 +122,13 @@ class FixedPoint:
     def __init__(self):
         self._x, self._residual = [], []
 
-    def next(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
-        """The x (n,) to try after x (n,) left the residual g(x) - x (n,)."""
+    def next(self, x: np.ndarray, residual: np.ndarray, part: float = 1.0) -> np.ndarray:
+        """The x (n,) to try after x (n,) left the residual g(x) - x (n,). part: of what no earlier round
+        explains."""
         self._x, self._residual = [*self._x[-_MEMORY:], x], [*self._residual[-_MEMORY:], residual]
         moved, changed = np.diff(self._x, axis=0).T, np.diff(self._residual, axis=0).T
         weight = 0.01 ** np.arange(changed.shape[1])[::-1] / np.maximum(
             np.linalg.norm(changed, axis=0), 1e-300
         )
         share = weight * np.linalg.lstsq(changed * weight, residual, rcond=1e-13)[0]
-        return x + residual - (moved + changed) @ share
+        return x + part * residual - (moved + part * changed) @ share

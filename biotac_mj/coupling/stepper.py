@@ -63,9 +63,10 @@ class SkinResult:
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
       reached: share of the touching bodies' motion in this step at which all this holds: 1 where it
-        converged.
+        converged; of their way into the skin, where they are deeper in the core than one fits.
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
+      cost: of the solve, as a share of what a hard one may cost.
       measured: False where an approximate tier leaves the range in which its error was measured.
     """
 
@@ -81,6 +82,7 @@ class SkinResult:
     reached: float = 1.0
     pose: tuple | None = None
     load: np.ndarray | None = None
+    cost: float = 0.0
 
 
 class SkinStepper(Protocol):

@@ -116,7 +116,7 @@ class World:
             rounds = 1
             for skin in skins:
                 skin.aim(np.zeros(self.model.nv))
-                skin.go()
+                skin.arrive()
             self._forces(skins, outside)
         for skin in skins:
             skin.conclude(rounds)
@@ -139,7 +139,11 @@ class World:
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break
-            share = max(0.5 * share, LEAST_STEP) if off > CLOSER * last else min(1.0, 2 * share)
+            share = (
+                max(0.5 * share, LEAST_STEP)
+                if off > (1.0 - (1.0 - CLOSER) * share) * last
+                else min(1.0, 2 * share)
+            )
             last = off
             for skin in going:
                 skin.go(share)

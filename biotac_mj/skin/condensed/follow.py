@@ -26,9 +26,26 @@ def follow(
     skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray, near: Memory | None = None
 ) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
-    once where that can be, else in parts; and the displacements (nvert, 3) [m]."""
+    once where that can be, else in parts; and the displacements (nvert, 3) [m].
+
+    Where geoms are so deep inside the core that no skin fits, it follows them to where one does; `reached` is
+    then the share of their way into the skin."""
     most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     effort = Effort(most)
+    skin.pose(memory, pos, mat)
+    if not skin.search.deep(pos, mat):
+        out, u = _follow(skin, memory, pos, mat, near, effort)
+    else:
+        shallow, outside = skin.search.shallow(pos, mat), skin.search.outside(pos, mat)
+        share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
+        known = memory if memory.started else _outside(skin, shallow, mat)
+        out, u = _follow(skin, known, shallow, mat, None, effort)
+        out = dataclasses.replace(out, converged=False, reached=share * out.reached)
+    return dataclasses.replace(out, cost=effort.spent / most), u
+
+
+def _follow(skin, memory, pos, mat, near, effort):
+    most = effort.left
     motion, first = skin.pose(memory, pos, mat), 1.0
     turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
     far = np.abs(motion).max(initial=0.0) + _LEVER * turned
@@ -38,19 +55,18 @@ def follow(
         if found:
             return found
         first = min(1.0, max(_SHARE, _SHORT / max(far, 1e-12)))
-    deep = skin.search.deep(pos, mat)
     if skin.untouched(pos, mat):  # the skin lets go
         return skin.at_rest(pos, mat, motion), np.zeros_like(skin.rest)
     known = None
     if memory.started:
         out, u, blocked = _go(skin, memory, pos, mat, effort, first)
-        if deep or not blocked and out.reached > 0:
+        if not blocked and out.reached > 0:
             return out, u
         if far <= _PART and len(memory.force):
             known = out, u
             if effort.left < _SPENT * most:
                 return known
-        effort = Effort(most / 2)
+        effort.renew(most / 2)
     # the way there, if there is one, leads through the core or does not begin; or nobody knows it
     out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
     # a skin that presses is not given up for one that hardly touches yet

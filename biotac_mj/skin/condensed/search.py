@@ -26,6 +26,7 @@ wp.set_module_options({"enable_backward": False})
 _REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
 _REGIONS = 16
 _NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
+_CORE = 1e-6  # and where it comes out of the core
 _EVEN = 1e-9  # of a way: finer it is not divided
 _FAR = 1.0  # [m] geoms are moved out of the skin by no more
 
@@ -182,8 +183,7 @@ class NearSearch:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         if not self._geoms.count:
             return True
-        struct = self._geoms.struct
-        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+        self._pose(pos, mat)
         region = self._region(margin, pos, mat)
         if not len(region.faces):
             return region.clearance > 0 or not self.deep(pos, mat)
@@ -206,24 +206,35 @@ class NearSearch:
     def outside(self, pos: np.ndarray, mat: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Positions (ngeom, 3) [m] where geoms that are in the resting skin have just left it, each along the
         mean normal of what it touches."""
+        return self._out(pos, mat, lambda at: self.clear(at, mat, margin), _NARROW, margin)
+
+    def shallow(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+        """Positions (ngeom, 3) [m] where geoms that are too `deep` inside the core have just come out so far
+        that a skin fits between, each along the mean normal of what it touches of the resting skin."""
+        return self._out(pos, mat, lambda at: not self.deep(at, mat), _CORE)
+
+    def _out(self, pos, mat, free, narrow, margin=0.0):
+        """Positions from where each geom, alone at (ngeom, 3), is free, found to within `narrow` [m]."""
         out = pos.copy()
         for g in range(len(pos)):
             alone = np.full_like(pos, 2 * _FAR)
 
-            def clear(distance, g=g, alone=alone, normal=0.0):
+            def is_free(distance, g=g, alone=alone, normal=0.0):
                 alone[g] = pos[g] + distance * normal
-                return self.clear(alone, mat, margin)
+                self._pose(alone, mat)
+                return free(alone)
 
-            if clear(0.0):
+            if is_free(0.0):
                 continue
+            self._x[:, 0] = self._rest
             normal = self._outward(pos[g], self.faces(margin, 0.0, alone, mat))
-            high = _NARROW
-            while high < _FAR and not clear(high, normal=normal):
+            high = narrow
+            while high < _FAR and not is_free(high, normal=normal):
                 high *= 2
             low = high / 2
-            while high - low > _NARROW:
+            while high - low > narrow:
                 middle = (low + high) / 2
-                low, high = (low, middle) if clear(middle, normal=normal) else (middle, high)
+                low, high = (low, middle) if is_free(middle, normal=normal) else (middle, high)
             out[g] = pos[g] + high * normal
         return out
 
@@ -253,10 +264,13 @@ class NearSearch:
         """(ngeom,) of geoms at these poses from the core, negative inside it [m]; None without a core."""
         if not (self._model.has_core and self._geoms.count):
             return None
-        struct = self._geoms.struct
-        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+        self._pose(pos, mat)
         self._clearances()
         return self._clearance.copy()
+
+    def _pose(self, pos, mat):
+        struct = self._geoms.struct
+        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
 
     def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Raises ValueError for a geom deep inside the core."""

@@ -88,7 +88,7 @@ class Outcome:
     """A solved step: what to remember, wrench (ngroup, 6) of the skin on the geoms, their tangent (ngroup, 6,
     6), nodes (nvert, 3), volume of the liquid, whether the error of such a step has been measured; the size
     of the force (k,) on each of the memory's contacts; and the share of the geoms' motion at which this
-    holds, 1 where the step converged."""
+    holds, 1 where the step converged; its cost, as a share of what a hard step may cost."""
 
     memory: Memory
     wrench: np.ndarray
@@ -101,6 +101,7 @@ class Outcome:
     error: float
     load: np.ndarray
     reached: float = 1.0
+    cost: float = 0.0
 
     def sound(self) -> bool:
         """Whether it is finite and a `Memory` of so much contact may be kept."""
@@ -118,7 +119,11 @@ class Effort:
     """
 
     def __init__(self, most: float):
-        self.left, self._until = most, 0.0
+        self.left, self._until, self.spent = most, 0.0, 0.0
+
+    def renew(self, left: float) -> None:
+        """Lets a second way cost so much more."""
+        self.left, self._until = left, 0.0
 
     def allow(self, share: float) -> None:
         """Lets what comes next take a share of what is left."""
@@ -127,7 +132,9 @@ class Effort:
     def spend(self, n: int, linear: float = 0.0, times: int = 1) -> bool:
         """Counts iterations over n coordinates with what their linear solves cost; whether there is something
         left."""
-        self.left -= times * (_ITERATION + n * n + linear)
+        cost = times * (_ITERATION + n * n + linear)
+        self.left -= cost
+        self.spent += cost
         return self.left > self._until
 
 
