@@ -221,7 +221,7 @@ def test_a_pinch_settles_in_the_full_tier():
         assert most_energy(model, data, 0.1) < 1.02
         lost += handle.read(data, "status")[1]
     # of 75, where 69 were lost; which of them settle is chance: 15 with MuJoCo 3.17, 44 with 4.0
-    assert lost <= 50
+    assert lost <= (18 if mujoco.__version__.startswith("3") else 46)
 
 
 @pytest.mark.parametrize("tier, depth", covering(["condensed", "full"], [2e-3, 3e-3]))
@@ -296,11 +296,14 @@ def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_ye
     data = mujoco.MjData(model)
     data.qpos[:] = -0.0276994, -0.0033384, 0.0185314, -0.225419, -0.0676020, -0.113161, -0.965303
     data.qvel[:] = 0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781
-    energy = []
+    mujoco.mj_forward(model, data)
+    has = kinetic(model, data)
+    energy, lent = [], []
     for _ in range(20):
         mujoco.mj_step(model, data)
         energy.append(data.energy.sum())
-    assert max(energy) < 1.05 * energy[0]
+        lent.append(data.plugin_state[model.plugin_stateadr[0] + 3])  # what the skin may still give
+    assert max(energy) < 1.05 * energy[0] and 0 < max(lent) < 1.05 * has
 
 
 @pytest.mark.parametrize("nv", [0, 1])
