@@ -252,6 +252,8 @@ _READINGS = (
      "attach, condensed, batch; `converged` in generate"),
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
+    ("rounds that are accelerated; a skin that follows along the core what is too deep for it; nothing lent "
+     "at first touch", "yes", "attach, condensed; batches have none of these"),
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
      "the core; one that cannot move on begins anew; what was stored by bodies that are put into it is open "
      "until a balance is found", "yes",
