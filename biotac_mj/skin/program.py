@@ -5,12 +5,14 @@ branches conditional ones (CUDA 12.4 and later). On the CPU a `Program` records 
 packing a launch's arguments takes Warp longer than many of the kernels run.
 """
 
+import concurrent.futures
 import ctypes
+import os
 from collections.abc import Callable, Sequence
 
 import warp as wp
 
-__all__ = ["Launcher", "Program"]
+__all__ = ["Fork", "Launcher", "Program", "compile_kernels"]
 
 
 class Launcher:
@@ -60,6 +62,76 @@ class Launcher:
         function()
 
 
+class _Modules(Launcher):
+    """Launches nothing: finds the modules of the kernels that would be, on every branch."""
+
+    def __init__(self, device: wp.DeviceLike):
+        super().__init__(device)
+        self.found = {}
+
+    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
+        if _any(dim):
+            self.found[kernel.module, block_dim] = None
+
+    def launch_blocks(self, kernel, dim, inputs, outputs=(), block_dim=128):
+        self.launch(kernel, dim, inputs, outputs, block_dim)
+
+    def loop(self, flag, body):
+        body()
+
+    def branch(self, flag, body, otherwise=None):
+        body()
+        if otherwise:
+            otherwise()
+
+    def call(self, function):
+        pass
+
+
+def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
+    """Compiles what record(launcher) launches on a CUDA device, modules beside each other: Warp would one by
+    one, as they come."""
+    modules = _Modules(device)
+    record(modules)
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = [
+            pool.submit(wp.load_module, module, modules.device, block_dim=threads)
+            for module, threads in modules.found
+        ]
+        for one in made:
+            one.result()
+
+
+class Fork:
+    """Branches of a CUDA graph; on the CPU, one after another.
+
+    Small kernels mostly wait: those of several parts of a skin, or of several skins, wait together.
+    """
+
+    def __init__(self, device: wp.DeviceLike):
+        self._device, self._streams = wp.get_device(device), []
+
+    def run(self, branches: Sequence[Callable[[], None]]) -> None:
+        """Calls branches, each of launches only (no loop, no branch), that write nothing that another one
+        reads or adds to. What is launched afterwards waits for all."""
+        if not self._device.is_cuda:
+            for branch in branches:
+                branch()
+            return
+        main, others = self._device.stream, branches[1:]
+        while len(self._streams) < len(others):
+            self._streams.append((wp.Stream(self._device), wp.Event(self._device), wp.Event(self._device)))
+        for (stream, begin, end), branch in zip(self._streams, others):
+            stream.wait_event(main.record_event(begin))
+            with wp.ScopedStream(stream, sync_enter=False):
+                branch()
+                stream.record_event(end)
+        for branch in branches[:1]:
+            branch()
+        for (_, _, end), _ in zip(self._streams, others):
+            main.wait_event(end)
+
+
 class Program(Launcher):
     """What record(program) launches.
 
@@ -106,7 +178,7 @@ class Program(Launcher):
     ) -> None:
         if self.device.is_cuda:
             super().launch(kernel, dim, inputs, outputs, block_dim)
-        elif all(dim) if isinstance(dim, (tuple, list)) else dim:
+        elif _any(dim):
             command = wp.launch(kernel, dim, inputs, list(outputs), device=self.device, record_cmd=True)
             self._open.append(command.launch)
             self._arguments.append((inputs, outputs))
@@ -166,6 +238,11 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().call(function)
         self._open.append(function)
+
+
+def _any(dim):
+    """Whether there is anything in dim to be launched over."""
+    return all(dim) if isinstance(dim, (tuple, list)) else dim
 
 
 def _value(flag):

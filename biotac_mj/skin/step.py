@@ -15,11 +15,11 @@ Everything that changes between steps is read from device arrays: poses and fric
 .frame_mat` (implicit dynamics). Overwrite them, then step.
 
 A world that finds no balance goes there in parts: its geoms move from where they were when the last step
-ended, as far as the skin finds a balance; no skin fits between the core and a geom deep inside it. A world
-that does not come to the end stays where it came to (`data.reached`), is counted in
-`data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not finite, which
-stays where it was. The others do not notice. Worlds that are done idle inside the loops; those that are not
-`data.worlds.wanted` take no part, and stay as the last step left them."""
+ended, as far as the skin finds a balance, and friction slips on from part to part; no skin fits between the
+core and a geom deep inside it. A world that does not come to the end stays where it came to (`data.reached`),
+is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not
+finite, which stays where it was. The others do not notice. Worlds that are done idle inside the loops; those
+that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
 import weakref
@@ -36,7 +36,7 @@ from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, worlds
 from .precondition.dense import FEW, THREADS_FEW
-from .program import Launcher, Program
+from .program import Fork, Launcher, Program, compile_kernels
 from .types import mat33, real, vec3
 
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
@@ -170,9 +170,11 @@ class _Vectors:
         self.by_sample = None
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.base, self.balanced = (wp.zeros((n, w), dtype=vec3) for _ in range(2))
+            self.base = wp.zeros((n, w), dtype=vec3)
+            self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
             self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
-            self.part = wp.zeros((2, self.nchunk, w), dtype=real)
+            self.part = wp.zeros((3, self.nchunk, w), dtype=real)
+            self.held = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
             self.flags = wp.zeros(5, dtype=int)
             if w <= FEW and model.device.is_cuda:
@@ -234,9 +236,9 @@ class SkinStep:
         self._ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
         self._graph = None
         few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
-        self._streams = [wp.Stream(model.device) for _ in range(2 if few else 0)]
-        self._events = [wp.Event(model.device) for _ in range(3 if few else 0)]
+        self._fork = Fork(model.device) if few else None
         if model.device.is_cuda:
+            compile_kernels(model.device, self._record)
             self._warm_up()
         self._program = Program(model.device, self._record)
 
@@ -264,6 +266,7 @@ class SkinStep:
 
     def evaluate_forces(self) -> None:
         """Writes the forces at `data.x` and what belongs to them, in all worlds."""
+        wp.copy(self.k.begun, self.d.x_last)
         self._once(lambda: self._evaluate(self.st.moving))
 
     def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
@@ -307,7 +310,7 @@ class SkinStep:
         if self.implicit:
             frames = [d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt]
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
-        self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x])
+        self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
         self._try()
         program.loop(self._again, self._go_on)
         self._launch(worlds.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
@@ -335,15 +338,16 @@ class SkinStep:
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
         self._try()
-        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st], [k.balanced])
+        self._launch(worlds.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
+        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
+        self._commit_contacts(st.kept)
 
     def _place(self, share, on):
         """Geoms at a share of their way, nodes where they were last in balance."""
         d, g = self.d, self.geoms
         dim = (g.count, d.nworld)
         self._launch(worlds.place_geoms, dim, [self._way, share, on], [g.struct])
-        kept = [d.x_last, self.k.balanced, self.st.reached]
-        self._launch(nodes.return_nodes, d.x.shape, [*kept, on], [d.x])
+        self._launch(nodes.return_nodes, d.x.shape, [self.k.begun, on], [d.x])
 
     def _stay(self):
         """Where the way ended, as if it had been asked for: forces, and the tangents of what touches."""
@@ -373,6 +377,8 @@ class SkinStep:
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
         self.M.watch_products(self._launcher, self.d.x)
+        o = self.m.options
+        self._launch(worlds.choose_lag, self.d.nworld, [o.tolerance, o.max_newton, self.st])
         self._check()
 
     def _check(self):
@@ -409,10 +415,10 @@ class SkinStep:
         m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
         self._multiply()
         chunks, gradient = (k.nchunk, d.nworld), self._gradient()
-        pair = [k.chunk, k.p, k.q, gradient, m.free_mask]
-        self._launch(kernels.measure_product, chunks, [*pair, st.running], [k.part, self._solve_on])
+        inputs = [k.chunk, k.p, k.q, k.held, gradient, m.free_mask, st.running]
+        self._launch(kernels.measure_product, chunks, inputs, [k.part, self._solve_on])
         self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
-        inputs = [k.chunk, first, *pair[1:], st, k.dx, k.r]
+        inputs = [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r]
         self._launch(kernels.update_solution, chunks, inputs, [k.part])
 
     def _multiply(self):
@@ -447,7 +453,7 @@ class SkinStep:
                 k.p,
                 st,
             ],
-            [k.q],
+            [k.q, k.held],
         )
 
     def _search(self):
@@ -479,10 +485,7 @@ class SkinStep:
             inputs = [_WRENCH_CHUNK, o.surface.face, m.sample, g.struct, d.x, *touching]
             self._launch(faces.partial_wrench, (self._wrench_chunks, w), inputs, [self._part, touched_by])
             self._launch(faces.sum_wrench, (2 * g.ngroup, w), [self._part], [wrench])
-        kept = [o.touching, o.bond, o.trial_anchor, o.kept]
-        self._launch(
-            faces.commit_contacts, o.touching.shape, [len(m.sample), *kept], [o.anchor_geom, o.anchor]
-        )
+        self._commit_contacts(st.wanted)
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
         self._launch(worlds.release_geoms, (g.count, w), [g.struct, self._way, st])
@@ -492,6 +495,12 @@ class SkinStep:
         if self.implicit:
             self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])
+
+    def _commit_contacts(self, on):
+        """What friction remembers, where a balance was found."""
+        o = self.d.outer
+        found = [len(self.m.sample), o.touching, o.bond, o.trial_anchor, on, o.kept]
+        self._launch(faces.commit_contacts, o.touching.shape, found, [o.anchor_geom, o.anchor])
 
     # --- forces ---
 
@@ -559,7 +568,7 @@ class SkinStep:
             self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
         surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
         held = [state.anchor_geom, state.anchor, on, near]
-        law = [*surface, geoms.struct, laws, d.x, d.x_last, *held]
+        law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
         total = [state.corner, state.block, state.touching]
         if k.by_sample is None:
@@ -618,22 +627,12 @@ class SkinStep:
         self._launcher.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
 
     def _beside(self, *branches):
-        """Launches up to three functions, which do not need each other's results, as branches of the
-        graph."""
-        if not self._streams:
+        """Launches functions, which do not need each other's results, as branches of the graph."""
+        if self._fork:
+            self._fork.run(branches)
+        else:
             for branch in branches:
                 branch()
-            return
-        main = self.m.device.stream
-        main.record_event(self._events[0])
-        for stream, done, branch in zip(self._streams, self._events[1:], branches[1:]):
-            stream.wait_event(self._events[0])
-            with wp.ScopedStream(stream, sync_enter=False):
-                branch()
-                stream.record_event(done)
-        branches[0]()
-        for done, _ in zip(self._events[1:], branches[1:]):
-            main.wait_event(done)
 
     def _warm_up(self):
         """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made,

@@ -400,6 +400,7 @@ def commit_contacts(
     touching: wp.array2d(dtype=int),
     geom: wp.array2d(dtype=int),
     anchor: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
     # In and out:
     kept: wp.array2d(dtype=int),
     # Out:
@@ -409,7 +410,7 @@ def commit_contacts(
     """Anchors of the faces that touch, and that touched when the last step ended, become those that the next
     step starts from."""
     f, w = wp.tid()
-    if touching[f, w] == 0 and kept[f, w] == 0:
+    if on[w] == 0 or (touching[f, w] == 0 and kept[f, w] == 0):
         return
     kept[f, w] = touching[f, w]
     for s in range(nsample):

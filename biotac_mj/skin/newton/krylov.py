@@ -8,7 +8,7 @@ import warp as wp
 
 from ..contact.faces import block_index
 from ..types import Precision, mat33, real, vec3
-from .worlds import Worlds, clear_line, total_of
+from .worlds import Worlds, clear_line, total_of, totals_of
 
 __all__ = ["begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
 
@@ -35,13 +35,15 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
             st.alpha[w] = real(0.0)
             st.swell[w] = real(0.0)
         return
-    pq = total_of(part, 0, w, t)
+    pq, held = totals_of(part, 0, part, 2, w, t)
     gp = total_of(part, 1, w, t)
     if t > 0:
         return
     st.swell[w] = st.kappa[w] * gp
     curvature = pq + st.kappa[w] * gp * gp
     first = st.iterations_cg[w] == 0
+    if first:
+        st.held[w] = real(0.0)
     st.iterations_cg[w] = st.iterations_cg[w] + 1
     st.work[w] = st.work[w] + 1
     if not (curvature > real(0.0)):
@@ -51,9 +53,11 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         st.alpha[w] = real(0.0)
         if first:
             st.alpha[w] = wp.where(st.rz[w] < real(0.0), real(-1.0), real(1.0))
+            st.held[w] = wp.max(held, real(0.0))
         return
     alpha = st.rz[w] / curvature
     st.alpha[w] = alpha
+    st.held[w] = st.held[w] + wp.max(alpha * alpha * held, real(0.0))
     # a first step of length one says that the preconditioner is as good as the tangent
     if wp.abs(alpha - real(1.0)) <= real(0.2) or st.iterations_cg[w] >= limit:
         st.running[w] = 0
@@ -127,6 +131,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         st: Worlds,
         # Out:
         q_out: wp.array2d(dtype=vec),
+        held_out: wp.array2d(dtype=scalar),
     ):
         """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
         damping by mass, by stiffness."""
@@ -135,10 +140,14 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             return
         if mask[i] == real(0.0):
             q_out[i, w] = vec()
+            held_out[i, w] = scalar(0.0)
             return
         q = vec()
         for k in range(start[i], start[i + 1]):
             q += corner[slot[k], w]
+        lag = scalar(st.lag[w])
+        held_out[i, w] = lag * wp.dot(p[i, w], q)
+        q = (scalar(1.0) + lag) * q
         if inertia[0] > real(0.0):
             h = dt[w]
             m = st.density[w] * node_volume[i] / (h * h)
@@ -172,6 +181,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         p: wp.array2d(dtype=vec),
         q: wp.array2d(dtype=vec),
+        held: wp.array2d(dtype=scalar),
         gradient: wp.array2d(dtype=vec3),
         mask: wp.array(dtype=real),
         on: wp.array(dtype=int),
@@ -179,7 +189,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         part_out: wp.array3d(dtype=real),
         go_on: wp.array(dtype=int),
     ):
-        """p . q and gradient . p by chunks."""
+        """p . q, gradient . p and what is held by chunks."""
         c, w = wp.tid()
         if c == 0 and w == 0:
             go_on[0] = 0
@@ -187,12 +197,15 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             return
         pq = real(0.0)
         gp = real(0.0)
+        hold = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):
             pq += real(wp.dot(p[i, w], q[i, w]))
+            hold += real(held[i, w])
             if gradient.shape[0] > 0 and mask[i] > real(0.0):
                 gp += wp.dot(gradient[i, w], raised(p[i, w]))
         part_out[0, c, w] = pq
         part_out[1, c, w] = gp
+        part_out[2, c, w] = hold
 
     @wp.kernel(module=module, enable_backward=False)
     def update_solution(

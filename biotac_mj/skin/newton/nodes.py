@@ -27,10 +27,18 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def begin_nodes(
-    mask: wp.array(dtype=real), increment: wp.array2d(dtype=vec3), st: Worlds, x: wp.array2d(dtype=vec3)
+    # In:
+    mask: wp.array(dtype=real),
+    increment: wp.array2d(dtype=vec3),
+    st: Worlds,
+    # In and out:
+    x: wp.array2d(dtype=vec3),
+    # Out:
+    begun_out: wp.array2d(dtype=vec3),
 ):
     """Starts from the last step's increment, as far as the geoms repeat their last motion."""
     i, w = wp.tid()
+    begun_out[i, w] = x[i, w]
     if st.active[w] == 1 and mask[i] > real(0.0) and st.repeat[w] > real(0.0):
         x[i, w] = x[i, w] + st.repeat[w] * increment[i, w]
 
@@ -38,9 +46,7 @@ def begin_nodes(
 @wp.kernel
 def return_nodes(
     # In:
-    x_last: wp.array2d(dtype=vec3),
-    balanced: wp.array2d(dtype=vec3),
-    reached: wp.array(dtype=real),
+    begun: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     # Out:
     x: wp.array2d(dtype=vec3),
@@ -48,17 +54,15 @@ def return_nodes(
     """Back to the furthest part of the way that was gone."""
     i, w = wp.tid()
     if on[w] == 1:
-        x[i, w] = x_last[i, w]
-        if reached[w] > real(0.0):
-            x[i, w] = balanced[i, w]
+        x[i, w] = begun[i, w]
 
 
 @wp.kernel
-def keep_nodes(x: wp.array2d(dtype=vec3), st: Worlds, balanced_out: wp.array2d(dtype=vec3)):
-    """Keeps the end of a part that was gone."""
+def keep_nodes(x: wp.array2d(dtype=vec3), kept: wp.array(dtype=int), begun_out: wp.array2d(dtype=vec3)):
+    """The next part begins where one ended that was gone."""
     i, w = wp.tid()
-    if st.failed[w] == 0 and st.stride[w] > real(0.0):
-        balanced_out[i, w] = x[i, w]
+    if kept[w] == 1:
+        begun_out[i, w] = x[i, w]
 
 
 @wp.kernel

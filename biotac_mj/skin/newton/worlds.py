@@ -16,11 +16,13 @@ __all__ = [
     "Worlds",
     "all_on",
     "begin_worlds",
+    "choose_lag",
     "choose_length",
     "end_way",
     "end_worlds",
     "judge_balance",
     "judge_way",
+    "keep_geoms",
     "place_geoms",
     "release_geoms",
     "start_part",
@@ -37,6 +39,14 @@ BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
+_PATIENCE = wp.constant(20)  # iterations in which the error must halve
+_TRIES = wp.constant(12)  # of a line search
+_SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it must
+# by which the lag shrinks where a whole step is good, and grows where none is
+_QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
+# lag that is none, and with which skin is stiffer than contact
+_AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
+_NEAR = wp.constant(wp.float64(0.01))  # error below which no skin begins to creep: rounding is no circle
 _FIRST_PART = wp.constant(wp.float64(0.25))  # of a way that could not be gone at once
 _FAR = wp.constant(wp.float64(1e3))  # [m]
 
@@ -49,7 +59,10 @@ class Worlds:
     lam: wp.array(dtype=real)
     contact_stiffness: wp.array(dtype=real)  # pressure per overclosure [Pa/m]
     density: wp.array(dtype=real)  # [kg/m^3], of implicit dynamics
-    softness: wp.array(dtype=real)  # E of the model over E of the world
+    softness: wp.array(dtype=real)  # E of the model over E of the world, less where it creeps
+    elastic: wp.array(dtype=real)  # where it does, what it is otherwise
+    lag: wp.array(dtype=real)  # it creeps: rubber resists an iteration as if it were stiffer by so much
+    held: wp.array(dtype=real)  # work that the lag takes along a direction [J]
     kappa: wp.array(dtype=real)  # K / natural volume [Pa/m^3]
     natural: wp.array(dtype=real)  # volume of the liquid without pressure [m^3]
     holds: wp.array(dtype=int)  # the volume is kept: the liquid is incompressible
@@ -74,11 +87,13 @@ class Worlds:
     limit: wp.array(dtype=int)  # of iterations, at which the present try ends
     allowed: wp.array(dtype=int)  # work, at which it ends
     error: wp.array(dtype=real)
+    last_error: wp.array(dtype=real)  # of the iteration before
     best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
     since: wp.array(dtype=int)
     reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
     ahead: wp.array(dtype=real)  # that is tried
     stride: wp.array(dtype=real)  # between them; 0: the first try
+    kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
     beta: wp.array(dtype=real)
@@ -130,6 +145,14 @@ def clear_line(st: Worlds, w: int):
 
 
 @wp.func
+def set_lag(st: Worlds, w: int, lag: real):
+    if st.lag[w] == real(0.0):
+        st.elastic[w] = st.softness[w]
+    st.softness[w] = st.elastic[w] / (real(1.0) + lag)
+    st.lag[w] = lag
+
+
+@wp.func
 def begin_try(st: Worlds, w: int, limit: int, max_work: int):
     """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
     st.limit[w] = st.iterations[w] + limit
@@ -165,6 +188,7 @@ def begin_worlds(
     if law == 2:
         E = real(9.0) * l * m / (real(3.0) * l + m)
     st.softness[w] = youngs_modulus / E
+    st.lag[w] = real(0.0)
     if st.wanted[w] == 0:
         st.asked[w] = 0
         st.active[w] = 0
@@ -253,20 +277,23 @@ def judge_balance(
     # single precision leaves more residual than nothing, so a vibration without contact is measured by the
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
-    st.error[w] = wp.sqrt(wp.abs(rz) / work)
-    if wp.abs(rz) < real(0.25) * st.best[w]:
-        st.best[w] = wp.abs(rz)
+    stiffer = real(1.0) + st.lag[w]
+    far = stiffer * stiffer * wp.abs(rz)  # stiffer rubber goes less far for the same force
+    st.last_error[w] = st.error[w]
+    st.error[w] = wp.sqrt(far / work)
+    if far < real(0.25) * st.best[w]:
+        st.best[w] = far
         st.since[w] = st.iterations[w]
-    settled = int(1)
+    settled = wp.where(st.lag[w] == real(0.0), 1, 0)
     if has_liquid == 1:
         if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
             settled = 0
+    # what has not halved the error in so many iterations will hardly do so in the fewer left
+    patience = wp.min(_PATIENCE, st.limit[w] - st.iterations[w])
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif (  # what has not halved the error in so many iterations will hardly do so in the fewer left
-        st.iterations[w] - st.since[w] >= st.limit[w] - st.iterations[w] or st.work[w] >= st.allowed[w]
-    ):
+    elif st.iterations[w] - st.since[w] >= patience or st.work[w] >= st.allowed[w]:
         st.active[w] = 0
         st.failed[w] = 1
     else:
@@ -277,18 +304,52 @@ def judge_balance(
 
 
 @wp.kernel
+def choose_lag(tolerance: real, max_newton: int, st: Worlds):
+    """Where Newton's method goes round in circles, as where friction turns or skin snaps off a small geom,
+    the skin creeps: an iteration is a step of time of rubber with viscosity, which resists it as rubber that
+    is stiffer by the lag would. It goes to where real skin comes to rest; near there the steps are good, and
+    Newton's again, so that what is found is a balance without viscosity."""
+    w = wp.tid()
+    if st.active[w] == 0:
+        return
+    if st.iterations[w] - (st.limit[w] - max_newton) < _SLOW:
+        return
+    lag = st.lag[w]
+    good = int(0)
+    if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
+        if lag > real(0.0) or st.error[w] < st.last_error[w]:
+            good = 1
+    if good == 0 and lag == real(0.0) and st.error[w] < _NEAR:
+        return
+    if good == 0:
+        lag = wp.max(_SLOWER * lag, real(1.0))
+    elif lag > _AT_ONCE and st.error[w] > tolerance:
+        lag = lag / _QUICKER
+    else:
+        lag = real(0.0)
+    set_lag(st, w, lag)
+    if lag > _FIXED:
+        st.active[w] = 0
+        st.failed[w] = 1
+
+
+@wp.kernel
 def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
     The first try is the whole way from a guess. Parts cost together hardly more than the whole, and what they
-    come to is not lost: so they begin short.
+    come to is not lost: so they begin short. Friction goes with them: where a part ends the skin sticks, or
+    slips, and from there the next one slips on.
     """
     w = wp.tid()
     st.active[w] = 0
+    st.kept[w] = 0
     if st.asked[w] == 0:
         return
+    set_lag(st, w, real(0.0))
     stride = st.stride[w]
     if st.failed[w] == 0:
+        st.kept[w] = 1
         st.reached[w] = st.ahead[w]
         if st.ahead[w] == real(1.0):
             st.reason[w] = CONVERGED
@@ -337,6 +398,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     slope = total_of(part, 1, w, t)
     if t > 0:
         return
+    now -= st.alpha[w] * st.held[w]
     st.work[w] = st.work[w] + 1
     if st.tries[w] == 0:
         st.slope[w] = slope
@@ -348,18 +410,21 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     if wp.isfinite(now) and st.inverted[w] == 0:
         valid = 1
     st.inverted[w] = 0
+    pulls = st.pulls[w]
+    if st.lag[w] > real(0.0):
+        pulls = 0
     has_high = int(0)
     if st.high[w] >= real(0.0):
         has_high = 1
     enough = int(0)
     if valid == 1 and now >= real(-0.5) * slope:
-        if st.pulls[w] == 1:
+        if pulls == 1:
             if now <= real(0.2) * slope:
                 enough = 1
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
     st.tries[w] = st.tries[w] + 1
-    if enough == 1 or st.tries[w] == 12:
+    if enough == 1 or st.tries[w] == _TRIES:
         st.moving[w] = 0
         return
     if valid == 0 or now < real(0.0):
@@ -376,7 +441,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
         st.side[w] = -1
         st.low[w] = st.alpha[w]
         st.slope_low[w] = now
-    if st.pulls[w] == 1 and st.high[w] < real(0.0):
+    if pulls == 1 and st.high[w] < real(0.0):
         # a pull that falls as the gap opens is in no tangent: the way goes on
         further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
         st.alpha[w] = st.alpha[w] * further
@@ -426,6 +491,15 @@ def place_geoms(
         u = wp.where(turn[3] < real(0.0), -u, u)
         part = wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * f * half)
         geoms.mat[g, w] = R * wp.quat_to_matrix(part)
+
+
+@wp.kernel
+def keep_geoms(geoms: Geoms, kept: wp.array(dtype=int)):
+    """From there on counts how far what touches anew has slipped."""
+    g, w = wp.tid()
+    if kept[w] == 1:
+        geoms.pos_last[g, w] = geoms.pos[g, w]
+        geoms.mat_last[g, w] = geoms.mat[g, w]
 
 
 @wp.kernel
