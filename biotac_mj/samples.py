@@ -23,12 +23,12 @@ __all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
 
 OBJECT, SKIN = "sphere_7mm", "coarse"
 TOUCHES = 20
-_TOUCH, _AWAY = 24, 12  # rows of a touch, and on either side of it
+_TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand, and on either side of it
 _GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
-_EVERY = 2  # row in log.csv: `biotac diagnose` solves the skin in each again and again
+_EVERY = 5  # row in log.csv: `biotac diagnose` solves the skin in each again and again
 _CLEAR = 4e-3  # [m] that the object goes away
-_SET_RATE = 33.0  # [Hz] of the rows that the set takes: eight or nine of a touch
+_SET_RATE = 10.0  # [Hz] of the rows that the set takes: eight or nine of a touch
 # what the recorded sensor has and the simulated one lacks, for `biotac diagnose` to find
 EFFECT = ("warmup", {"a": -0.25, "tau": 5.0})
 
@@ -37,7 +37,7 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
     """Writes a synthetic recording of touches by a sphere in the forms that people have, and a set of it.
 
     electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
-    log.csv has all channels and the sphere's pose beside them, every other row; set/ is all touches with
+    log.csv has all channels and the sphere's pose beside them, every fifth row; set/ is all touches with
     the simulated skin under them, for `biotac train`.
 
     Args:

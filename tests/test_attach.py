@@ -335,6 +335,19 @@ def test_unknown_channel():
         handle.sensor("e20")
 
 
+def test_all_channels_are_read_at_once():
+    spec = spec_of()
+    handle = springs(spec, body="hand")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.sensordata[:] = np.arange(model.nsensordata)
+    read = handle.read(data)
+    assert {handle.sensor(name) for name in read} == {model.sensor(i).name for i in range(model.nsensor)}
+    for name, values in read.items():
+        np.testing.assert_array_equal(values, handle.read(data, name))
+    assert sorted(np.concatenate(list(read.values()))) == list(range(model.nsensordata))
+
+
 def test_own_geoms_cannot_be_named():
     spec = spec_of()
     springs(spec, body="hand", geoms=["hand"])

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 import biotac_mj
 from biotac_mj.coupling import attach, coupled
 from biotac_mj.coupling import world as coupled_world
-from biotac_mj.coupling.integrator import FixedPoint
+from biotac_mj.coupling.rules import FixedPoint
 from biotac_mj.geometry.rigid import displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
@@ -259,12 +259,12 @@ def test_only_dampers_take_momentum(integrator):
 
 def test_a_fixed_point_with_a_kink_is_found_in_few_rounds():
     rng = np.random.default_rng(1)
-    a = rng.normal(size=(5, 5))
-    slope, offset = 0.9 * a / np.linalg.norm(a, 2), rng.normal(size=5)
+    a = rng.normal(size=(6, 6))
+    slope, offset = 0.9 * a / np.linalg.norm(a, 2), rng.normal(size=6)
     for g in (lambda x: slope @ x + offset, lambda x: np.minimum(slope @ x + offset, 0.3)):
-        x, search = np.zeros(5), FixedPoint()
+        x, search = np.zeros(6), FixedPoint(1)
         for _ in range(12):
-            x = search.next(x, g(x) - x)
+            x = search.next(x[None], (g(x) - x)[None])[0]
         np.testing.assert_allclose(g(x), x, atol=1e-8)
 
 

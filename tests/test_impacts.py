@@ -214,14 +214,54 @@ def test_what_is_withheld_gives_nothing_to_bodies_that_turn_far_in_a_step(integr
 
 def test_a_pinch_settles_in_the_full_tier():
     """All but two of its steps found no balance: way and depth were those of the force before it, and the
-    friction that of all the way through the air."""
+    friction that of all the way through the air. Then a skin that lost the way of its bodies held on to them
+    when they were 20 mm off. What is left are steps that end where no skin fits."""
     lost = 0
     for integrator in ("implicitfast", "implicit", "Euler"):
         model, data, handle = pinched(integrator)
         assert most_energy(model, data, 0.1) < 1.02
         lost += handle.read(data, "status")[1]
-    # of 75, where 69 were lost; which of them settle is chance: 15 with MuJoCo 3.17, 44 with 4.0
-    assert lost <= (18 if mujoco.__version__.startswith("3") else 46)
+    assert lost <= 10  # of 75, where 69 were lost, and later 15 with MuJoCo 3.17 and 44 with 4.0
+
+
+def test_two_fingers_settle_together():
+    """Each skin looked for where its rounds lead by itself, though they held one body: nine of 18 steps were
+    lost."""
+    fingers = "".join(
+        f'<body pos="0 0 {-s * 0.01566718}" gravcomp="1"><inertial pos="0 0 0" mass=".03" '
+        f'diaginertia="1e-5 1e-5 1e-5"/><joint name="j{i}" type="slide" axis="0 0 1" damping="{1 - i}"/>'
+        f'<site name="t{i}" quat="1 {-s} 0 0"/></body>'
+        for i, s in enumerate((1, -1))
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep=".01" integrator="implicitfast" cone="elliptic"/><worldbody>{fingers}'
+        '<body pos="-.00437919 -.00102685 0" quat="-.45647733 .78446803 .06504385 -.41473804"><freejoint/>'
+        '<geom type="ellipsoid" size=".0033719 .00412547 .00733387" mass=".011415" friction="0"/></body>'
+        '</worldbody><actuator><motor joint="j0"/><motor joint="j1"/></actuator></mujoco>'
+    )
+    rubber = {"youngs_modulus": 4e5, "poissons_ratio": 0.4999}
+    hands = [
+        biotac_mj.attach(
+            spec,
+            site=f"t{i}",
+            prefix=f"b{i}_",
+            tier="condensed",
+            skin="coarse",
+            material=rubber,
+            liquid=False,
+            friction=1.0,
+            readings="none",
+        )
+        for i in (0, 1)
+    ]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for k in range(20):
+        push = min(1.0, k / 15) * 3.7 * (1 + 0.5 * np.sin(0.72 * k))
+        data.ctrl[:] = push, -push
+        mujoco.mj_step(model, data)
+    assert max(hand.read(data, "status")[1] for hand in hands) <= 5
+    assert min(np.linalg.norm(hand.read(data, "contact_force")[:3]) for hand in hands) > 1
 
 
 @pytest.mark.parametrize("tier, depth", covering(["condensed", "full"], [2e-3, 3e-3]))

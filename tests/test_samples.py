@@ -31,6 +31,7 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     assert cli.main(["diagnose", *words, "--out", str(tmp_path / "report")]) == 0
     said = capsys.readouterr().out
     assert "named: shared impedance gain (warm-up)" in said.replace("  ", " ")  # samples.EFFECT, by name
+    assert "not loaded" not in said  # touches long and slow enough to be taken for touches
 
 
 def test_touches_repeat_by_their_seed():

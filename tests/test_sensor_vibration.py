@@ -185,3 +185,27 @@ def test_textures_are_checked():
             read_texture(value)
     with pytest.raises(ValueError, match="no geom 'cup' to touch"):
         slid({"cup": "cork"}, seconds=0.01)
+
+
+def test_pac_of_a_sphere_that_slides_is_of_its_way_and_not_of_the_steps():
+    def change(timestep):
+        """Of PAC within its frames [counts], median over the slide."""
+        spec = mujoco.MjSpec.from_string(
+            f'<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody>'
+            '<site name="tip" quat="1 -1 0 0"/><body mocap="true">'
+            '<geom size=".006" friction="0"/></body></worldbody></mujoco>'
+        )
+        finger = biotac_mj.attach(
+            spec, site="tip", tier="condensed", skin="coarse", friction=0.3, textures={}, seed=1
+        )
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        counts = []
+        for t in np.arange(0.0, 0.8, timestep):
+            data.mocap_pos[0] = -0.014 + 0.02 * max(0.0, t - 0.3), 0, 0.0163 - 0.0032 * min(1.0, t / 0.2)
+            mujoco.mj_step(model, data)
+            if t > 0.4:
+                counts.append(np.ptp(finger.read(data, "pac")))
+        return np.median(counts)
+
+    assert change(0.005) == pytest.approx(change(0.002), rel=0.05)

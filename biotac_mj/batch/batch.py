@@ -18,8 +18,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.rules import remember
 from ..coupling.touching import Touching
-from . import dynamics, kernels, rounds
+from ..skin.program import Fork
+from . import dynamics, energy, kernels, rounds
 from .scratch import Scratch
 from .senses import Senses
 from .skin import BatchSkin
@@ -69,19 +71,38 @@ class Batch(Skins):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             for name in ("drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            for name in ("spent", "far", "trial", "placed", "inside", "passed"):
+            flags = (
+                "untouched",
+                "far",
+                "down",
+                "placed",
+                "inside",
+                "open",
+                "passed",
+                "found",
+                "better",
+                "back",
+                "ended",
+            )
+            for name in ("spent", "trial", *flags):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
             r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
-            r.off, r.share, r.store, r.most, r.without = (
-                wp.zeros(self.nworld, dtype=wp.float64) for _ in range(5)
+            r.clearance = wp.zeros((rounds.SHARES + 1, *skin.pos.shape), dtype=wp.float64)
+            r.off, r.share, r.best, r.store, r.most, r.without = (
+                wp.zeros(self.nworld, dtype=wp.float64) for _ in range(6)
             )
+            r.seen = remember(*self.groups)
+            self._going = wp.zeros(1, dtype=int)
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
-            skin.prepare_keep()
+            models = [getattr(self.model, name) for name in kernels.Model.vars]
+            skin.prepare_keep([*models, r.asked_pos, r.asked_mat])
         self._solid = rounds.Solid()
         self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
         self._solid.area = float(skin.model.outer.area.numpy().sum())
+        self._solid.core = int(skin.model.has_core)
+        self._solid.core_depth = skin.model.options.max_core_depth
 
     def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
@@ -89,13 +110,12 @@ class Batch(Skins):
         r = self._of_step
         bodies = [self._core, self._body, d.xpos, d.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
-        arrays = [m.body_rootid, m.body_isdofancestor, d.xpos, d.xmat, d.subtree_com, d.cvel, d.cdof, d.qvel]
-        self._launch(
-            dynamics.advance_groups,
-            self.groups,
-            [self._core, self._body, self.dt, *arrays],
-            [r.start_pos, r.start_mat, self._jacobian, r.drift],
-        )
+        where, start = [d.xpos, d.xmat, d.subtree_com], [r.start_pos, r.start_mat]
+        going = [self._core, self._body, self.dt, m.body_rootid, *where, d.cvel]
+        self._launch(dynamics.advance_groups, self.groups, going, start)
+        turning = [self._core, self._body, m.body_rootid, m.body_isdofancestor, *where, d.cdof, *start]
+        self._launch(dynamics.relative_jacobians, self._jacobian.shape, turning, [self._jacobian])
+        self._launch(dynamics.find_drift, self.groups, [self.dt, self._jacobian, d.qvel], [r.drift])
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
         if self.moving:
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
@@ -103,17 +123,20 @@ class Batch(Skins):
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
 
-    def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Puts the linear models into the forces and the rows."""
-        r = self._of_step
-        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+    def add_forces(self, d: "mjw.Data") -> None:
+        """Adds the linear models to the forces, after `act`."""
         self._launch(
             dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive]
         )
+
+    def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Finds the linear models' forces, and puts the rest of them into the rows."""
+        r = self._of_step
+        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
         efc = d.efc
         self._launch(
             dynamics.write_rows,
-            self._row.shape,
+            (*self._row.shape, self._jacobian.shape[2]),
             [self.dt**2, self._group_slot, self._row, self._jacobian, self.model.tangent0]
             + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
             [efc.J, efc.D, efc.aref, efc.pos],
@@ -133,9 +156,14 @@ class Batch(Skins):
             self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self.model], [r])
             pos, mat = r.asked_pos, r.asked_mat
             self.place_geoms(pos, mat, m.geom_pos, m.geom_quat)
-            x = self.skin.x
-            self._launch(rounds.look_ahead, x.shape, [self.skin.geoms.struct, x], [r])
-            self._launch(rounds.draw_near, self.nworld, [], [r])
+            skin, model, geoms = self.skin, self.skin.model, self.skin.geoms.struct
+            face, laws = model.outer.face, skin.data.laws.struct
+            seen = [face, model.sample, geoms, laws, skin.x]
+            self._launch(rounds.look_ahead, (len(face), self.nworld), seen, [r])
+            if model.has_core:
+                core = [model.core_vert, model.core(self.nworld).struct, geoms, self.model]
+                self._launch(rounds.look_down, (len(model.core_vert), self.nworld), core, [r])
+            self._launch(rounds.draw_near, self.nworld, [self._solid, geoms, self.model], [r])
         if self.skin.inertial:
             skin, data = self.skin, self.skin.data
             arrays = [
@@ -183,40 +211,49 @@ class Batch(Skins):
         )
 
     def judge(self, again: wp.array) -> None:
-        """Sets again[0] where a skin is to be solved again, after `aim`."""
-        st = self.skin.data.worlds
-        self._launch(rounds.judge, self.nworld, [st.reason, st.iterations], [self._of_step, st.wanted, again])
+        """After `aim`: sets again[0] where a skin is to be solved again, or acts otherwise now; keeps the
+        models that came closest."""
+        st, r = self.skin.data.worlds, self._of_step
+        self._going.zero_()
+        how = [st.reason, st.iterations]
+        self._launch(rounds.judge, self.nworld, how, [r, st.wanted, self._going, again])
+        self.skin.keep_best(r.better)
+        self.skin.take_best(r.back)
 
     def solve_again(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Another round of the worlds that want one."""
-        self.skin.put_back()
-        self.solve_skins(m, d)
+
+        def solve():
+            self.skin.put_back()
+            self.solve_skins(m, d)
+
+        wp.capture_if(self._going, solve)
 
     def restrain(self, again: wp.array) -> None:
         """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
         changes how bodies move."""
-        self._settle(rounds.restrain, [self._last], [self._solid], [again])
+        self._settle(energy.restrain, [self._last], [self._solid], [again])
 
     def share_push(self) -> None:
         """Gives those as much push as they have energy for, after `aim` without any."""
-        self._settle(rounds.share_push)
+        self._settle(energy.share_push)
 
     def withhold(self, again: wp.array) -> None:
         """Takes it again where it still is too much, as `restrain`."""
-        self._settle(rounds.withhold, outputs=[again])
+        self._settle(energy.withhold, outputs=[again])
 
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
-        self._settle(rounds.conclude)
+        self._settle(energy.conclude, how=[self.skin.reason])
 
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""
-        self._launch(rounds.pass_by, self.nworld, [self._solid.area], [self._of_step])
+        self._launch(energy.pass_by, self.nworld, [self._solid.area], [self._of_step])
 
-    def _settle(self, kernel, last=(), solid=(), outputs=()):
+    def _settle(self, kernel, last=(), how=(), outputs=()):
         r = self._of_step
         self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
-        inputs = [self.model, *last, self._wrench, *solid]
+        inputs = [self.model, *last, self._wrench, *how]
         self._launch(kernel, self.nworld, inputs, [r, *outputs])
 
     def _find_wrenches(self, pos, mat, withheld, out):
@@ -232,6 +269,7 @@ class Hook:
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
         self._outside = None
+        self._fork = Fork(m.qpos0.device)
         self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
 
@@ -249,8 +287,7 @@ class Hook:
             self._passive(m, d)
         batches = [b for b in self.batches if b.active]
         self._any.zero_()
-        for batch in batches:
-            batch.predict(m, d, self._any)
+        self._fork.run([functools.partial(batch.predict, m, d, self._any) for batch in batches])
         moving = [b for b in batches if b.moving]
         for batch in batches:
             if batch not in moving:
@@ -272,8 +309,7 @@ class Hook:
                     lambda: [batch.pass_by() for batch in moving],
                 )
             self._act(m, d, moving)
-        for batch in batches:
-            batch.end_step()
+        self._fork.run([batch.end_step for batch in batches])
 
     def _find_balance(self, m, d, moving):
         """Models of the skins that hold where they lead, and that give no energy which is not there."""
@@ -284,11 +320,8 @@ class Hook:
             again.zero_()
             for batch in moving:
                 batch.judge(again)
-            wp.capture_if(again, solve)
-
-        def solve():
             for batch in moving:
-                wp.capture_if(batch.rest.any, functools.partial(batch.solve_again, m, d))
+                batch.solve_again(m, d)
 
         def withhold():
             self._accelerate(m, d, moving)
@@ -316,8 +349,9 @@ class Hook:
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)
+        self._fork.run([functools.partial(batch.act, m, d) for batch in moving])
         for batch in moving:
-            batch.act(m, d)
+            batch.add_forces(d)
 
     def _accelerate(self, m, d, moving, first=False):
         """Where the bodies go under the present models."""
@@ -327,8 +361,7 @@ class Hook:
         mjw.fwd_acceleration(m, d, factorize=first)
         mjw.solve(m, d)
         wp.copy(d.qacc_warmstart, d.qacc)
-        for batch in moving:
-            batch.aim(d)
+        self._fork.run([functools.partial(batch.aim, d) for batch in moving])
 
     def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
         from mujoco_warp._src.types import Stage
@@ -336,9 +369,11 @@ class Hook:
         if self._sensor:
             self._sensor(m, d, stage)
         if stage == Stage.VEL:
-            for batch in self.batches:
-                if batch.active:
-                    batch.sense(d.sensordata)
+            batches = [batch for batch in self.batches if batch.active]
+            self._fork.run([batch.look for batch in batches])
+            for batch in batches:
+                batch.solve_film()
+            self._fork.run([functools.partial(batch.sense, d.sensordata) for batch in batches])
 
 
 def _begin_dynamics(m, d):

@@ -13,8 +13,10 @@ __all__ = [
     "add_forces",
     "advance_core",
     "advance_groups",
+    "find_drift",
     "find_rows",
     "follow",
+    "relative_jacobians",
     "write_rows",
 ]
 
@@ -54,46 +56,70 @@ def advance_groups(
     body: wp.array(dtype=int),
     h: real,
     rootid: wp.array(dtype=int),
-    isdofancestor: wp.array2d(dtype=int),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
     com: wp.array2d(dtype=wp.vec3),
     cvel: wp.array2d(dtype=wp.spatial_vector),
-    cdof: wp.array2d(dtype=wp.spatial_vector),
-    qvel: wp.array2d(dtype=float),
     # Out:
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
-    jacobian_out: wp.array3d(dtype=vec6),
-    drift_out: wp.array2d(dtype=vec6),
 ):
-    """Poses of the touching bodies after h at present velocities [group, world], their Jacobians relative to
-    the BioTac, and their motion h J v."""
+    """Poses of the touching bodies after h at present velocities [group, world]."""
     g, w = wp.tid()
     b = body[g]
-    frame = _ahead_mat(core, w, h, xmat, cvel)
+    frame = wp.transpose(_ahead_mat(core, w, h, xmat, cvel))
     origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
-    pos = wp.transpose(frame) * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
-    mat = wp.transpose(frame) * _ahead_mat(b, w, h, xmat, cvel)
-    pos_out[g, w] = pos
-    mat_out[g, w] = mat
-    finite = is_finite(pos, mat)  # what is lost takes no part in the dynamics
-    turn = wp.transpose(matrix(xmat[w, core]))
-    here = vector(xpos[w, core])
+    pos_out[g, w] = frame * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
+    mat_out[g, w] = frame * _ahead_mat(b, w, h, xmat, cvel)
+
+
+@wp.kernel
+def relative_jacobians(
+    # In:
+    core: int,
+    body: wp.array(dtype=int),
+    rootid: wp.array(dtype=int),
+    isdofancestor: wp.array2d(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    com: wp.array2d(dtype=wp.vec3),
+    cdof: wp.array2d(dtype=wp.spatial_vector),
+    pos: wp.array2d(dtype=vec3),
+    mat: wp.array2d(dtype=mat33),
+    # Out:
+    jacobian_out: wp.array3d(dtype=vec6),
+):
+    """Jacobians of the touching bodies relative to the BioTac, column i by thread i; pos, mat of
+    `advance_groups`."""
+    g, w, i = wp.tid()
+    b = body[g]
+    share = real(isdofancestor[b, i] - isdofancestor[core, i])
+    # the bodies' own columns differ in sign alone: both are about the BioTac's origin
+    j = vec6()
+    if share != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
+        turn = wp.transpose(matrix(xmat[w, core]))
+        spin = vector(wp.spatial_top(cdof[w, i]))
+        arm = vector(xpos[w, core]) - vector(com[w, rootid[wp.where(share > real(0.0), b, core)]])
+        linear = share * (turn * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        angular = share * (turn * spin)
+        j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
+    jacobian_out[g, w, i] = j
+
+
+@wp.kernel
+def find_drift(
+    # In:
+    h: real,
+    jacobian: wp.array3d(dtype=vec6),
+    qvel: wp.array2d(dtype=float),
+    # Out:
+    drift_out: wp.array2d(dtype=vec6),
+):
+    """Motion h J v of the touching bodies [group, world]."""
+    g, w = wp.tid()
     drift = vec6()
-    for i in range(jacobian_out.shape[2]):
-        share = real(
-            isdofancestor[b, i] - isdofancestor[core, i]
-        )  # the bodies' own columns differ in sign alone: both are about `here`
-        j = vec6()
-        if finite and share != real(0.0):
-            spin = vector(wp.spatial_top(cdof[w, i]))
-            arm = here - vector(com[w, rootid[wp.where(share > real(0.0), b, core)]])
-            linear = share * (turn * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
-            angular = share * (turn * spin)
-            j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
-        jacobian_out[g, w, i] = j
-        drift += h * real(qvel[w, i]) * j
+    for i in range(jacobian.shape[2]):
+        drift += h * real(qvel[w, i]) * jacobian[g, w, i]
     drift_out[g, w] = drift
 
 
@@ -231,8 +257,10 @@ def write_rows(
     aref_out: wp.array2d(dtype=float),
     pos_out: wp.array2d(dtype=float),
 ):
-    """h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L."""
-    s, w = wp.tid()
+    """h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L.
+
+    Each thread writes one column of the rows: loads and stores in turn take ten times the sums."""
+    s, w, n = wp.tid()
     first = row[s, w]
     if first < 0:
         return
@@ -251,13 +279,12 @@ def write_rows(
                 column[i] = S[i, k] / pivot
             S -= pivot * wp.outer(column, column)
         r = first + k
-        D_out[w, r] = float(wp.max(h2 * pivot, _NEGLIGIBLE))
-        aref_out[w, r] = 0.0
-        pos_out[w, r] = 0.0
-        if sparse == 1:
-            for n in range(rownnz[w, r]):
-                at = rowadr[w, r] + n
-                J_out[w, 0, at] = float(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))
-        else:
-            for i in range(jacobian.shape[2]):
-                J_out[w, r, i] = float(wp.dot(column, jacobian[group, w, i]))
+        if n == 0:
+            D_out[w, r] = float(wp.max(h2 * pivot, _NEGLIGIBLE))
+            aref_out[w, r] = 0.0
+            pos_out[w, r] = 0.0
+        if sparse == 0:
+            J_out[w, r, n] = float(wp.dot(column, jacobian[group, w, n]))
+        elif n < rownnz[w, r]:
+            at = rowadr[w, r] + n
+            J_out[w, 0, at] = float(wp.dot(column, jacobian[group, w, colind[w, 0, at]]))

@@ -8,8 +8,9 @@ import warp as wp
 
 from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
 from ..sensor.channels import NELECTRODE, NPAC
+from ..skin.contact.faces import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
-from .rigid import displace, matrix, motion, vector
+from .rigid import matrix, motion, vector
 
 __all__ = [
     "Model",
@@ -134,14 +135,14 @@ def accept_models(
     tangent: wp.array2d(dtype=mat66),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
+    geoms: Geoms,
     last: Model,
     # Out:
     model: Model,
 ):
-    """The linear models of skins that were asked for poses pos, mat: where their way ended, which began at
-    the last step's model; that model, where there was no way; no force on what is nowhere.
-
-    A world's first step has not `began`: its way came from outside."""
+    """The linear models of skins that were asked for poses pos, mat: where their way ended; the last step's,
+    where there was no way; of the first one, which came from outside, where it was to end; no force on
+    what is nowhere."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
@@ -155,11 +156,15 @@ def accept_models(
         model.wrench0[g, w] = last.wrench0[g, w]
         model.tangent0[g, w] = last.tangent0[g, w]
     else:
+        p = pos[g, w]
+        R = mat[g, w]
         if began[w] == 1 and far < real(1.0):
-            p, R = displace(p, R, far * motion(pos[g, w], mat[g, w], p, R))
-        else:
-            p = pos[g, w]
-            R = mat[g, w]
+            k = int(0)
+            while geoms.group[k] != g:
+                k += 1
+            turn = geoms.mat_last[k, w] * wp.transpose(geoms.mat[k, w])
+            p = turn * (p - geoms.pos[k, w]) + geoms.pos_last[k, w]
+            R = turn * R
         model.wrench0[g, w] = wrench[g, w]
         model.tangent0[g, w] = tangent[g, w]
     model.pos0[g, w] = p
@@ -262,26 +267,25 @@ def write_sensors(
     sensordata_out: wp.array2d(dtype=float),
 ):
     """Readings at the addresses of electrodes, pdc, pac, tac, tdc, contact_force and status; -1: the model
-    has no such sensor."""
-    w = wp.tid()
-    if address[0] >= 0:
-        for e in range(NELECTRODE):
-            sensordata_out[w, address[0] + e] = float(state[w, HELD + e])
+    has no such sensor. Each thread writes one number of every channel that has as many."""
+    w, i = wp.tid()
+    if address[0] >= 0 and i < NELECTRODE:
+        sensordata_out[w, address[0] + i] = float(state[w, HELD + i])
+    if address[2] >= 0 and i < NPAC:
+        sensordata_out[w, address[2] + i] = float(state[w, PAC + i])
+    if address[5] >= 0 and i < 6:
+        total = real(0.0)
+        for g in range(wrench.shape[0]):
+            total += wrench[g, w][i]
+        sensordata_out[w, address[5] + i] = float(-total)
+    if i > 0:
+        return
     if address[1] >= 0:
         sensordata_out[w, address[1]] = float(state[w, HELD_PDC])
-    if address[2] >= 0:
-        for k in range(NPAC):
-            sensordata_out[w, address[2] + k] = float(state[w, PAC + k])
     if address[3] >= 0:
         sensordata_out[w, address[3]] = float(state[w, HELD_TAC])
     if address[4] >= 0:
         sensordata_out[w, address[4]] = float(state[w, HELD_TDC])
-    if address[5] >= 0:
-        total = vec6()
-        for g in range(wrench.shape[0]):
-            total += wrench[g, w]
-        for i in range(6):
-            sensordata_out[w, address[5] + i] = float(-total[i])
     if address[6] >= 0:
         good = float(0.0)
         if reason[w] == CONVERGED and settled[w] == 1:

@@ -1,13 +1,22 @@
-"""What decides in the rounds of a coupled step, and how much energy a skin may give: `coupling/world.py` and
-`coupling/coupled.py` for all worlds at once, one thread each.
+"""What decides where the rounds of a coupled step go: `coupling/world.py` and `coupling/coupled.py` for all
+worlds at once, one thread each. What energy they may give: `energy`.
 
 Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ..coupling.coupled import DEEPER, TELEPORT
-from ..coupling.world import CLOSER, LEAST_STEP, TOLERANCE
-from ..skin.contact.faces import Geoms
+from ..coupling.coupled import DEEPER, LONG, MOST, TELEPORT
+from ..coupling.fem import HARD
+from ..coupling.instance import FITS
+from ..coupling.rules import (
+    MAX_ROUNDS,
+    TOLERANCE,
+    Seen,
+    accelerated,
+    next_share,
+    place_of,
+)
+from ..skin.contact.faces import Geoms, Laws
 from ..skin.contact.shapes import distance_bound
 from ..skin.newton.worlds import CONVERGED
 from .kernels import Model, wrench_at
@@ -16,18 +25,16 @@ from .rigid import LEVER, displace, is_finite, motion, size_of
 __all__ = [
     "SHARES",
     "Rounds",
+    "Solid",
     "ask",
     "begin_rounds",
     "change_forces",
-    "conclude",
     "draw_near",
+    "force_of",
     "judge",
     "look",
     "look_ahead",
-    "pass_by",
-    "restrain",
-    "share_push",
-    "withhold",
+    "look_down",
     "wrenches",
 ]
 
@@ -39,14 +46,13 @@ mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
-_MAX_ROUNDS = 6
-_TOLERANCE, _CLOSER, _LEAST_STEP, _DEEPER, _TELEPORT = (
-    wp.constant(wp.float64(x)) for x in (TOLERANCE, CLOSER, LEAST_STEP, DEEPER, TELEPORT)
+_TOLERANCE, _DEEPER, _TELEPORT, _FITS = (
+    wp.constant(wp.float64(x)) for x in (TOLERANCE, DEEPER, TELEPORT, FITS)
 )
-_MOST_ITERATIONS = 60  # of the skin's solver in a step, after which the last model must do
-_BISECTIONS = 12
-_TRIALS = 4
-_CAUTION = wp.constant(wp.float64(0.9))
+_MAX_ROUNDS = wp.constant(MAX_ROUNDS)
+_next_share = wp.func(next_share)
+# of the skin's solver in a solve and in a step, after which the closest model must do
+_LONG, _MOST = (wp.constant(int(share * HARD)) for share in (LONG, MOST))
 SHARES = 8  # of a way that crosses the skin are looked at
 
 
@@ -73,12 +79,22 @@ class Rounds:
     settled: wp.array(dtype=int)  # the skin was solved where the bodies go
     rounds: wp.array(dtype=int)  # solves of the skin
     spent: wp.array(dtype=int)  # iterations of its solver
+    seen: Seen
+    best: wp.array(dtype=real)  # [m] `off` of the model that came closest
+    found: wp.array(dtype=int)  # it is that of a balance
+    better: wp.array(dtype=int)  # it is the present one
+    back: wp.array(dtype=int)  # it must do
+    ended: wp.array(dtype=int)  # no more rounds
     began: wp.array(dtype=int)  # a step was made since the reset
     placed: wp.array(dtype=int)  # bodies were put where they are from outside
     inside: wp.array(dtype=int)  # and into the skin
+    open: wp.array(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
+    untouched: wp.array(dtype=int)  # the skin that the way begins at
     far: wp.array(dtype=int)  # so far the bodies go from where nothing touches that they may cross the skin
     depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
+    down: wp.array(dtype=int)  # so far they go from where something touches that they may come to the core
+    clearance: wp.array3d(dtype=real)  # [m] of the geoms from it on that way [share, geom, world]
     off: wp.array(dtype=real)  # [m] how far the bodies go from where the skin was solved
     share: wp.array(dtype=real)  # of the way between them that the next round goes
     push: wp.array(dtype=real)  # of the wrench at the present pose that acts: less than 1 where not paid for
@@ -94,9 +110,12 @@ class Rounds:
 
 @wp.struct
 class Solid:
-    """Of the skin: from its outside to the core at most [m], its outer area [m^2], whether it has inertia."""
+    """Of the skin: from its outside to the core at most [m], how deep in it no skin fits [m], whether there
+    is one; its outer area [m^2], whether it has inertia."""
 
     thickness: real
+    core_depth: real
+    core: int
     area: real
     inertial: int
 
@@ -137,6 +156,8 @@ def wrenches(
 def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     w = wp.tid()
     r.placed[w] = 1 - r.began[w]
+    if r.began[w] == 0:
+        r.open[w] = 0
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
         if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.drift[g, w])):
@@ -149,28 +170,21 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     r.settled[w] = 1
     r.rounds[w] = 1 - awake[w]
     r.spent[w] = 0
+    r.seen.count[w] = 0
+    r.best[w] = real(wp.inf)
+    r.found[w] = 0
+    r.better[w] = 0
+    r.back[w] = 0
+    r.ended[w] = 0
     r.off[w] = real(wp.inf)
     r.share[w] = real(1.0)
     r.push[w] = real(1.0)
 
 
 @wp.func
-def within_reach(r: Rounds, model: Model, w: int):
-    """Share of the way from the model's pose to the asked ones that leads no deeper than is known; and
-    whether anything touches there."""
-    touched = int(0)
-    depth = real(0.0)
-    for g in range(r.pos.shape[0]):
-        wrench = model.wrench0[g, w]
-        force = force_of(wrench)
-        if force > real(0.0):
-            touched = 1
-            way = motion(r.asked_pos[g, w], r.asked_mat[g, w], model.pos0[g, w], model.mat0[g, w])
-            depth = wp.max(depth, -wp.dot(wrench, way) / force)
-    share = real(1.0)
-    if touched == 1 and depth > _DEEPER:
-        share = _DEEPER / depth
-    return share, touched
+def levelled(m: vec6, lever: real):
+    """A small motion in which turning compares with going."""
+    return vec6(m[0], m[1], m[2], lever * m[3], lever * m[4], lever * m[5])
 
 
 @wp.kernel
@@ -181,86 +195,223 @@ def ask(
     # In and out:
     r: Rounds,
 ):
-    """Where the skins of the wanted worlds are solved next: where their bodies go, or a share of the way from
-    where they were solved before."""
+    """Where the skins of the wanted worlds are solved next: where their bodies go in the end, as far as
+    earlier rounds tell, and a share of the way that these do not explain."""
     w = wp.tid()
     if wanted[w] == 0:
         return
+    now = place_of(r.seen, w)
     for g in range(r.pos.shape[0]):
         p = r.pos[g, w]
         R = r.mat[g, w]
-        if r.rounds[w] > 0 and r.share[w] < real(1.0):
+        done = vec6()
+        left = vec6()
+        if r.rounds[w] > 0 and is_finite(p, R):
             p0 = r.asked_pos[g, w]
             R0 = r.asked_mat[g, w]
-            p, R = displace(p0, R0, r.share[w] * motion(p, R, p0, R0))
+            done = levelled(motion(p0, R0, r.start_pos[g, w], r.start_mat[g, w]), real(LEVER))
+            left = levelled(motion(p, R, p0, R0), real(LEVER))
+        r.seen.x[now, g, w] = done
+        r.seen.residual[now, g, w] = left
+    if r.rounds[w] > 0:
+        accelerated(r.seen, w, r.share[w])
+    for g in range(r.pos.shape[0]):
+        p = r.pos[g, w]
+        R = r.mat[g, w]
+        if r.rounds[w] > 0 and is_finite(p, R):
+            way = levelled(r.seen.to[g, w], real(1.0) / real(LEVER))
+            p, R = displace(r.start_pos[g, w], r.start_mat[g, w], way)
         r.asked_pos[g, w] = p
         r.asked_mat[g, w] = R
-    near, touched = within_reach(r, model, w)
-    if near < real(1.0):
-        for g in range(r.pos.shape[0]):
-            p0 = model.pos0[g, w]
-            R0 = model.mat0[g, w]
-            p, R = displace(p0, R0, near * motion(r.asked_pos[g, w], r.asked_mat[g, w], p0, R0))
-            r.asked_pos[g, w] = p
-            r.asked_mat[g, w] = R
+    r.untouched[w] = 1
     far = real(0.0)
+    down = real(0.0)
     for g in range(r.pos.shape[0]):
-        way = motion(r.asked_pos[g, w], r.asked_mat[g, w], r.here_pos[g, w], r.here_mat[g, w])
-        far = wp.max(far, size_of(way))
+        p = r.asked_pos[g, w]
+        R = r.asked_mat[g, w]
+        far = wp.max(far, size_of(motion(p, R, r.here_pos[g, w], r.here_mat[g, w])))
+        down = wp.max(down, size_of(motion(p, R, model.pos0[g, w], model.mat0[g, w])))
+        if force_of(model.wrench0[g, w]) > real(0.0):
+            r.untouched[w] = 0
     r.far[w] = 0
-    if touched == 0 and far > _DEEPER:
+    r.down[w] = 0
+    if r.untouched[w] == 1 and far > _DEEPER:
         r.far[w] = 1
     if r.rounds[w] == 0 and r.placed[w] == 1:
         r.far[w] = 1
+    elif r.untouched[w] == 0 and down > _DEEPER:
+        r.down[w] = 1
     for k in range(r.depth.shape[0]):
         r.depth[k, w] = real(-1.0)
+        for g in range(r.clearance.shape[1]):
+            r.clearance[k, g, w] = real(1.0)
     r.rounds[w] = r.rounds[w] + 1
+
+
+@wp.func
+def distance_on_the_way(
+    p: vec3, share: int, pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, geoms: Geoms, g: int, w: int
+):
+    """Of a point from a geom, posed for its body at pos, mat, when that has gone a share of its way there."""
+    way = motion(pos, mat, pos0, mat0)
+    p1, R1 = displace(pos0, mat0, real(share) / real(SHARES) * way)
+    y = mat * (wp.transpose(R1) * (p - p1)) + pos - geoms.pos[g, w]
+    y = wp.transpose(geoms.mat[g, w]) * y
+    return distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
 
 
 @wp.kernel
 def look_ahead(
     # In:
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
     geoms: Geoms,
+    laws: Laws,
     x: wp.array2d(dtype=vec3),
     # In and out:
     r: Rounds,
 ):
-    """How deep nodes of the skin, where it is, would be in the bodies on their way to where they are asked
-    to."""
-    i, w = wp.tid()
+    """How deep the skin, where it is, would be in the bodies on their way to where they are asked to."""
+    f, w = wp.tid()
     if r.far[w] == 0:
         return
+    reach = real(0.0)
+    if laws.reach.shape[0] > 0:
+        reach = laws.reach[w]
+    t = face[f]
     for g in range(geoms.count):
         k = geoms.group[g]
-        pos = r.asked_pos[k, w]
-        mat = r.asked_mat[k, w]
-        way = motion(pos, mat, r.here_pos[k, w], r.here_mat[k, w])
         for s in range(r.depth.shape[0]):
-            p, R = displace(r.here_pos[k, w], r.here_mat[k, w], real(s) / real(SHARES) * way)
-            y = mat * (wp.transpose(R) * (x[i, w] - p)) + pos - geoms.pos[g, w]
-            y = wp.transpose(geoms.mat[g, w]) * y
-            d = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-            wp.atomic_max(r.depth, s, w, -d)
+            depth = real(-1.0)
+            for n in range(sample.shape[0]):
+                b = sample[n]
+                p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+                d = distance_on_the_way(
+                    p,
+                    s,
+                    r.here_pos[k, w],
+                    r.here_mat[k, w],
+                    r.asked_pos[k, w],
+                    r.asked_mat[k, w],
+                    geoms,
+                    g,
+                    w,
+                )
+                depth = wp.max(depth, reach - d)
+            wp.atomic_max(r.depth, s, w, depth)
 
 
 @wp.kernel
-def draw_near(r: Rounds):
-    """Leaves so much of a way from where nothing touches that the bodies are no deeper in the skin than one
-    round goes."""
-    w = wp.tid()
-    if r.far[w] == 0:
+def look_down(
+    # In:
+    vert: wp.array(dtype=vec3),
+    core: Geoms,
+    geoms: Geoms,
+    model: Model,
+    # In and out:
+    r: Rounds,
+):
+    """How far the geoms would be from the core on their way from where the skin is known; as
+    `NearSearch.clearance` of one world."""
+    i, w = wp.tid()
+    if r.down[w] == 0:
         return
-    if r.rounds[w] == 1 and r.depth[0, w] <= real(0.0):
-        r.inside[w] = 0
+    for g in range(geoms.count):
+        k = geoms.group[g]
+        pos0 = model.pos0[k, w]
+        mat0 = model.mat0[k, w]
+        pos = r.asked_pos[k, w]
+        mat = r.asked_mat[k, w]
+        for s in range(r.clearance.shape[0]):
+            d = distance_on_the_way(vert[i], s, pos0, mat0, pos, mat, geoms, g, w)
+            kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
+            if i == 0 and distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], vec3()) < real(
+                0.0
+            ):
+                way = motion(pos, mat, pos0, mat0)
+                p1, R1 = displace(pos0, mat0, real(s) / real(SHARES) * way)
+                c = R1 * (wp.transpose(mat) * (geoms.pos[g, w] - pos)) + p1
+                inside = distance_bound(
+                    core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], c
+                )
+                if inside < real(0.0):
+                    d = wp.min(d, inside)
+            wp.atomic_min(r.clearance, s, g, w, d)
+
+
+@wp.func
+def clear_share(r: Rounds, w: int):
+    """Of a way, after which about the bodies meet the skin."""
     share = real(1.0)
+    if r.depth[0, w] > real(0.0):
+        share = real(0.0)
     for s in range(r.depth.shape[0] - 1):
         before = r.depth[s, w]
         after = r.depth[s + 1, w]
-        if share == real(1.0) and before <= _DEEPER and after > _DEEPER:
-            share = (real(s) + (_DEEPER - before) / (after - before)) / real(SHARES)
+        if share == real(1.0) and after > real(0.0):
+            share = (real(s) - before / (after - before)) / real(SHARES)
+    return share
+
+
+@wp.func
+def share_down(r: Rounds, solid: Solid, w: int):
+    """As `Instance.share_down`: of a way, on which no geom goes deeper by more than is known, nor to where no
+    skin fits; what slides there is not held."""
+    share = real(1.0)
+    near = real(wp.inf)
+    for s in range(r.clearance.shape[0]):
+        deep = real(-wp.inf)
+        for g in range(r.clearance.shape[1]):
+            known = r.clearance[0, g, w] + solid.core_depth
+            allowed = wp.max(wp.min(known, solid.thickness) - _DEEPER, _FITS)
+            allowed = wp.min(allowed, known - _FITS)
+            deep = wp.max(deep, allowed - r.clearance[s, g, w] - solid.core_depth)
+        if share == real(1.0) and deep > real(0.0):
+            share = (real(s - 1) + near / (near + deep)) / real(SHARES)
+        near = -deep
+    return share
+
+
+@wp.kernel
+def draw_near(solid: Solid, geoms: Geoms, model: Model, r: Rounds):
+    """Leaves so much of a way that the bodies are no deeper in the skin than one round goes. Where nothing
+    touched it before, friction knows of their way from about where they meet it."""
+    w = wp.tid()
+    if r.far[w] == 0 and r.down[w] == 0:
+        return
+    share = real(1.0)
+    if r.far[w] == 1:
+        if r.rounds[w] == 1 and r.depth[0, w] <= real(0.0):
+            r.inside[w] = 0
+        met = clear_share(r, w)
+        way = real(0.0)
+        for g in range(r.pos.shape[0]):
+            there = motion(r.asked_pos[g, w], r.asked_mat[g, w], r.here_pos[g, w], r.here_mat[g, w])
+            way = wp.max(way, size_of(there))
+        share = wp.min(met + _DEEPER / wp.max(way, _DEEPER), real(1.0))
+        if r.untouched[w] == 1 and met > real(0.0):
+            for g in range(geoms.count):
+                k = geoms.group[g]
+                pos = r.asked_pos[k, w]
+                mat = r.asked_mat[k, w]
+                p, R = displace(
+                    r.here_pos[k, w],
+                    r.here_mat[k, w],
+                    met * motion(pos, mat, r.here_pos[k, w], r.here_mat[k, w]),
+                )
+                turn = R * wp.transpose(mat)
+                geoms.pos_last[g, w] = turn * (geoms.pos[g, w] - pos) + p
+                geoms.mat_last[g, w] = turn * geoms.mat[g, w]
+    elif solid.core == 1:
+        share = share_down(r, solid, w)
+    if share == real(1.0):
+        return
     for g in range(r.pos.shape[0]):
         p0 = r.here_pos[g, w]
         R0 = r.here_mat[g, w]
+        if r.down[w] == 1:
+            p0 = model.pos0[g, w]
+            R0 = model.mat0[g, w]
         p, R = displace(p0, R0, share * motion(r.asked_pos[g, w], r.asked_mat[g, w], p0, R0))
         r.asked_pos[g, w] = p
         r.asked_mat[g, w] = R
@@ -332,189 +483,40 @@ def judge(
     # In and out:
     r: Rounds,
     wanted: wp.array(dtype=int),
+    going: wp.array(dtype=int),
     again: wp.array(dtype=int),
 ):
-    """After MuJoCo's answer to the models: which worlds go again, and how far.
+    """After MuJoCo's answer to the models: which worlds go again, and how far; which take the model back that
+    came closest.
 
-    Another solve after one that found no balance, which took long, is not worth its cost.
+    Another solve after one that found no balance, or took long, is not worth its cost.
     """
     w = wp.tid()
     r.spent[w] = r.spent[w] + wanted[w] * iterations[w]
     wanted[w] = 0
+    r.better[w] = 0
+    r.back[w] = 0
     if r.settled[w] == 1:
         return
     off = distance_off(r, w)
     if off < _TOLERANCE:
         r.settled[w] = 1
-    elif reason[w] == CONVERGED and r.spent[w] < _MOST_ITERATIONS and r.rounds[w] < _MAX_ROUNDS:
-        share = wp.min(real(1.0), real(2.0) * r.share[w])
-        if off > _CLOSER * r.off[w]:
-            share = wp.max(real(0.5) * r.share[w], _LEAST_STEP)
-        r.share[w] = share
-        r.off[w] = off
-        wanted[w] = 1
-        again[0] = 1
-
-
-@wp.func
-def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
-    """What acts on a body, as MuJoCo takes it: linear in the accelerations, from its wrench without them."""
-    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w]
-
-
-@wp.func
-def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Work of what acts on the bodies on their way [J]."""
-    work = real(0.0)
-    for g in range(r.pos.shape[0]):
-        work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
-    return work
-
-
-@wp.func
-def most_energy(r: Rounds, force: real, solid: Solid, w: int):
-    """The most that a skin which pushes with so much force can hold: over the whole way to the core [J]."""
-    if solid.inertial == 1:
-        return real(wp.inf)
-    most = solid.thickness * force
-    if r.surface.shape[0] > 0:
-        most += r.surface[w] * solid.area
-    return most
-
-
-@wp.func
-def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Whether what acts gives more energy than there is."""
-    return given(r, model, wrench, w) > wp.max(r.store[w], real(0.0))
-
-
-@wp.kernel
-def restrain(
-    # In:
-    model: Model,
-    last: Model,
-    wrench: wp.array2d(dtype=vec6),
-    solid: Solid,
-    # In and out:
-    r: Rounds,
-    again: wp.array(dtype=int),
-):
-    """Finds the energy in the skins, and takes the push of those that would give more.
-
-    What remains without it is the skin's tangent about the present pose: a damper. The energy is that of the
-    last step, and what those have put in who have moved bodies since.
-    """
-    w = wp.tid()
-    before = real(0.0)
-    now = real(0.0)
-    pushed = real(0.0)
-    pushes = real(0.0)
-    for g in range(r.pos.shape[0]):
-        jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
-        acts = acting(r, model, wrench, g, w)
-        before += wp.dot(last.wrench0[g, w], jump)
-        now += wp.dot(acts, jump)
-        pushed += force_of(last.wrench0[g, w])
-        pushes += force_of(acts)
-        r.full_wrench[g, w] = acts
-        r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
-    store = r.store[w] - wp.min(before, now)
-    if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with
-        store = real(0.0)
-        if r.inside[w] == 1 or solid.inertial == 1:
-            store = most_energy(r, pushes, solid, w)
-        elif r.surface.shape[0] > 0:
-            store = r.surface[w] * solid.area
-    # a solve that lost its way knows little of the force that was there before it
-    r.most[w] = most_energy(r, wp.max(pushed, pushes), solid, w)
-    r.store[w] = wp.min(store, r.most[w])
-    if overdraws(r, model, wrench, w):
-        r.push[w] = real(0.0)
-        again[0] = 1
-
-
-@wp.kernel
-def share_push(
-    # In:
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    r: Rounds,
-):
-    """As much push as there is energy for, of skins without any: what acts, and how bodies move, is linear in
-    it while no other contact changes."""
-    w = wp.tid()
-    if r.push[w] == real(1.0):
-        return
-    # of the work: without push, with all of it, and half of the curve between them
-    none = given(r, model, wrench, w)
-    full = real(0.0)
-    bend = real(0.0)
-    for g in range(r.pos.shape[0]):
-        full += wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
-        change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
-        bend += wp.dot(change, r.full_motion[g, w] - r.drift[g, w] - r.moved[g, w])
-    low = real(0.0)
-    high = real(1.0)
-    for _ in range(_BISECTIONS):
-        p = real(0.5) * (low + high)
-        if none + p * (full - none - bend) + p * p * bend > wp.max(r.store[w], real(0.0)):
-            high = p
+    elif r.ended[w] == 0:
+        balanced = wp.where(reason[w] == CONVERGED, 1, 0)
+        # what was found counts before what was not
+        if balanced > r.found[w] or (balanced == r.found[w] and off < r.best[w]):
+            r.better[w] = 1
+            r.found[w] = balanced
+            r.best[w] = off
+        quick = iterations[w] < _LONG and r.spent[w] < _MOST and r.rounds[w] < _MAX_ROUNDS
+        if balanced == 1 and quick:
+            r.share[w] = _next_share(r.share[w], off, r.off[w])
+            r.off[w] = off
+            wanted[w] = 1
+            going[0] = 1
+            again[0] = 1
         else:
-            low = p
-    r.push[w] = low
-    r.without[w] = none
-    r.trial[w] = 0
-
-
-@wp.kernel
-def withhold(
-    # In:
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    r: Rounds,
-    again: wp.array(dtype=int),
-):
-    """Withholds more where a share of the push still gives too much, at last all."""
-    w = wp.tid()
-    if r.push[w] == real(1.0) or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
-        return
-    none = r.without[w]
-    room = (wp.max(r.store[w], real(0.0)) - none) / (given(r, model, wrench, w) - none)
-    r.push[w] = _CAUTION * room * r.push[w]
-    r.trial[w] = r.trial[w] + 1
-    if r.trial[w] == _TRIALS:
-        r.push[w] = real(0.0)
-    again[0] = 1
-
-
-@wp.kernel
-def conclude(
-    # In:
-    model: Model,
-    wrench: wp.array2d(dtype=vec6),
-    # In and out:
-    r: Rounds,
-):
-    """Keeps the energy that is left, and where the bodies go."""
-    w = wp.tid()
-    # what is withheld is in the skin all the same
-    r.store[w] = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
-    for g in range(r.pos.shape[0]):
-        r.end_pos[g, w] = r.pos[g, w]
-        r.end_mat[g, w] = r.mat[g, w]
-
-
-@wp.kernel
-def pass_by(area: real, r: Rounds):
-    """Instead of all rounds where no skin takes part: bodies go where they go, a skin has the energy of its
-    adhesion."""
-    w = wp.tid()
-    r.store[w] = real(0.0)
-    if r.surface.shape[0] > 0:
-        r.store[w] = r.surface[w] * area
-    r.passed[w] = 1
-    for g in range(r.pos.shape[0]):
-        r.end_pos[g, w] = r.start_pos[g, w]
-        r.end_mat[g, w] = r.start_mat[g, w]
+            r.ended[w] = 1
+            r.back[w] = 1 - r.better[w]
+            if r.back[w] == 1:
+                again[0] = 1

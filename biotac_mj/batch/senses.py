@@ -215,28 +215,35 @@ class Senses:
         if self.vibration:
             self._touched.begin()
 
-    def advance(self, wrench: wp.array, tangent: wp.array, awake: wp.array) -> wp.array:
+    def look(self, wrench: wp.array, tangent: wp.array, awake: wp.array) -> None:
         """After it; wrench, tangent (ngroup, nworld) of the skins ON the bodies, awake (nworld,) int, 1 where
-        the skin may have moved. Returns the states (nworld, NSTATE)."""
-        skin, acquisition = self._skin, self.acquisition
+        the skin may have moved: heat, and which worlds want their film. Launches only."""
         if self._touched:
             self._touched.end(wrench, tangent)
         if self.heat:
             self.heat.advance(self._dt)
-        due = acquisition.find_due(self._dt)
-        if isinstance(self.film, BatchFilm):  # a network may remember, and sees every frame
+        self._due = due = self.acquisition.find_due(self._dt)
+        if isinstance(self.film, BatchFilm):
             self._any.zero_()
             outputs = [self._known, self._changed, self._any]
-            wp.launch(find_changed, skin.nworld, [due, awake], outputs, device=due.device)
-            wp.capture_if(self._any, lambda: self.film.solve_film(skin.x, self._changed))
-        else:
-            self.film.solve_film(skin.x, due)
+            wp.launch(find_changed, self._skin.nworld, [due, awake], outputs, device=due.device)
+
+    def solve_film(self) -> None:
+        """The films that are wanted, after `look`."""
+        if isinstance(self.film, BatchFilm):
+            wp.capture_if(self._any, lambda: self.film.solve_film(self._skin.x, self._changed))
+        else:  # a network may remember, and sees every frame
+            self.film.solve_film(self._skin.x, self._due)
+
+    def sample(self) -> wp.array:
+        """The step's slots, after `solve_film`; returns the states (nworld, NSTATE). Launches only."""
         shaken = None
         if self.vibration:
             self.vibration.advance(self._dt)
             shaken = self.vibration.pressure
-        acquisition.advance(self._dt, self.film.impedance, self.film.valid, skin.pressure, shaken)
-        return acquisition.state
+        film = self.film
+        self.acquisition.advance(self._dt, film.impedance, film.valid, self._skin.pressure, shaken)
+        return self.acquisition.state
 
 
 def _begin(row, temperature, cold):

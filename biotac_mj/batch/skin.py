@@ -88,7 +88,7 @@ class BatchSkin:
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
             self.fresh = wp.full(nworld, 1, dtype=int)
-            self._rest, self._kept = self.data.rest_vert, {}
+            self._rest, self._kept, self._best = self.data.rest_vert, {}, []
 
     @property
     def nbytes(self) -> int:
@@ -121,11 +121,16 @@ class BatchSkin:
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
 
-    def prepare_keep(self) -> None:
-        """Allocates what `keep` needs."""
+    def prepare_keep(self, also: list) -> None:
+        """Allocates what `keep` and `keep_best` need. also: arrays [item, world] that the latter keeps
+        too."""
+        st = self.data.worlds
+        found = [self.wrench, self.tangent, self.pressure, st.pressure, st.reached]
+        found += [self.reason, self.iterations, self.error]
         for array in self._memory():
             if array.size:
                 self._kept[array.ptr] = array, wp.empty_like(array)
+        self._best = [(a, wp.empty_like(a)) for a in [*self._memory(), *found, *also] if a.size]
 
     def keep(self) -> None:
         """Keeps what the skins remember, for `put_back`. Launches only."""
@@ -138,9 +143,21 @@ class BatchSkin:
         wanted = self.data.worlds.wanted
         last = self.data.increment.ptr, self.motion.ptr, self._touched_by.ptr
         for array, kept in self._kept.values():
-            now, then = _words(array), _words(kept)
-            given = [then, wanted, int(array.ptr in last), self.reason]
-            self._launch(kernels.put_back, now.shape[:2], given, [now])
+            self._copy(kept, array, wanted, int(array.ptr in last))
+
+    def keep_best(self, mask: wp.array) -> None:
+        """Keeps what the worlds of mask (nworld,) came to, for `take_best`. Launches only."""
+        for array, best in self._best:
+            self._copy(array, best, mask)
+
+    def take_best(self, mask: wp.array) -> None:
+        """Gives it back to the worlds of mask. Launches only."""
+        for array, best in self._best:
+            self._copy(best, array, mask)
+
+    def _copy(self, source, target, mask, start=0):
+        source, target = _words(source), _words(target)
+        self._launch(kernels.put_back, target.shape[:2], [source, mask, start, self.reason], [target])
 
     def _memory(self):
         """All that a step starts from, and changes."""

@@ -1,6 +1,8 @@
 """BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the
 bodies."""
 
+import os
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -15,6 +17,8 @@ from .senses import Senses
 from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
+
+_WIDEST = max(CHANNELS.values())  # numbers of a channel
 
 
 class Skins:
@@ -65,6 +69,10 @@ class Skins:
             self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.rest = Rest(skin)
+        if self.device.is_cuda:  # beside each other: Warp would compile them one by one, as they are launched
+            for package in ("batch", "sensor") if senses else ("batch",):
+                name = f"{__package__.rpartition('.')[0]}.{package}"
+                wp.load_module(name, self.device, recursive=True, max_workers=os.cpu_count())
         self.reset()
 
     def reset(self, world_mask: wp.array | np.ndarray | None = None) -> None:
@@ -141,8 +149,9 @@ class Skins:
         self.place_geoms(pos, mat, geom_pos, geom_quat)
         skin.solve_skins()
         st = skin.data.worlds
+        where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
-        self._launch(kernels.accept_models, self.groups, [*solved, pos, mat, self._last], [self.model])
+        self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 
     def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
         """Puts the skins' geoms on bodies as in `solve_at`."""
@@ -151,15 +160,26 @@ class Skins:
             kernels.geom_poses, skin.pos.shape, [self._geom, self._group, *poses], [skin.pos, skin.mat]
         )
 
+    def look(self) -> None:
+        """What the sensors see of the step, before `solve_film`. Launches only."""
+        if self.senses:
+            self.senses.look(self.model.wrench0, self.model.tangent0, self.rest.awake)
+
+    def solve_film(self) -> None:
+        """The film, where electrodes are sampled and skins have moved, before `sense`. Launches only."""
+        if self.senses:
+            self.senses.solve_film()
+
     def sense(self, sensordata: wp.array) -> None:
-        """Film and acquisition of the step, then all readings into sensordata (nworld, n) float. Launches
-        only."""
+        """Acquisition of the step, then all readings into sensordata (nworld, n) float. Launches only."""
         state, skin = self._no_state, self.skin
         if self.senses:
-            state = self.senses.advance(self.model.wrench0, self.model.tangent0, self.rest.awake)
+            state = self.senses.sample()
         outputs = [state, self.model.wrench0, skin.reason, self._valid, self._settled, self.failed]
         how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
-        self._launch(kernels.write_sensors, self.nworld, [self._addresses, *outputs, *how], [sensordata])
+        self._launch(
+            kernels.write_sensors, (self.nworld, _WIDEST), [self._addresses, *outputs, *how], [sensordata]
+        )
 
     @property
     def groups(self) -> tuple:
@@ -235,6 +255,8 @@ class PoseBatch(Skins):
         self.end_step()
         bodies = [self._core, self._body, self.model.wrench0, xpos, xmat, xipos]
         self._launch(kernels.body_forces, self.nworld, bodies, [self.xfrc_applied])
+        self.look()
+        self.solve_film()
         self.sense(self.sensordata)
 
     def readings(self) -> dict:

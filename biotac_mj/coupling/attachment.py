@@ -55,12 +55,24 @@ class Handle:
             raise ValueError(f"a BioTac has no channel {channel!r}: choose one of {', '.join(CHANNELS)}")
         return self.prefix + channel
 
-    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray:
-        """Copy of a channel's present values in mjData: counts; contact_force is force [N] and torque [N m]
-        on the BioTac in its frame; status is (converged: 1, 0, or -1 after an error; steps that did not
-        converge; iterations; residual; tier: 0 full, 1 condensed, -1 condensed where its error has not been
-        measured; rounds through MuJoCo's solver; share of the bodies' motion for which the skin was solved;
-        share of its push that was withheld): see docs/lab/coupling.md."""
+    @typing.overload
+    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray: ...
+
+    @typing.overload
+    def read(self, data: mujoco.MjData, channel: None = None) -> dict[str, np.ndarray]: ...
+
+    def read(self, data: mujoco.MjData, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
+        """Copy of a channel's present values in mjData, or of all channels: {channel: values}. Counts;
+        contact_force is force [N] and torque [N m] on the BioTac in its frame; status is (converged: 1, 0, or
+        -1 after an error; steps that did not converge; iterations; residual; tier: 0 full, 1 condensed, -1
+        condensed where its error has not been measured; rounds through MuJoCo's solver; share of the bodies'
+        motion for which the skin was solved; share of its push that was withheld): see docs/lab/coupling.md.
+
+        Raises:
+          ValueError: no such channel.
+        """
+        if channel is None:
+            return {name: self.read(data, name) for name in CHANNELS}
         return np.array(data.sensor(self.sensor(channel)).data)
 
     @property
@@ -193,7 +205,13 @@ def attach(
       textures: geom name -> what slides feel of it: {"pitch": 1e-3, "height": 5e-5} of ridges, {"roughness":
         1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"); of a list one is drawn. {} makes all
         smooth: PAC feels taps and stick-slip. None leaves vibration out.
-      coupling, geoms, rounding, priority, seed, device, stepper, tier, readings, on_error: see `Config`.
+      tier: "full" finite elements, or "condensed" for real time on one CPU core.
+      coupling: "two-way", or "one-way": the skin is only read and pushes nothing.
+      geoms: names of those that touch the skin; None is every colliding one that is not on its own links.
+      seed: of the noise, and of what is drawn.
+      device: where Warp solves the skin, "cpu" or "cuda:0".
+      on_error: "warn" goes on without this skin's force where `mj_step` fails in it; "raise" raises there.
+      rounding, priority, stepper, readings: see `biotac_mj.coupling.config.Config`.
 
     Raises:
       ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that is not

@@ -1,21 +1,23 @@
 """A skin in two-way coupling during one step: its linear model, where its bodies go under it, and the energy
 that it can give."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from ..geometry.rigid import displace, displacement, rotation
 from .instance import LEVER, Instance
-from .integrator import FixedPoint
+from .rules import TRIALS, affordable, in_store, withheld_further
 from .stepper import SkinResult
 from .structs import DataView
 
-__all__ = ["DEEPER", "TELEPORT", "Coupled"]
+__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled"]
 
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
 # of what a hard solve may cost, at once and in a step: then the closest model must do
-_LONG, _MOST = 0.4, 0.8
+LONG, MOST = 0.4, 0.8
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
@@ -48,7 +50,6 @@ class Coupled:
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
         self.asked = self.result = None
-        self._rounds = FixedPoint()
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
@@ -70,22 +71,17 @@ class Coupled:
         self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
         return self.off
 
-    def go(self, share: float = 1.0) -> None:
-        """Solves the skin where its bodies go, or a share of the way from where it was solved."""
-        pose = self.target
-        if self.asked is not None:
-            pose = self._beyond(share)
-        self._solve(self._within_reach(pose))
-
-    def _beyond(self, share):
-        """Where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as of
-        what rolls, lead there by parts), and a share of the way that these do not explain."""
-        done, left = (
-            (displacement(*to, *start) * _SCALE).ravel()
+    def gone(self) -> tuple[np.ndarray, np.ndarray]:
+        """Motions (n, 6) [m] to where the skin was last solved, and on from there to where its bodies go."""
+        return tuple(
+            displacement(*to, *start) * _SCALE
             for to, start in ((self.asked, self.pose), (self.target, self.asked))
         )
-        motion = self._rounds.next(done, left, share)
-        return displace(*self.pose, motion.reshape(-1, 6) / _SCALE)
+
+    def go(self, motion: np.ndarray | None = None) -> None:
+        """Solves the skin where its bodies go, or after a motion (n, 6) [m] like those of `gone`."""
+        pose = self.target if motion is None else displace(*self.pose, motion / _SCALE)
+        self._solve(self._within_reach(pose))
 
     def arrive(self) -> None:
         """Solves the skin where its bodies are sure to come."""
@@ -94,7 +90,7 @@ class Coupled:
     def _solve(self, pose):
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
         self._cost += result.cost
-        quick = result.cost < _LONG and self._cost < _MOST
+        quick = result.cost < LONG and self._cost < MOST
         self.may_go = result.converged and quick
         self.use(pose, result)
 
@@ -129,16 +125,23 @@ class Coupled:
             depth = (1.0 - clear) * _size(way)
             return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
         way = displacement(*pose, *start)
-        if _size(way) <= room:
+        if _size(way) <= room or self._leaves(pose):
             return pose
         share = self.instance.share_down(*start, way, room)
         if share is not None:
-            return pose if share == 1.0 else displace(*start, share * way)
+            return pose if (share == 1.0).all() else displace(*start, share[:, None] * way)
         force = (
             np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
         )
         depth = (-(self.wrench0 * way).sum(axis=1)[force > 0] / force[force > 0]).max(initial=0.0)
         return pose if depth <= room else displace(*start, room / depth * way)
+
+    def _leaves(self, pose):
+        """Whether the bodies touch nothing at a pose, and go there from where they are by no way through the
+        core: what the skin was before it may have been left behind, and does not count."""
+        way = displacement(*pose, *self.here)
+        free = self.instance.share_down(*self.here, way, DEEPER)
+        return free is not None and (free == 1.0).all() and self.instance.is_clear(*pose)
 
     def _core_motion(self):
         if not self.core:
@@ -187,6 +190,22 @@ class Coupled:
         """Whether what acts on the bodies on their way gives them more energy than the skin has."""
         return self._given() > max(self._store(), 0.0)
 
+    def shares_of_push(self) -> Iterator[float]:
+        """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
+        asked for, the last of which it has the energy for."""
+        force, way = self._acting(), self.drift + self.moved
+        store = self._store()
+        yield 0.0
+        none = self._given()
+        change, further = force - self._acting(), way - self.drift - self.moved
+        push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
+        for trial in range(TRIALS):
+            yield push
+            if push == 0.0 or not self.overdraws():
+                return
+            push = withheld_further(push, store, none, self._given()) if trial < TRIALS - 1 else 0.0
+        yield push
+
     def _given(self):
         return float((self._acting() * (self.drift + self.moved)).sum())
 
@@ -201,7 +220,8 @@ class Coupled:
             self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
-        return min(store - min((w * jump).sum() for w in (self._acting(), last)), self._most())
+        before, now = (float((w * jump).sum()) for w in (last, self._acting()))
+        return in_store(store, before, now, self._most())
 
     def _most(self):
         """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was

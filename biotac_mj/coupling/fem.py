@@ -18,9 +18,10 @@ from .config import Config
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
-__all__ = ["CLEAR", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
+__all__ = ["CLEAR", "HARD", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
 _WORK = 160  # of two-way skins, see SkinOptions.max_work
+HARD = _WORK / 2  # iterations of a hard solve
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
@@ -188,7 +189,7 @@ class FemStepper:
             step(self._model, d, geoms, dt)
         new = np.zeros_like(state)
         self._pack(new)
-        if d.converged[0] and self._came_to_rest(new):
+        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, geom_pos, geom_mat, 0.0):
             return self._still(state, geom_pos, geom_mat)
         return SkinResult(
             state=new,
@@ -203,7 +204,7 @@ class FemStepper:
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
             load=d.contact_load(),
-            cost=float(d.iterations[0]) / (_WORK / 2),
+            cost=float(d.iterations[0]) / HARD,
         )
 
     # --- a skin at rest  ---
@@ -253,7 +254,7 @@ class FemStepper:
         self._part(state, "motion")[:] = new - last if started[0] else 0.0
         last[:], self._part(state, "geom_mat")[:], started[:] = new, np.ravel(geom_mat), 1.0
 
-    def _untouched(self, state, geom_pos, geom_mat):
+    def _untouched(self, state, geom_pos, geom_mat, margin=CLEAR):
         if (
             self.inertial
             or self._material.remembers
@@ -262,7 +263,7 @@ class FemStepper:
         ):
             return False
         # one that is deformed and let go comes to rest: nearer than this it may bulge to the geoms
-        margin = 0.0 if self.resting(state) else CLEAR
+        margin = 0.0 if self.resting(state) else margin
         return self._search.clear(geom_pos, geom_mat, max(margin, self._reach))
 
     def _met_at(self, state, geom_pos, geom_mat):

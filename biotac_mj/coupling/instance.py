@@ -24,7 +24,16 @@ from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
 from .touching import Touching, forget_notes
 
-__all__ = ["NO_PASSIVE", "Instance", "Setup", "forget_skins", "reset_state", "skin_thickness", "state_size"]
+__all__ = [
+    "FITS",
+    "NO_PASSIVE",
+    "Instance",
+    "Setup",
+    "forget_skins",
+    "reset_state",
+    "skin_thickness",
+    "state_size",
+]
 
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
@@ -38,7 +47,7 @@ _PATIENCE = 3  # steps in which the skin may stay where it was, after which it b
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9
 _ALONE = 1, True, 0.0, 0.0, None  # how a step went in which bodies and skin do not meet: see `concluded`
-_FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
+FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 
@@ -293,9 +302,12 @@ class Instance:
         with skin.lock:
             return skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
 
-    def share_down(self, pos0: np.ndarray, mat0: np.ndarray, way: np.ndarray, room: float) -> float | None:
-        """Share of a way (ngroup, 6) of the bodies from poses at which the skin is known, on which none goes
-        deeper by more than a room [m], nor to where no skin fits; None where that is not known."""
+    def share_down(
+        self, pos0: np.ndarray, mat0: np.ndarray, way: np.ndarray, room: float
+    ) -> np.ndarray | None:
+        """Shares (ngroup,) of ways (ngroup, 6) of the bodies from poses at which the skin is known, on which
+        each goes deeper by no more than a room [m], nor to where no skin fits; None where that is not
+        known."""
         stepper, least = self.setup.skin.stepper, self.setup.thickness
         if not hasattr(stepper, "clearance"):
             return None
@@ -307,15 +319,17 @@ class Instance:
             known = clearance(0.0)
             if known is None:
                 return None
-            deepest = np.maximum(np.minimum(known, least) - room, _FITS)
-            allowed, low = np.minimum(deepest, known - _FITS), 0.0  # what slides there is not held
-            near = (known - allowed).min()
+            deepest = np.maximum(np.minimum(known, least) - room, FITS)
+            allowed, low = np.minimum(deepest, known - FITS), 0.0  # what slides there is not held
+            near, found = known - allowed, np.ones(len(known))
             for share in np.linspace(0.0, 1.0, _LOOKS + 1)[1:]:
-                deep = (allowed - clearance(share)).max()
-                if deep > 0.0:
-                    return float(low + (share - low) * near / (near + deep))
-                low, near = share, -deep
-        return 1.0
+                left = clearance(share) - allowed
+                held = (found == 1.0) & (left < 0.0)
+                found[held] = low + (share - low) * near[held] / (near - left)[held]
+                low, near = share, left
+        shares = np.ones(self.setup.ngroup)
+        np.minimum.at(shares, self.touching.group, found)
+        return shares
 
     @property
     def inertial(self) -> bool:

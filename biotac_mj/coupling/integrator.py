@@ -13,7 +13,7 @@ import numpy as np
 
 from .structs import LIBRARY, DataView, ModelView
 
-__all__ = ["Integrator", "FixedPoint"]
+__all__ = ["Integrator"]
 
 LIBRARY.mjd_smooth_vel.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
 _EULER, _FAST, _IMPLICIT = (
@@ -24,7 +24,6 @@ _NO_DAMPER, _NO_EULERDAMP = (
     int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP),
 )
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
-_MEMORY = 6
 _NEGLIGIBLE = 1e-9  # h D relative to M
 # the same of the velocity products that implicitfast has in D for lone free bodies: a body that turns by so
 # much in a step goes elsewhere by 0.3 um at 10 mm, a tenth of what the skin is solved for
@@ -111,24 +110,3 @@ class Integrator:
         jacobian = jacobian.reshape(stiff.shape)
         response = np.linalg.solve(self._inertia + jacobian.T @ stiff, jacobian.T)
         return np.eye(len(stiff)) - stiff @ (response - self._step @ response)
-
-
-class FixedPoint:
-    """Anderson's acceleration of x = g(x): exact for a linear g after as many rounds as it has dimensions.
-
-    Where g has kinks (a joint reaches its limit), what was seen last counts most.
-    """
-
-    def __init__(self):
-        self._x, self._residual = [], []
-
-    def next(self, x: np.ndarray, residual: np.ndarray, part: float = 1.0) -> np.ndarray:
-        """The x (n,) to try after x (n,) left the residual g(x) - x (n,). part: of what no earlier round
-        explains."""
-        self._x, self._residual = [*self._x[-_MEMORY:], x], [*self._residual[-_MEMORY:], residual]
-        moved, changed = np.diff(self._x, axis=0).T, np.diff(self._residual, axis=0).T
-        weight = 0.01 ** np.arange(changed.shape[1])[::-1] / np.maximum(
-            np.linalg.norm(changed, axis=0), 1e-300
-        )
-        share = weight * np.linalg.lstsq(changed * weight, residual, rcond=1e-13)[0]
-        return x + part * residual - (moved + part * changed) @ share

@@ -15,25 +15,20 @@ import numpy as np
 
 from .coupled import Coupled
 from .instance import LEVER, Instance
-from .integrator import FixedPoint, Integrator
+from .integrator import Integrator
+from .rules import MAX_ROUNDS, TOLERANCE, FixedPoint, next_share
 from .structs import DataView, ModelView
 
-__all__ = ["CLOSER", "LEAST_STEP", "TOLERANCE", "World"]
+__all__ = ["World"]
 
-MAX_ROUNDS = 16
-# [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
-TOLERANCE = 2e-6
 MAX_CORRECTIONS = 12
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
-CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
-LEAST_STEP = 0.125
 _RESETS = {
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name.upper()}")): name for name in ("qpos", "qvel", "qacc")
 }
-_TRIALS = 4  # to find how much of a skin's push it can pay for
 
 
 class World:
@@ -44,6 +39,7 @@ class World:
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         self.first = self.coupled[0].index if self.coupled else -1
+        self._searches = {}  # by number of touching bodies: made once, not in every step
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -110,8 +106,8 @@ class World:
         if not skins:
             return
         if skins[0].horizon > 0 and self.model.nv > 0:
-            acceleration, rounds = self._find_balance(skins, outside)
-            self._restrain(skins, outside, acceleration)
+            rounds = self._find_balance(skins, outside)
+            self._restrain(skins, outside)
         else:
             rounds = 1
             for skin in skins:
@@ -122,40 +118,51 @@ class World:
             skin.conclude(rounds)
 
     def _find_balance(self, skins, outside):
-        """Accelerations under models of the skins that hold where these lead, and how many rounds that took.
+        """Finds models of the skins that hold where these lead; returns how many rounds that took.
 
         Their forces are left in place. Where rounds go to and fro (friction that sticks in one and slips in
         the other, a skin that begins to touch), shorter steps settle them.
         """
         share, last, best = 1.0, np.inf, None
+        n = sum(len(skin.wrench0) for skin in skins)
+        if n not in self._searches:
+            self._searches[n] = FixedPoint(n)
+        search = self._searches[n]
+        search.begin()
         for rounds in range(MAX_ROUNDS + 1):
             acceleration = self._accelerations(skins, outside)
             off = max([skin.aim(acceleration) for skin in skins])
             if off < TOLERANCE:
-                return acceleration, rounds
+                return rounds
             rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
             if best is None or not rank >= best[0]:
                 best = rank, [skin.model() for skin in skins]
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break
-            share = (
-                max(0.5 * share, LEAST_STEP)
-                if off > (1.0 - (1.0 - CLOSER) * share) * last
-                else min(1.0, 2 * share)
-            )
-            last = off
-            for skin in going:
-                skin.go(share)
+            if off > last and len(skins) > 1:  # what one skin did while the other was elsewhere misleads
+                search.begin()
+            share, last = next_share(share, off, last), off
+            # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
+            # of what rolls, lead there by parts), and a share of the way that these do not explain; of all
+            # skins together, since they may hold one body
+            ways = [None] * len(skins)
+            if rounds:
+                done, left = zip(*(skin.gone() for skin in skins))
+                way = search.next(np.concatenate(done), np.concatenate(left), share)
+                ways = np.split(way, np.cumsum([len(d) for d in done])[:-1])
+            for skin, way in zip(skins, ways):
+                if skin in going:
+                    skin.go(way)
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
         acceleration = self._accelerations(skins, outside)
         for skin in skins:
             skin.aim(acceleration)
             skin.settled = skin.off < TOLERANCE
-        return acceleration, rounds
+        return rounds
 
-    def _restrain(self, skins, outside, acceleration):
+    def _restrain(self, skins, outside):
         """Withholds so much of a skin's push that it does not give more energy than it has.
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
@@ -163,19 +170,11 @@ class World:
         about the present pose: a damper.
         """
         for skin in [s for s in skins if s.overdraws()]:
-            low, high = 0.0, 1.0  # of the push: affordable, and not
-            for trial in range(_TRIALS):
-                skin.push = 0.0 if trial == _TRIALS - 1 else 0.5 * (low + high)
+            for share in skin.shares_of_push():
+                skin.push = share
+                acceleration = self._accelerations(skins, outside)
                 for s in skins:
-                    s.aim(self._accelerations(skins, outside))
-                if skin.overdraws():
-                    high = skin.push
-                else:
-                    low = skin.push
-            skin.push = low
-            acceleration = self._accelerations(skins, outside)
-            for s in skins:
-                s.aim(acceleration)
+                    s.aim(acceleration)
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
@@ -209,11 +208,9 @@ class World:
                     skin.amiss = part
                 return moved
             if search is None:
-                search, slope = FixedPoint(), self.integrator.slope(jacobian, stiffness)
+                search, slope = FixedPoint(len(correction)), self.integrator.slope(jacobian, stiffness)
             step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
-            correction = (
-                search.next((_SCALE * correction).ravel(), (_SCALE * step).ravel()).reshape(-1, 6) / _SCALE
-            )
+            correction = search.next(_SCALE * correction, _SCALE * step) / _SCALE
             for skin, part in zip(skins, np.split(correction, ends)):
                 skin.correction = part
             self._forces(skins, outside)

@@ -1,0 +1,178 @@
+"""What energy the skins of a batch may give in a step, and what is withheld of their push: the account of
+`coupling/coupled.py` and `World._restrain` for all worlds at once, one thread each, after the `rounds`."""
+
+import warp as wp
+
+from ..coupling.rules import TRIALS, affordable, in_store, withheld_further
+from ..skin.newton.worlds import CONVERGED
+from .kernels import Model
+from .rigid import motion
+from .rounds import Rounds, Solid, force_of
+
+__all__ = ["conclude", "pass_by", "restrain", "share_push", "withhold"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec6 = wp.spatial_vectord
+
+_in_store, _affordable, _withheld_further = (
+    wp.func(rule) for rule in (in_store, affordable, withheld_further)
+)
+_TRIALS = wp.constant(TRIALS)
+
+
+@wp.func
+def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
+    """What acts on a body, as MuJoCo takes it: linear in the accelerations, from its wrench without them."""
+    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w]
+
+
+@wp.func
+def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
+    """Work of what acts on the bodies on their way [J]."""
+    work = real(0.0)
+    for g in range(r.pos.shape[0]):
+        work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
+    return work
+
+
+@wp.func
+def most_energy(r: Rounds, force: real, solid: Solid, w: int):
+    """The most that a skin which pushes with so much force can hold: over the whole way to the core [J]."""
+    if solid.inertial == 1:
+        return real(wp.inf)
+    most = solid.thickness * force
+    if r.surface.shape[0] > 0:
+        most += r.surface[w] * solid.area
+    return most
+
+
+@wp.func
+def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
+    """Whether what acts gives more energy than there is."""
+    return given(r, model, wrench, w) > wp.max(r.store[w], real(0.0))
+
+
+@wp.kernel
+def restrain(
+    # In:
+    model: Model,
+    last: Model,
+    wrench: wp.array2d(dtype=vec6),
+    solid: Solid,
+    # In and out:
+    r: Rounds,
+    again: wp.array(dtype=int),
+):
+    """Finds the energy in the skins, and takes the push of those that would give more.
+
+    What remains without it is the skin's tangent about the present pose: a damper. The energy is that of the
+    last step, and what those have put in who have moved bodies since.
+    """
+    w = wp.tid()
+    before = real(0.0)
+    now = real(0.0)
+    pushed = real(0.0)
+    pushes = real(0.0)
+    for g in range(r.pos.shape[0]):
+        jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
+        acts = acting(r, model, wrench, g, w)
+        before += wp.dot(last.wrench0[g, w], jump)
+        now += wp.dot(acts, jump)
+        pushed += force_of(last.wrench0[g, w])
+        pushes += force_of(acts)
+        r.full_wrench[g, w] = acts
+        r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
+    # a solve that lost its way knows little of the force that was there before it
+    r.most[w] = most_energy(r, wp.max(pushed, pushes), solid, w)
+    store = _in_store(r.store[w], before, now, r.most[w])
+    if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with, and elsewhere nothing
+        store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
+    r.store[w] = store
+    if overdraws(r, model, wrench, w):
+        r.push[w] = real(0.0)
+        again[0] = 1
+
+
+@wp.kernel
+def share_push(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+):
+    """As much push as there is energy for, of skins without any: what acts, and how bodies move, is linear in
+    it while no other contact changes."""
+    w = wp.tid()
+    if r.push[w] == real(1.0):
+        return
+    # of the work: without push, with all of it, and half of the curve between them
+    none = given(r, model, wrench, w)
+    full = real(0.0)
+    bend = real(0.0)
+    for g in range(r.pos.shape[0]):
+        full += wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
+        change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
+        bend += wp.dot(change, r.full_motion[g, w] - r.drift[g, w] - r.moved[g, w])
+    r.push[w] = _affordable(r.store[w], none, full, bend)
+    r.without[w] = none
+    r.trial[w] = 0
+
+
+@wp.kernel
+def withhold(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    # In and out:
+    r: Rounds,
+    again: wp.array(dtype=int),
+):
+    """Withholds more where a share of the push still gives too much, at last all."""
+    w = wp.tid()
+    if r.push[w] == real(1.0) or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+        return
+    r.push[w] = _withheld_further(r.push[w], r.store[w], r.without[w], given(r, model, wrench, w))
+    r.trial[w] = r.trial[w] + 1
+    if r.trial[w] == _TRIALS:
+        r.push[w] = real(0.0)
+    again[0] = 1
+
+
+@wp.kernel
+def conclude(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    reason: wp.array(dtype=int),
+    # In and out:
+    r: Rounds,
+):
+    """Keeps the energy that is left, and where the bodies go."""
+    w = wp.tid()
+    # what is withheld is in the skin all the same
+    store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
+    if r.open[w] == 1 or r.inside[w] == 1:  # what was put in is not known before a balance is found
+        r.open[w] = wp.where(reason[w] == CONVERGED, 0, 1)
+        if r.open[w] == 1:
+            store = real(wp.inf)
+    r.store[w] = store
+    for g in range(r.pos.shape[0]):
+        r.end_pos[g, w] = r.pos[g, w]
+        r.end_mat[g, w] = r.mat[g, w]
+
+
+@wp.kernel
+def pass_by(area: real, r: Rounds):
+    """Instead of all rounds where no skin takes part: bodies go where they go, a skin has the energy of its
+    adhesion."""
+    w = wp.tid()
+    r.store[w] = real(0.0)
+    if r.surface.shape[0] > 0:
+        r.store[w] = r.surface[w] * area
+    r.passed[w] = 1
+    for g in range(r.pos.shape[0]):
+        r.end_pos[g, w] = r.start_pos[g, w]
+        r.end_mat[g, w] = r.start_mat[g, w]
