@@ -5,8 +5,8 @@
     python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
-pieces of either half and further forms. Other authors' recordings: --half second, third, fourth
-(`recordings_foreign_second.py` and so on; --counts of the third: rounds; the fourth's are as many as they
+pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth
+(`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last two's are as many as they
 are). --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
@@ -19,6 +19,7 @@ import time
 
 import numpy as np
 import recordings_foreign as first
+import recordings_foreign_fifth as fifth
 import recordings_foreign_fourth as fourth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
 import recordings_foreign_third as third
@@ -247,29 +248,29 @@ def table(rows: list) -> str:
 
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
-    "shared": {"nats": 1, "size": 1, "lead": 1, "uneven": -1, "seconds": 1},
-    "supply": {"nats": 1, "size": 1, "lead": 1, "turns": -1, "room": 1, "uneven": -1},
-    "one": {"nats": 1, "size": 1, "turns": -1, "lead": 1, "stands": 1, "apart": 1},
+    "shared": {"nats": 1, "uneven": -1, "seconds": 1},
+    "supply": {"nats": 1, "lead": 1, "turns": -1},
+    "one": {"lead": 1, "apart": 1},
     "jump": {"edge": 1, "alone": 1},
-    "answer": {"nats": 1, "spread": -1, "lead": 1, "sharp": 1},
-    "order": {"nats": 1, "ratio": 1, "left": -1},
+    "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
+    "order": {"nats": 1, "ratio": 1},
     "samples": {"nats": 1},
     "single": {"nats": 1, "alone": 1},
     "still": {"nats": 1, "share": 1},
-    "limit": {"nats": 1, "blocks": 1, "share": 1, "runs": 1},
+    "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
     "line": {"score": 1, "amplitude": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
     "pairs": {"rest": 1},
-    "common": {"factor": 1, "rest": -1},
-    "size": {"apart": 1, "stands": 1, "counts": 1},
+    "common": {"factor": 1},
+    "size": {"apart": 1, "stands": 1},
     "late": {"gain": 1, "size": 1},
-    "memory": {"gain": 1, "size": 1, "blocks": 1, "explained": 1},
+    "memory": {"size": 1, "explained": 1},
 }
 # of what is left: each may be what no name fits
 LEFT = {
-    "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again"),
+    "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again", "change1"),
     "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "again"),
     "left_still": (
         "counts1",
@@ -287,6 +288,7 @@ LEFT = {
 DOUBT, FAR = 1.0, 1.5  # names on either side, and how far: standard deviations of every clue
 RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
 LEAST = 0.25  # spread of a clue of what is left
+UNSEEN = 2.0  # nats below the least score that was seen, at which nothing is known of a name
 TOP = 0.5  # share of the names, the surest, whose rate no confidence may exceed
 
 
@@ -377,7 +379,8 @@ def _isotonic(score, right):
         while len(blocks) > 1 and blocks[-1][2] * blocks[-2][3] <= blocks[-2][2] * blocks[-1][3]:
             _, last, r, n = blocks.pop()
             blocks[-1] = [blocks[-1][0], last, blocks[-1][2] + r, blocks[-1][3] + n]
-    return [[float(edge), r / n] for first, last, r, n in blocks for edge in (first, last)]
+    worth = [[float(edge), r / n] for first, last, r, n in blocks for edge in (first, last)]
+    return [[worth[0][0] - UNSEEN, 0.0], *worth]
 
 
 def _usual(rows, clues):
@@ -438,6 +441,16 @@ def pieces(half: str, data: str, counts: str) -> list:
             return base, "+".join(f"{kind}{form}" for kind, form in effects), seed
 
         author, kinds = fourth, [tuple(kind for kind, _ in effects) for _, effects, _ in cases]
+    elif half == "fifth":
+        author, cases = fifth, [(p["id"],) for p in fifth.plan()]
+        kinds = [tuple(kind for kind, _ in p["effects"]) for p in fifth.plan()]
+
+        def make(name):
+            piece = fifth.make(name, data)
+            return foreign.Case(**piece.case), piece.clean
+
+        def key(name):
+            return (name,)
     else:
         author = {"second": foreign, "third": third}.get(half, first)
         which = (half,) if author is first else ()
@@ -459,7 +472,9 @@ def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("data", nargs="?")
     args.add_argument(
-        "--half", choices=("practice", "blind", "mixed", "second", "third", "fourth"), default="practice"
+        "--half",
+        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth"),
+        default="practice",
     )
     args.add_argument(
         "--counts", default="9,5,20", help="recordings without effect on each base, of each effect, pairs"

@@ -99,7 +99,7 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
     "arguments, text",
     [
         (["--sensor", "r.yaml", "--in-skin"], "write `constitutive: in_skin` into it"),
-        (["--device", "cuda:0"], "add --tier full"),
+        (["--tier", "condensed", "--device", "cuda:0"], "add --tier full"),
     ],
 )
 def test_the_command_line_says_what_does_not_go_together(arguments, text, tmp_path, capsys, monkeypatch):

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from scipy import stats
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings.courses import courses
+from biotac_mj.discrepancy.recordings.electronics import correlated, muted
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
+from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
 DATA = os.environ.get("BIOTAC_RECORDINGS", pathlib.Path(__file__).parents[1] / "../shared/data")
@@ -52,6 +55,12 @@ def pressed(seed=0, seconds=80):
         + 0.01 * (state[:, 2:3] * state[:, 3:4]) @ rng.standard_normal((1, 19))
     )
     return 4095 / (1 + np.exp(z)), f + 0.01 * rng.standard_normal(f.shape), rng
+
+
+def session_of(counts):
+    """Of counts that are rounded as a converter does, the first 60 % fitted."""
+    recording = Recording(np.clip(np.rint(counts), 0, 4095), rate=RATE)
+    return Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
 
 
 def test_a_few_seconds_of_a_fast_log_are_read():
@@ -119,7 +128,10 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
             "line 1: e1 is 'x1', not a finite number",
         ),
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like normalised values"),
-        ((" ".join(["-40"] * 19) + "\n") * 500, "raw counts 0..4095 are needed, not tared"),
+        (
+            (" ".join(["-40"] * 19) + "\n") * 500,
+            "raw counts 0..4095 are needed, not tared.* before its rest was subtracted",
+        ),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
         ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
     ],
@@ -389,7 +401,8 @@ def test_electronics_show_in_the_noise():
     smooth = np.stack([np.convolve(c, np.ones(5) / 5, "same") for c in x.T], axis=1)[5:-5]
     assert ids(diagnose_recording(Recording(np.rint(smooth)))) == ["lowpass"]
     near = np.abs(np.subtract.outer(np.arange(19), np.arange(19))) == 1
-    mixed = np.rint(e + 6 * rng.standard_normal(e.shape) @ (np.eye(19) + 0.2 * near))
+    own = electrode_noise(e[0]) * rng.standard_normal(e.shape)  # as a sensor's: cross-talk adds little to it
+    mixed = np.rint(e + own @ (np.eye(19) + 0.2 * near))
     d = diagnose_recording(Recording(mixed))
     assert ids(d) == ["crosstalk"] and abs(d.findings[0].parameters["kappa"][0] - 0.2) < 0.04
     assert ids(diagnose_recording(Recording(8 * np.rint(noisy(e, rng) / 8)))) == ["quantise"]
@@ -410,6 +423,42 @@ def test_an_electrode_that_dies_is_said(seed, channel):
     counts[start:, channel] = noisy(np.full(len(counts) - start, counts[:start, channel].mean()), rng, 2.0)
     d = diagnose_recording(Recording(counts, force))
     assert any(f.id == "stuck" and f.channels == (channel,) for f in d.findings), d.verdict
+
+
+@pytest.mark.parametrize("share", [0.0, 0.35])
+def test_cross_talk_and_a_filter_are_told_from_the_time_they_begin(share):
+    """By the noise alone, which the load is none of: what some electrodes hear of each other, and the mean of
+    the last forty rows."""
+    e, _, rng = pressed(9)
+    x = e + electrode_noise(np.median(e, axis=0)) * rng.standard_normal(e.shape)
+    since = int(share * len(x))
+    coupled = x.copy()
+    coupled[since:, 1:12:2] += 0.4 * (x[since:, 2:13:2] - x[:, 2:13:2].mean(0))
+    found = correlated(session_of(coupled))
+    assert found.id == "crosstalk" and abs(found.start - since / RATE) < 5
+    assert correlated(session_of(x)) is None
+    total = np.cumsum(x, axis=0)
+    mean = x.copy()
+    mean[40:] = (total[40:] - total[:-40]) / 40
+    found = muted(session_of(np.concatenate([x[:since], mean[since:]])))
+    assert muted(session_of(x)) is None
+    if share:
+        assert found.id == "lowpass" and abs(found.start - since / RATE) < 3
+
+
+def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
+    e, _, rng = pressed(3)
+    e = noisy(e, rng)
+    broken, clipped = e.copy(), e.copy()
+    for a in (900, 2000, 3100, 4300, 5600, 6800):
+        broken[a : a + 300, 6] = 4095
+    clipped[:, 6] = np.minimum(e[:, 6], np.quantile(e[:, 6], 0.8))
+    names = {}
+    for name, counts in (("stuck", broken), ("saturate", clipped)):
+        d = diagnose_recording(Recording(counts, rate=RATE))
+        names[name] = {f.id for f in (*d.findings, *d.rejected) if f.channels == (6,)}
+    assert "stuck" in names["stuck"] and "saturate" not in names["stuck"], names
+    assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
 
 
 @pytest.mark.parametrize("value", [0, 4095, None])
@@ -435,6 +484,36 @@ def test_single_channels_stick_and_spike():
     spiked[100::150, 2] = 0
     d = diagnose_recording(Recording(spiked))
     assert ids(d) == ["spikes"] and d.findings[0].channels == (2,)
+
+
+@pytest.mark.parametrize("end", [0, 4095])
+@pytest.mark.parametrize("share", [0.25, 0.55])
+def test_a_wire_that_breaks_at_rest_is_said(end, share):
+    """Of a sensor with so little noise that a value which stays is no news by itself; most of it may be in
+    the rows kept aside."""
+    e, rng = unloaded(seconds=10)
+    counts = noisy(e, rng, 0.4)
+    assert "stuck" not in ids(diagnose_recording(Recording(counts)))
+    counts[round(share * len(counts)) :, 12] = end
+    (found,) = [f for f in diagnose_recording(Recording(counts)).findings if f.id == "stuck"]
+    assert found.channels == (12,) and abs(found.start - share * 10) < 0.3
+
+
+def test_an_electrode_that_trembles_from_the_first_row_is_said():
+    """Its own noise is not what it would have, nor does it go on at a limit."""
+    e, _, rng = pressed(6)
+    counts = noisy(e, rng)
+    counts[:, 9] = round(counts[:, 9].mean()) + (rng.random(len(counts)) < 0.04)
+    found = [f for f in diagnose_recording(Recording(counts)).findings if len(f.channels) == 1]
+    assert [(f.id, f.channels) for f in found] == [("stuck", (9,))]
+
+
+def test_spikes_are_told_by_the_noise_around_them():
+    e, rng = unloaded(5, seconds=10)
+    counts = noisy(e, rng, 0.4)
+    assert not ids(diagnose_recording(Recording(counts)))
+    counts[50::70, 4] -= 12
+    assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
 def test_what_has_no_name_is_called_unknown_under_load_too():
@@ -514,6 +593,35 @@ def test_summary_says_what_it_cannot_know():
     e, rng = unloaded()
     text = summary(diagnose_recording(Recording(noisy(e, rng))))
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
+
+
+def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
+    """A recording as long as it asks for will do; touches as slow as a drift never do."""
+
+    def said(counts, force, rng):
+        return summary(diagnose_recording(Recording(noisy(counts, rng), force)))
+
+    short = said(*pressed(seconds=15))
+    assert "too short to tell touches from drift" in short and "not loaded" not in short
+    seconds = int(re.search(r"record (\d+) s or more", short)[1])
+    enough, less = (said(*pressed(seconds=s)) for s in (seconds, seconds - 1))
+    assert "too short" in less and "too short" not in enough and "sign of an electrode" not in enough
+    e, rng = unloaded()
+    rise = np.linspace(0, 1, len(e))[:, None] ** 2
+    slow, none = (said(e + 60 * rise, size * rise * [0, 0, -1], rng) for size in (2, 0))
+    assert "touches could not be told from drift, record some" in slow and "not loaded" not in slow
+    assert "not loaded: gains" in none
+
+
+def test_a_force_without_noise_is_said_to_have_none():
+    e, force, rng = pressed()
+    with_noise = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    force[: len(force) // 2] = 0
+    without = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    last = [
+        [x for x in text.splitlines() if "force from electrodes:" in x][0] for text in (with_noise, without)
+    ]
+    assert float(last[0].split()[-1]) == pytest.approx(0.01, rel=0.1) and last[1].endswith("noise none")
 
 
 def test_the_verb_writes_a_verdict(tmp_path, capsys):

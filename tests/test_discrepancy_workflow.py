@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
+from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
@@ -85,13 +86,13 @@ def plans(n=14, seed=0, unload=True):
     return out
 
 
-def measured(effects, seed=1, modulus=1.07, **kw):
+def measured(effects, seed=1, modulus=1.07, of=None, **kw):
     """What the springs with effects would read, with noise, slips of the pose and another modulus
     (synthetic)."""
     rng = np.random.default_rng(seed)
     data = plans(**kw)
     slips = [rng.normal(0, 15e-6, 3) for _ in data]
-    runs = Springs().run(data, None, True, effects, modulus, slips)
+    runs = (of or Springs()).run(data, None, True, effects, modulus, slips)
     return [
         Trajectory(
             t.id,
@@ -268,8 +269,6 @@ def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
 
 
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
-    from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
-
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
     data = [
@@ -290,6 +289,52 @@ def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     report = diagnose(Springs(), data, progress=False)
     assert not report.effects and abs(report.fit.nuisance.footprint - 0.06) < 0.015
     assert any("footprint is +" in note for note in report.notes)
+
+
+class TwoTiers(Springs):
+    """Springs whose full tier answers with a pattern that no effect has."""
+
+    def solve(self, trajectories, *args, **kw):
+        out = super().solve(trajectories, *args, **kw)
+        for one in out if self.tier == "full" else ():
+            depth = one["pressure"] / 4e6
+            one["log_z"] = one["log_z"] + np.outer((depth / 1e-3) ** 2, 0.15 * np.sin(5.0 * np.arange(19)))
+        return out
+
+
+@pytest.mark.parametrize("tier, share", [("full", 0.0), ("condensed", 1.0)])
+def test_what_one_tier_lacks_is_the_base_models_and_takes_no_effects_name(tier, share):
+    report = diagnose(TwoTiers(tier="full"), measured([], of=TwoTiers(tier=tier)), progress=False)
+    assert not report.effects and report.verdict == "no significant disagreement"
+    assert abs(report.fit.nuisance.tier - share) < 0.15
+
+
+def test_the_skin_is_solved_again_where_differences_do_not_reach():
+    """A shift of 0.4 mm whose answer is curved: exact where it was solved, nothing at zero, a quarter of the
+    curve at half of it; not solved twice near there."""
+
+    class Curved(Springs):
+        def solve(self, trajectories, offset=None, *args, **kw):
+            out = super().solve(trajectories, offset, *args, **kw)
+            for i, one in enumerate(out):
+                side = 0.0 if offset is None else offset[i][:, 0] / 1e-3
+                one["log_z"] = one["log_z"] + np.outer(side**2 * np.ones(len(one["pressure"])), WEIGHT)
+            return out
+
+    sim, data, shift = Curved(), plans(4), by_id("misalign")
+    fields, chosen = sim.fields(data, progress=False), np.array([0, 1, 3])
+
+    def error(x, i):
+        effects = [(shift, {**shift.default(), "x": x})]
+        near, true = (sim.run(data, fields, exact, effects)[i] for exact in (False, True))
+        return np.abs(near.log_z - true.log_z).max()
+
+    before = error(4e-4, 1)
+    theta = {**shift.default(), "x": 4e-4}
+    assert sim.bend(fields, [(shift, theta)], Nuisance(), chosen)
+    assert error(4e-4, 1) < 1e-9 < 0.05 < before and error(4e-4, 2) == before  # 2 was not asked for
+    assert error(2e-4, 1) < 0.1 * before and error(0.0, 1) < 1e-9
+    assert not sim.bend(fields, [(shift, {**theta, "x": 3.8e-4})], Nuisance(), chosen)
 
 
 @pytest.mark.parametrize(

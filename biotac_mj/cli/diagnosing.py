@@ -73,7 +73,12 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
     verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="SHARE", help=kept)
-    verb.add_argument("--tier", default="condensed", choices=TIERS, help="skin that simulates DATA")
+    verb.add_argument(
+        "--tier",
+        default="full",
+        choices=TIERS,
+        help="skin that simulates DATA; condensed is faster, and its own error may look like an effect",
+    )
     verb.add_argument(
         "--material", help="of the skin that simulates DATA: a preset, a .json file of a material, or JSON"
     )

@@ -4,15 +4,15 @@ import numpy as np
 
 from ..sensor.channels import electrode_noise
 
-__all__ = ["noise_level", "sound_noise"]
+__all__ = ["ROUNDING", "noise_level", "sound_noise"]
 
-_ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
+ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
 
 
 def sound_noise(counts: np.ndarray) -> np.ndarray:
     """Standard deviation of a sound electrode's noise at these counts [counts]: of rounding at least, which
     is all that is left at the ends of what it can read, where a broken wire leaves it."""
-    return np.maximum(electrode_noise(counts), _ROUNDING)
+    return np.maximum(electrode_noise(counts), ROUNDING)
 
 
 def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: float = 0.05) -> np.ndarray:

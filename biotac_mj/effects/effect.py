@@ -68,6 +68,7 @@ class Run:
       stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
       answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) by unit of it,
         where that has been solved; modulus: factor on the material's since.
+      pos: (n, 3) of the object [m], None where only the place of its touch is known.
       session: dict that the effects of one simulation share from trajectory to trajectory.
     """
 
@@ -93,6 +94,7 @@ class Run:
     stiffness: np.ndarray | None = None
     answers: dict = dataclasses.field(default_factory=dict)
     modulus: float = 1.0
+    pos: np.ndarray | None = None
 
     @property
     def normal_force(self) -> np.ndarray:

@@ -83,7 +83,8 @@ class Asperities(Effect):
     params = {
         "log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)
     }
-    confusable = {"gain": "one electrode or all", "saturate": "depth ladder"}
+    kin = ("crosstalk",)
+    confusable = {"gain": "one electrode or all", "saturate": "depth ladder", "crosstalk": "drive one alone"}
 
     def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.rest_log_z + np.exp(theta["log_p"]) * (run.log_z - run.rest_log_z)
@@ -142,7 +143,7 @@ class CrossTalk(Effect):
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
-    law = LAW
+    law, kin = LAW, ("asper",)
     confusable = {
         "gain": "drive one electrode alone",
         "rocking": "another place",
@@ -179,7 +180,7 @@ class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
     physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
-    law = LAW
+    law, kin = LAW, ("latency",)
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -191,6 +192,7 @@ class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
+    kin = ("lowpass",)
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 
     def apply(self, run: Run, theta: dict) -> None:

@@ -244,12 +244,19 @@ class Radius(Effect):
 
 class Misalignment(Effect):
     id, name, stage = "misalign", "constant misalignment of the sensor", "S"
-    physics = "all poses are shifted across the press by the same vector"
-    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")}
+    physics = "all poses are shifted and turned alike: x and z, and a small rotation about the sensor's axes"
+    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")} | {
+        k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
+    }
     confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.offset = run.offset + np.array([theta["x"], 0, theta["z"]])
+        turn = np.array([theta["roll"], theta["yaw"], theta["pitch"]])
+        run.offset = (
+            run.offset
+            + np.array([theta["x"], 0, theta["z"]])
+            + np.cross(turn, run.place if run.pos is None else run.pos)
+        )
 
 
 class DepthZero(Effect):

@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 from ...sensor.channels import log_impedance
 from ..evidence import sign_flip
 from .findings import KINDS, Finding
+from .recording import FORCE_MOVED
 from .session import Session
 
 __all__ = ["BETWEEN", "ForceEffect", "ForceView", "find_between", "force_view", "lagged"]
@@ -294,7 +295,7 @@ def force_view(session: Session, rows: np.ndarray, known: Sequence[Finding] = ()
     """ForceView of contiguous rows (n,) bool, None where force and electrodes are not related."""
     r = session.recording
     usable = np.flatnonzero(session.masked[rows].mean(0) < 0.02)
-    if r.force is None or len(usable) < 6 or r.force[rows].std(0).max() < 0.02:
+    if r.force is None or len(usable) < 6 or r.force[rows].std(0).max() < FORCE_MOVED:
         return None
     chain = [f.seen for f in known if f.seen is not None]
     return ForceView(session.counts, r.force, rows, usable, r.rate, chain)

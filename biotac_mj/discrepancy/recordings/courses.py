@@ -98,7 +98,7 @@ def courses(
         and how it goes on; kinds: to choose from.
     """
     w = len(level)
-    scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 1e-9)
+    scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 0.01 * level.std(), 1e-9)
     block = np.arange(w) * min(BLOCKS, w // 2) // w
     null = _left_out(w, 1)[0] @ level
     found = []

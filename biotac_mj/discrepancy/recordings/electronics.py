@@ -18,7 +18,7 @@ from .courses import BLOCKS
 from .findings import Finding
 from .session import Session
 
-__all__ = ["coloured", "correlated", "humming", "noisy"]
+__all__ = ["coloured", "correlated", "humming", "muted", "noisy"]
 
 _NAN = float("nan")
 _WANDERS = 3.0  # [s] within which a line keeps its phase
@@ -28,10 +28,11 @@ _SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
 _RHYTHM = 8.0
 # channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
 _FACTOR = 3.0
-_LOUDER = 0.5  # than the law, as a logarithm: what touches do within rows is in the noise
+_LOUDER = 0.2  # than the law, as a logarithm: what touches do within rows is in the noise
 _WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
 # sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
 _PAIRS = 0.25
+_FEWEST = 6  # blocks behind the time from which on noise is correlated
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
 # logarithm of times the next electrode that one is noisier: 0.1 in most real recordings
@@ -50,20 +51,21 @@ def _differences(session, order=3):
 
 
 def _calm(d, share=0.5, size=40):
-    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, and
-    their blocks."""
+    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, their
+    blocks, and how many these are."""
     k = len(d) // size
+    blocks = int(np.clip(k // 5, BLOCKS, 2 * BLOCKS))
     cells = d[: k * size].reshape(k, size, -1)
     known = np.isfinite(cells)
     power = np.where(known, cells**2, 0).sum(1) / np.maximum(known.sum(1), 1)
     level = np.median(power / np.maximum(np.quantile(power, 0.1, axis=0), 0.1), axis=1)
-    block = np.arange(k) * BLOCKS // k
+    block = np.arange(k) * blocks // k
     keep = np.zeros(k, bool)
-    for b in range(BLOCKS):
+    for b in range(blocks):
         mine = np.flatnonzero(block == b)
         if len(mine):
             keep[mine[level[mine] <= np.quantile(level[mine], share)]] = True
-    return cells[keep], block[keep]
+    return cells[keep], block[keep], blocks
 
 
 # --- colour
@@ -137,6 +139,43 @@ def coloured(session: Session) -> Finding | None:
             "quiet": quiet,
             "even": even,
         },
+    )
+
+
+def muted(session: Session) -> Finding | None:
+    """Noise that a filter takes away from some time on, down to rounding: then neighbouring rows are mostly
+    equal and none jumps, as rows that are held do."""
+    x = session.counts[session.fit & ~session.masked.all(1)]
+    d, blocks = np.abs(np.diff(x, n=3, axis=0)), 2 * BLOCKS
+    if len(d) < 32 * blocks:
+        return None
+    # of third differences: what all but the largest are below, beside what the law's noise would make
+    usual = sound_noise(np.median(x, axis=0)) * np.sqrt(20)
+    size = np.stack([np.quantile(part, 0.97, axis=0) for part in np.array_split(d, blocks)]) / 2.17
+    calm = np.median(np.log(usual / (size + 0.5)), axis=1)
+
+    def gain(b):
+        return (calm[b:].mean() - calm[:b].mean()) * np.sqrt(b * (blocks - b))
+
+    first = max(range(4, blocks - _FEWEST + 1), key=gain)
+    before, after = float(np.median(calm[:first])), calm[first:]
+    p, quiet = sign_flip(after - before - _QUIET), float(np.median(after))
+    if p > 0.02 or quiet - before < 2 * _QUIET or after.min() < calm[:first].max():
+        return None
+    rate, last = session.recording.rate, session.recording.time[session.fit][-1]
+    # of white noise a first-order filter leaves a / (2 tau rate): at least so much that it rounds away
+    tau = 0.5 * np.exp(2 * (quiet - before)) / rate
+    return Finding(
+        "lowpass",
+        tuple(range(19)),
+        {"tau": (tau, tau, _NAN)},
+        float(blocks * (quiet - before)),
+        p,
+        last * first / blocks,
+        session.recording.time[-1],
+        note=f"from {last * first / blocks:.1f} s on noise is {np.exp(quiet - before):.0f} times smaller, "
+        "and no row jumps",
+        clues={"ratio": quiet - before, "quiet": quiet - before, "even": 0.0},
     )
 
 
@@ -303,7 +342,7 @@ def correlated(session: Session) -> Finding | None:
     d, rows = _differences(session, 5)
     if len(d) < 40 * BLOCKS // 2 or _with_temperature(session, d, rows):
         return None
-    cells, block = _calm(d, 0.3 if session.loaded else 1.0)
+    cells, block, blocks = _calm(d, 0.3 if session.model().moved else 1.0)
     known = np.isfinite(cells)
     power = np.where(known, cells**2, 0).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1)
     sd = np.sqrt(power / 252)
@@ -313,23 +352,24 @@ def correlated(session: Session) -> Finding | None:
     x = np.clip(np.nan_to_num(cells[:, :, alive]) / (sd[alive] * np.sqrt(252)), -3, 3)
     pairs = np.triu_indices(len(alive), 1)
     value = []
-    for b in range(BLOCKS):
+    for b in range(blocks):
         y = x[block == b].reshape(-1, len(alive))
         power = np.maximum((y**2).sum(0), 1e-9)
         value.append((y.T @ y / np.sqrt(np.outer(power, power)))[pairs])
     value = np.nan_to_num(np.array(value))  # (blocks, pairs)
-    number, mean = len(alive), value.mean(0)
-    common, others = np.empty(BLOCKS), np.empty(BLOCKS)  # what one factor explains, what is left of pairs
-    for b in range(BLOCKS):
-        by = value[np.arange(BLOCKS) != b].mean(0)
-        one = _factor(by, number)[pairs]
-        common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
+    number = len(alive)
+    # it may have been there from the first row on, or since some time
+    since = [0, *range(2, blocks - _FEWEST + 1)]
+    common, others = max((_explained(value[s:], number) for s in since), key=lambda e: e[1].sum())
+    since = blocks - len(others)
+    mean = value[since:].mean(0)
     size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
     error, last = 1 / np.sqrt(size), session.recording.time[-1]
-    louder = float(np.median(np.log(sd / sound_noise(np.median(session.counts[session.fit], axis=0)))[alive]))
+    law = sound_noise(np.median(session.counts[session.fit], axis=0))
+    louder = float(np.median(np.log(sd[alive] / law[alive])))
     clues = {
         "factor": float(np.log(max(common.mean(), 0.01))),
-        "rest": float(np.log(max(others.mean(), 0.01))),
+        "rest": float(np.log(max(others.sum() / blocks, 0.01))),
         "louder": louder,
         "loaded": float(session.loaded),
     }
@@ -338,11 +378,18 @@ def correlated(session: Session) -> Finding | None:
     ):  # a wave, each electrode at its own phase
         return None
     p = sign_flip(others)
-    if p < 0.01 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
+    if p < 0.02 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
         K, parameters = _coupling(mean, alive, sd, 4 * error)
         matrix = np.linalg.inv(np.eye(19) + K)
         centre = np.median(session.counts[session.fit], axis=0)
         most = int(np.abs(mean).argmax())
+        onset = session.recording.time[rows[len(rows) * since // blocks]] if since else 0.0
+
+        def correct(counts, at):
+            out, late = counts.copy(), at >= onset
+            out[late] = centre + (counts[late] - centre) @ matrix.T
+            return out
+
         return Finding(
             "crosstalk",
             tuple(range(19)),
@@ -350,13 +397,13 @@ def correlated(session: Session) -> Finding | None:
             | ({"length": (parameters[1], _NAN, _NAN)} if len(parameters) > 1 else {}),
             float(size * others.sum()),
             p,
-            0.0,
+            onset,
             last,
             note=f"noise of some electrodes is correlated, of e{alive[pairs[0][most]] + 1} and "
             f"e{alive[pairs[1][most]] + 1} by {mean[most]:.2f}; a sensor's is independent",
             ties=("common_noise",) if common.mean() > others.mean() else (),
             clues=clues,
-            correct=lambda counts, at: centre + (counts - centre) @ matrix.T,
+            correct=correct,
         )
     p = sign_flip(common)
     size_of = float(np.sqrt(max(2 * common.mean(), 0)))  # of n channels that are all alike: n
@@ -376,6 +423,18 @@ def correlated(session: Session) -> Finding | None:
             correct=_without_common(x.reshape(-1, number), sd) if number == 19 else None,
         )
     return None
+
+
+def _explained(value, number):
+    """Of correlations in blocks (b, pairs) of some number of channels: by the other blocks, what one factor
+    explains of each block (b,), and what is left of pairs (b,)."""
+    pairs = np.triu_indices(number, 1)
+    common, others = np.empty(len(value)), np.empty(len(value))
+    for b in range(len(value)):
+        by = np.delete(value, b, axis=0).mean(0)
+        one = _factor(by, number)[pairs]
+        common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
+    return common, others
 
 
 def _peak(cells):
@@ -483,6 +542,7 @@ def noisy(session: Session) -> list[Finding]:
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
+    own[[k for f in session.findings if f.id == "stuck" for k in f.channels]] = 0  # little is left of them
     found, order = [], np.argsort(-own)
     for e, following in zip(order[:4], order[1:]):
         # every recording has one that is the noisiest, but not by much

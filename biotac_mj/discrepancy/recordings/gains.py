@@ -16,7 +16,6 @@ __all__ = ["gains", "undecided"]
 _CURVED = 0.18
 _LIVELY = 3.0  # [counts] within windows, of half of the electrodes: with less there is nothing to answer
 _DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
-_WINDOW = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
 _SPLITS = 28  # times tried
 _LARGEST = 5.0  # factor: more comes of a side in which nothing moves
 _ROUNDS = 4  # of reweighting: an electrode that changes is an outlier for as long
@@ -34,7 +33,7 @@ def gains(session: Session, refused: set) -> Finding | None:
     if blind and not sharp or not m.inside.sum() > 64 or np.median(m.activity * m.slope) < _LIVELY:
         return None
     whole = m.whole[m.inside]
-    span, moment, floor, middle = _windows(m)
+    span, moment, floor, middle = m.moments()
     w = len(moment)
     block = np.arange(w) * BLOCKS // w
     fits = {}
@@ -71,26 +70,17 @@ def gains(session: Session, refused: set) -> Finding | None:
             finding = _gain_finding(session, k, i, c, spread, when, gain, p, edge)
         # where the load goes elsewhere all electrodes change what they make of it
         others = [max(fits[j].nats, 1.0) for j in order if j != i]
-        finding.clues["lead"] = float(np.log(fit.nats / max(others, default=1.0)))
+        finding.clues |= {
+            "lead": float(np.log(fit.nats / max(others, default=1.0))),
+            "side": float(np.log(min(late.mean(), 1 - late.mean()))),  # what a few windows say is little
+        }
         return finding
     return None
 
 
-def _windows(m):
-    """Rows of a window, moments (w, q, q) of their changes, floor (q,) of a window's noise, middles
-    (w,) [s]."""
-    whole = m.whole[m.inside]
-    span = max(4, int(min(_WINDOW / m.period, len(whole) // 32)))
-    w = len(whole) // span
-    cells = whole[: w * span].reshape(w, span, -1)
-    cells = cells - cells.mean(1, keepdims=True)
-    floor = np.concatenate([m.noise**2, np.full(whole.shape[1] - len(m.used), 0.02)]) * span
-    return span, np.einsum("wsi,wsj->wij", cells, cells), floor, m.time[: w * span].reshape(w, span).mean(1)
-
-
 def _fitted(m, session, i, k):
     """Regression of electrode k, and its windows (w,) bool after its jumps that explain most, or None."""
-    _, moment, floor, middle = _windows(m)
+    _, moment, floor, middle = m.moments()
     fit = _Regression(moment, i, floor, _changed(edges(session).get(k, ()), middle), True)
     return fit, fit.late
 

@@ -13,12 +13,13 @@ import numpy as np
 from ...sensor.channels import FULL_SCALE, log_impedance
 from ..noise import noise_level
 
-__all__ = ["Model", "slope_of"]
+__all__ = ["CHANGES", "LEAST", "WINDOW", "Model", "slope_of"]
 
 _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
-_WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
-_LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
+WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
+CHANGES = 1.5  # [s] within which an electrode's changes are compared with what the others say of them
+LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
 _MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
 _DIMENSIONS = 8  # of the load at most
 
@@ -75,7 +76,7 @@ class Model:
                 self._fit()
 
     def _fit(self):
-        span = int(np.clip(self.inside.sum() / 24, _WINDOW[0] / self.period, _WINDOW[1] / self.period))
+        span = int(np.clip(self.inside.sum() / 24, WINDOW[0] / self.period, WINDOW[1] / self.period))
         span = max(4, span)
         x = self.value
         centred = x - x.mean(1, keepdims=True)
@@ -109,7 +110,7 @@ class Model:
     @property
     def parted(self) -> bool:
         """Whether the rows fitted are long enough to tell load from drift."""
-        return bool(self.inside.sum() * self.period >= _LEAST)
+        return bool(self.inside.sum() * self.period >= LEAST)
 
     @property
     def whole(self) -> np.ndarray:
@@ -135,6 +136,18 @@ class Model:
         filtered = self.precision[:, : len(self.used)] @ pattern
         whole = np.concatenate([value, self._products], axis=1)
         return whole @ filtered / (pattern @ filtered[: len(self.used)])
+
+    def moments(self, every: bool = False) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """Of windows of the bins fitted or of all: rows of one, moments (w, q, q) of changes within each, of
+        electrodes and products, floor (q,) of a window's noise, and middles (w,) [s]."""
+        whole = self.whole if every else self.whole[self.inside]
+        span = max(4, int(min(CHANGES / self.period, len(whole) // 32)))
+        w = len(whole) // span
+        cells = whole[: w * span].reshape(w, span, -1)
+        cells = cells - cells.mean(1, keepdims=True)
+        floor = np.concatenate([self.noise**2, np.full(whole.shape[1] - len(self.used), 0.02)]) * span
+        middle = self.time[: w * span].reshape(w, span).mean(1)
+        return span, np.einsum("wsi,wsj->wij", cells, cells), floor, middle
 
     def levels(self, series: np.ndarray, every: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Means (w, ...) of a series (m, ...) over cells, of the bins fitted or of all, and the cells' times

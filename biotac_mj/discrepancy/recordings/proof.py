@@ -2,19 +2,22 @@
 whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
 from . import electronics, sampling
 from .between import force_view
 from .findings import Finding
-from .recording import MIN_ROWS
+from .model import CHANGES
+from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
 
-__all__ = ["prove", "views"]
+__all__ = ["NOISELESS", "prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
 # number that a fault of samples or of the electronics is found by, and its value where there is none
+NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
 
 
@@ -78,6 +81,8 @@ def _counts(session, without, finding):
         else:
             mine = np.flatnonzero(np.isin(m.used, finding.channels))
             series = m.alone(value)[:, mine] * m.slope[mine]
+            if finding.id in ("gain", "flip"):  # about which level a change turns, nothing says
+                series = series - uniform_filter1d(series, int(CHANGES / m.period), axis=0)
             floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
         for rows in (aside, first):
             out.append(float(np.sqrt(np.mean(series[rows] ** 2))) if series.shape[1] else np.nan)
@@ -168,7 +173,7 @@ def _force(session, finding):
     for chain in (known, [*known, finding]):
         view = force_view(session, ~session.fit, chain)
         out.append(np.nan if view is None else float(np.exp(0.5 * view.errors().mean())))
-    floor = float(np.mean(noise_level(session.recording.force[session.fit], None, 1e-6)))
+    floor = float(np.mean(noise_level(session.recording.force[session.fit], None, NOISELESS)))
     return *out, floor, "N", "RMS error of force from electrodes, by blocks of that part"
 
 
@@ -186,7 +191,7 @@ def views(session: Session) -> dict:
     else:
         each = [_at_rest(s) for s in (bare, session)]
         out["electrodes at rest"] = _view("counts", each, "channels", sample)
-    if session.recording.force is not None and session.recording.force.std(0).max() > 0.02:
+    if session.recording.force is not None and session.recording.force.std(0).max() > FORCE_MOVED:
         # a drift that load has blurred may be right for the electrodes and wrong for the force, whose own
         # trend it resembles: the last rows fitted choose, said from those before them
         fit = np.flatnonzero(session.fit)
@@ -196,7 +201,7 @@ def views(session: Session) -> dict:
             (session, still), key=lambda s: np.sum(_force_said(s, fit[: int(0.7 * len(fit))], late) ** 2)
         )
         each = [_force_said(s, fit, np.flatnonzero(~s.fit)) for s in (bare, best)]
-        noise = noise_level(session.recording.force[session.fit], None, 1e-6)
+        noise = noise_level(session.recording.force[session.fit], None, NOISELESS)
         out["force from electrodes"] = _view("N", each, "components", noise)
     return out
 

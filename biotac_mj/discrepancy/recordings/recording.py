@@ -10,10 +10,11 @@ import numpy as np
 from ...recordings import load_one
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
-__all__ = ["BUS_RATE", "Recording", "read_recording"]
+__all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
 
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
+FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 MIN_ROWS = 400  # fewer leave no part to keep aside
 
 
@@ -129,7 +130,10 @@ def read_recording(
     found, _ = load_one(electrodes, force=force, tdc=tdc, rate=rate)
     counts, assumed = found.counts()
     if assumed:  # a rest that is assumed would itself be found
-        raise ValueError(f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign")
+        raise ValueError(
+            f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign: give the log "
+            "from before its rest was subtracted, or add the counts at rest again"
+        )
     out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: no electrode changes, the logger stood still: record again")

@@ -18,6 +18,7 @@ from ..plain_values import plain_values
 from .amended import amended_sensor
 from .confidence import clues
 from .findings import KINDS, Finding
+from .proof import NOISELESS
 from .search import RecordingDiagnosis
 
 __all__ = ["summary", "verdict_dict", "write_report"]
@@ -100,12 +101,16 @@ def _apart(f: Finding) -> dict:
     }
 
 
+def _noise(gap: dict) -> str:
+    return "none" if math.isclose(gap["noise"], NOISELESS) else f"{gap['noise']:.2g}"
+
+
 def _proof(f: Finding) -> str:
     if not f.gap:
         return "nothing of it in the part kept aside: not checked"
     g = f.gap
     sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[f.verified]
-    return f"{g['name']} {g['before']:.3g} -> {g['after']:.3g} {g['unit']}, noise {g['noise']:.2g} ({sign})"
+    return f"{g['name']} {g['before']:.3g} -> {g['after']:.3g} {g['unit']}, noise {_noise(g)} ({sign})"
 
 
 def summary(diagnosis: RecordingDiagnosis) -> str:
@@ -132,7 +137,7 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
     for name, view in d.gap.items():
         lines.append(
             f"  {name}: {view['before']:.4g} -> {view['after']:.4g} {view['unit']} RMS on the part kept "
-            f"aside, noise {view['noise']:.2g}"
+            f"aside, noise {_noise(view)}"
         )
     if left := amended_sensor(d)[1]:
         lines.append(
@@ -285,7 +290,7 @@ def _page(d, pictures):
         )
     effects = "".join(rows) or "<tr><td colspan=7>nothing</td></tr>"
     gaps = "".join(
-        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{v['noise']:.2g}</td>"
+        f"<tr><td>{esc(n)}</td><td>{v['before']:.4g}</td><td>{v['after']:.4g}</td><td>{_noise(v)}</td>"
         f"<td>{esc(v['unit'])}</td><td>{v['variance_removed']:.1%}</td></tr>"
         for n, v in d.gap.items()
     )

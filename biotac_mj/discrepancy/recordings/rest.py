@@ -58,6 +58,7 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     clues |= _whole(session)
+    clues["change1"] = _changed(m) if m.dimensions else 0.0
     # without a load, or where it is not told from a drift, something else is usual
     kind = "loaded" if session.loaded else "moving" if m.moved else "still"
     p = unusual(clues, f"left_{kind}")
@@ -83,6 +84,24 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
             for c in listed
         )
     return Rest(p <= UNKNOWN, text, f"left_{kind}", listed, clues, p)
+
+
+def _changed(m):
+    """How much worse electrodes are said by what they had to do with each other up to some time than by what
+    they have to do with each other after it: a logarithm, of the worst electrode and time."""
+    _, moment, floor, _ = m.moments(every=True)
+    c, w, worst = len(m.used), len(moment), 0.0
+
+    def left(weights_of, rows):  # (rows, c) squares of what the others do not say
+        P = np.linalg.inv(moment[weights_of].mean(0) + np.diag(floor))[:c]
+        square = np.einsum("ki,wij,kj->wk", P, moment[rows], P)
+        return np.log(square / np.diag(P) ** 2 + floor[:c])
+
+    for first in (w // 3, w // 2, 2 * w // 3):
+        odd, even = np.arange(first, w, 2), np.arange(first + 1, w, 2)
+        change = [left(slice(first), rows) - left(rest, rows) for rows, rest in ((odd, even), (even, odd))]
+        worst = max(worst, np.median(np.concatenate(change), axis=0).max())
+    return float(np.log(worst + 0.1))
 
 
 def _whole(session):

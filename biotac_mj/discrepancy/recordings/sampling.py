@@ -6,8 +6,9 @@ import numpy as np
 from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
 from scipy.stats import poisson
 
+from ...sensor.channels import FULL_SCALE
 from ..evidence import sign_flip
-from ..noise import noise_level, sound_noise
+from ..noise import ROUNDING, noise_level, sound_noise
 from .courses import BLOCKS
 from .findings import Finding
 from .session import Session
@@ -18,10 +19,12 @@ _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
+_BEGUN = 2.0  # [s] within which it is known when an effect on all electrodes begins
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
+_CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
@@ -54,16 +57,20 @@ def _finding(session, name, channels, parameters, mask, note, strength, blocks, 
         at[0] / rate,
         at[-1] / rate,
         note,
-        clues={"nats": float(np.log1p(np.sum(strength))), "blocks": float(np.mean(np.asarray(strength) > 0))},
+        clues={
+            "nats": float(np.log1p(np.sum(strength))),
+            "blocks": float(np.mean(np.asarray(strength) > 0)),
+        },
         mask=mask,
         correct=correct,
     )
 
 
 def _by_block(flags, chance):
-    """(blocks,) nats by which flags (n,) are more frequent than chance, in each block."""
-    share = np.array([b.mean() for b in np.array_split(flags.astype(float), BLOCKS)])
-    size = len(flags) / BLOCKS
+    """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
+    blocks = min(BLOCKS, len(flags))
+    share = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
+    size = len(flags) / blocks
     share, chance = np.clip(share, 1e-9, 1), np.clip(chance, 1e-9, 1)
     return np.sign(share - chance) * size * np.abs(share * np.log(share / chance) - share + chance)
 
@@ -85,7 +92,7 @@ def quantised(session: Session) -> list[Finding]:
     # levels that lie far apart look alike, but are no multiples of anything
     if 1 < len(coarse) < 0.5 * told.sum():
         coarse = np.flatnonzero(lattice > 1)
-    if not len(coarse):
+    if len(coarse) < 2:  # one converter reads all
         return []
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
@@ -163,7 +170,7 @@ def _held(session):
                     BLOCKS,
                 )
             ]
-    return _dithered(session) if held.mean() < 0.4 else []
+    return (_dithered(session) if held.mean() < 0.4 else []) or _hung(session)
 
 
 def _dithered(session):
@@ -211,6 +218,45 @@ def _dithered(session):
     ]
 
 
+def _hung(session):
+    """Stretches in which the noise of all electrodes is far below what it is elsewhere and what a sensor's
+    is: rows that are held, carried on by less noise."""
+    x, n, rate = _rows(session)
+    rows = np.flatnonzero(~session.recording.repeated)
+    k = (len(rows) - 3) // _STILL
+    if k < 2 * BLOCKS or any(f.id == "quantise" for f in session.findings):
+        return []
+    bend = np.diff(session.recording.electrodes[rows], n=3, axis=0)[: k * _STILL]
+    size = np.sqrt((bend.reshape(k, _STILL, 19) ** 2).mean(1) / 20)
+    usual = np.median(size, axis=0)
+    # neither a noise that was added elsewhere, nor rounding
+    least = np.minimum(usual, sound_noise(np.median(x, axis=0)))
+    left = np.median(size / np.maximum(least, _ALIVE), axis=1)
+    calm = left < _CALM
+    start, length = _runs(calm)
+    long = calm[start] & (length >= 4)
+    # the last may be a filter that was switched on
+    if np.median(usual) < _ALIVE or np.count_nonzero(long[:-1]) < 2:
+        return []
+    mask, weight = np.zeros(n, bool), np.zeros(k)
+    for a, m in zip(start[long], length[long]):
+        mask[rows[a * _STILL] : rows[min((a + m) * _STILL, len(rows) - 1)]] = True
+        weight[a : a + m] = _STILL * 19 * (0.5 * left[a : a + m] ** 2 - 0.5 - np.log(left[a : a + m] + 0.01))
+    seconds = float(mask.sum() / rate)
+    found = _finding(
+        session,
+        "freeze",
+        range(19),
+        {"seconds": (seconds, seconds, seconds)},
+        np.repeat(mask[:, None], 19, axis=1),
+        f"for {seconds:.1f} s, in {long.sum()} stretches, all electrodes have hardly any noise",
+        [part.sum() for part in np.array_split(weight, BLOCKS)],
+        BLOCKS,
+    )
+    found.p = 0.5 ** int(length[long].sum())
+    return [found]
+
+
 def _between(x, usual):
     """(n,) bool, rows of x (n, 19) in which less than a quarter of the electrodes take a new value."""
     step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
@@ -220,7 +266,8 @@ def _between(x, usual):
 def _stretch(mask):
     """What a mask (n,) says from its first to its last row, at least one row a block."""
     on = np.flatnonzero(mask)
-    return mask[on[0] : max(on[-1] + 1, on[0] + BLOCKS)]
+    first = min(on[0], len(mask) - BLOCKS)
+    return mask[first : max(on[-1] + 1, first + BLOCKS)]
 
 
 def _runs(x):
@@ -248,10 +295,14 @@ def _still(session):
     size = np.sqrt(np.maximum(uniform_filter1d(bend, _STILL, axis=0), 0)) / law
     lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
     usual, loud = (_middle(values, lively) for values in (size, law))
-    usual = np.fmin(usual, np.nanmedian(usual))  # spikes and bursts are not a channel's noise
+    others = np.nanmedian(usual)
+    # spikes and bursts are not a channel's noise, nor is what is left to one that trembled from the start
+    usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
     # without noise a constant reading is no news
     alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
-    quiet = (size < _QUIET * usual) & alive
+    # at an end of the converter nothing is measured, however little noise there was before
+    railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _STILL, axis=0)[1:-1] > 0
+    quiet = (size < _QUIET * usual) & alive | railed
     share = quiet.mean(0)
     found = []
     # where several stand still at times it is nothing of one channel
@@ -267,6 +318,9 @@ def _still(session):
         # a row that repeats another is as that one
         before = np.maximum(np.searchsorted(rows, np.arange(len(whole)), "right") - 1, 0)
         mask[:, k] = at[before]
+        # of equal readings all are held or none: a window tells the middle of them alone
+        run = np.cumsum(np.diff(whole[:, k], prepend=np.nan) != 0)
+        mask[:, k] |= np.isin(run, run[mask[:, k]])
         found += _stood(session, int(k), mask, rate)
     return found
 
@@ -287,7 +341,10 @@ def _stood(session, k, mask, rate):
     ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
     on = np.flatnonzero(mask[:, k])
     stays = mask[on[0] : on[-1] + 1, k].mean() > 0.8  # a limit is left when the load goes back
-    for side, mine in ((-1, values <= ends[0] + 3), (1, values >= ends[1] - 3), (0, None)):
+    # and a limit is reached by going there: what lies far beyond where it moves is none
+    near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
+    low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
+    for side, mine in ((-1, low), (1, high), (0, None)):
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
         mine = np.ones(len(values), bool) if mine is None else mine
@@ -296,8 +353,10 @@ def _stood(session, k, mask, rate):
             rest[a : a + n, k] = False
         if not rest.any() or (side == 0 and (found or length.max() < 0.25 * rate)):
             continue
-        # nothing is fitted here, so what begins in the rows kept aside is told from these alone
-        flags = rest[session.fit, k] if rest[session.fit, k].any() else rest[:, k]
+        # nothing is fitted here, so what is mostly in the rows kept aside is told from these alone
+        flags = rest[session.fit, k]
+        if flags.sum() < rest[~session.fit, k].sum():
+            flags = rest[:, k] & ~session.fit
         value = float(np.median(values[mine]))
         spread = float(np.ptp(values[mine])) / 2 + 0.5
         name, key = ("saturate", "level") if side else ("stuck", "value")
@@ -317,6 +376,8 @@ def _stood(session, k, mask, rate):
         found[-1].beyond = side
         found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
         found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
+        if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
+            found[-1].ties = ("saturate",)  # of one stay at an end of what it reads
         if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
             found[-1].ties = ("gain",) if side else ("gain", "saturate")
     return found
@@ -362,7 +423,7 @@ def _outliers(x, coarse):
     before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
     around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
     # lively stretches leave the median by more
-    limit = np.maximum(np.maximum(10 * noise_level(x), 25) + 4 * coarse, 10 * around)
+    limit = np.maximum(10 * noise_level(x, least=ROUNDING) + 4 * coarse, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
 
 
@@ -399,9 +460,19 @@ def lost(session: Session) -> list[Finding]:
     for i in order[:60]:
         if score[i] > 3 * np.maximum(around[i], 1) and score[i] > 4 and all(abs(i - j) > 12 for j in places):
             places.append(int(i))
-    # after rows that were held the load has moved on
+    # after rows that were held, trembling or not, the load has moved on
+    bend = np.abs(np.diff(x, n=3, axis=0))
+    usual = np.maximum(np.median(bend, axis=0), 0.5)
+    # and where something else of all electrodes begins they all change
+    begun = [
+        f.start for f in session.findings if len(f.channels) > 12 and "course" not in f.clues and f.start > 0
+    ]
     places = [
-        i for i in places if not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
+        i
+        for i in places
+        if all(abs(rows[i + h] / r.rate - start) > _BEGUN for start in begun)
+        and not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
+        and np.median(bend[max(i + h - 2 * _STILL, 0) : i + h - 3] / usual) > 0.4
     ]
     places = _in_order(places, x, left[:-h], right[h:], h)
     if not places:

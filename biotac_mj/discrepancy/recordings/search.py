@@ -2,6 +2,7 @@
 kept aside."""
 
 import dataclasses
+import math
 
 import numpy as np
 import tqdm
@@ -9,14 +10,15 @@ import tqdm
 from ..evidence import benjamini_hochberg
 from .between import find_between
 from .confidence import NAMED, confidence
-from .electronics import coloured, correlated, humming, noisy
+from .electronics import coloured, correlated, humming, muted, noisy
 from .findings import Finding
 from .gains import gains, undecided
 from .jumps import jumped
 from .levels import levels, settle
+from .model import LEAST, WINDOW
 from .order import exchanged
 from .proof import prove, views
-from .recording import Recording
+from .recording import FORCE_MOVED, Recording
 from .rest import Rest, rest
 from .sampling import lost, sampling_faults
 from .session import Session
@@ -71,7 +73,7 @@ def diagnose_recording(
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
     fit = np.arange(n) < round(n * (1 - locked))
-    with tqdm.tqdm(total=5, desc="diagnose", disable=not progress, leave=False) as bar:
+    with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         session, weak = Session(recording, fit), []
         _search(session, weak, named, bar)
         late = _late(session, named)
@@ -129,8 +131,7 @@ def _search(session, weak, named, bar):
         take(finding)
     # held rows have a colour, and what is left of a wave is common, by themselves
     if not {f.id for f in session.findings} & {"freeze", "hum"}:
-        for find in (coloured, correlated):
-            finding = find(session)
+        for finding in (coloured(session) or muted(session), correlated(session)):
             if finding is not None:
                 take(finding)
     for finding in noisy(session):
@@ -212,15 +213,24 @@ def _late(session, named):
 
 
 def _notes(recording, session):
+    loads = "gains, saturation, the sign of an electrode"
     out = [f"{recording.rate:.1f} Hz: {recording.rate_source}"]
     if recording.force is None:
         out.append("no force: latency, relaxation and hysteresis between force and electrodes")
     if recording.tdc is None:
         out.append("no TDC: whether a warm-up is the liquid's temperature")
     if not session.model().parted:
-        out.append("too short to tell a load from a drift: slow changes of single electrodes")
-    if not session.loaded:
-        out.append("not loaded: gains, saturation, the sign of an electrode")
+        out.append(
+            f"too short to tell touches from drift, record {math.ceil(LEAST / session.fit.mean())} s or "
+            f"more: slow changes of single electrodes, {loads}"
+        )
+    elif not session.loaded and recording.force is not None and recording.force.std(0).max() > FORCE_MOVED:
+        out.append(
+            "touches could not be told from drift, record some at several places that each change electrodes "
+            f"by tens of counts within {WINDOW[0]:g} s: {loads}"
+        )
+    elif not session.loaded:
+        out.append(f"not loaded: {loads}")
     if recording.rest_correlation < 0.3:
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"

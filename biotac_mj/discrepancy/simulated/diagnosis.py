@@ -193,7 +193,7 @@ def diagnose_simulated(
     models = list(_models(response, straight, mechanisms))
     base, plain = Setup(gains=0.0), response.amended(np.zeros(len(response.changes)))
     sensors, tested = [], {model.id: [] for model in models}
-    bar = tqdm(total=len(recordings) * (1 + len(models)), desc="models", unit="model", disable=quiet)
+    bar = tqdm(total=len(recordings) * (1 + len(models)), desc="models", unit="model", disable=quiet or None)
     for recording in recordings:
         rows, locked = press_rows(recording)
         # every model goes on from here: what going on alone brings must not count for it

@@ -15,9 +15,12 @@ from .thresholds import THRESHOLDS
 if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
-__all__ = ["Candidate", "compose"]
+__all__ = ["Candidate", "compose", "resumed"]
 
 _SETUP = {"misalign", "depth0"}  # on every short list: what most often is wrong, and cheap to look at
+_LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
+_SOLVED = 2  # times that the skin is solved for an effect that moves the object,
+_WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit
 _BEAMS = 3
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
@@ -73,26 +76,20 @@ def compose(
     """
     bar = tqdm.tqdm(total=0, disable=True) if bar is None else bar
     first = _round(comparison, null, null, usable, chosen, seed, bar)
-    accepted = [c for c in first if not c.refused]
-    if not accepted:
-        return null, [], [first]
-    _rank(accepted[0], first)
     ends = {}
-    tied = [accepted[0], *[c for c in accepted[1:] if c.effect.id in accepted[0].ties]]
-    for start in tied[:_BEAMS]:
-        fit, found, rounds = start.fit, [start], [first]
-        while len(found) < THRESHOLDS["most"]:
-            step = _round(comparison, fit, null, usable, chosen, seed, bar)
-            rounds.append(step)
-            able = [c for c in step if not c.refused]
-            if not able:
-                break
-            best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
-            _rank(best, step)
-            found, fit = [*found, best], best.fit
-        held = found[-1].held
-        fit, found = _needed(comparison, fit, found, chosen)
-        ends[start.effect.id] = fit, found, rounds, held - THRESHOLDS["gain"] * len(found)
+    # Where what only promises comes to nothing, what stands by itself begins.
+    for accepted in ([c for c in first if _promising(c)], [c for c in first if not c.refused]):
+        if not accepted or any(found for _, found, *_ in ends.values()):
+            break
+        _rank(accepted[0], first)
+        tied = [accepted[0], *[c for c in accepted[1:] if c.effect.id in accepted[0].ties]]
+        ends = {}
+        for start in tied[:_BEAMS]:
+            fit, found, rounds, held = _grown(comparison, start.fit, [start], null, usable, chosen, seed, bar)
+            ends[start.effect.id] = fit, found, [first, *rounds], held - THRESHOLDS["gain"] * len(found)
+    if not ends:
+        return null, [], [first]
+    ends = {k: e for k, e in ends.items() if e[1]} or ends
     size = [sum(len(c.effect.params) for c in e[1]) for e in ends.values()]
     winner = list(ends)[_simplest([(e[3], k) for e, k in zip(ends.values(), size)])]
     fit, found, rounds, score = ends[winner]
@@ -113,10 +110,49 @@ def compose(
                 for c, other in zip(others, swapped)
                 if other is not None and _tied(held - zero, other - zero, c.effect.id in kin)
             ]
+    return fit, _told_apart(found), rounds
+
+
+def _told_apart(found):
+    """Candidates without ties to each other: both are named."""
     named = {c.effect.id for c in found}
     for c in found:
         c.ties = [t for t in c.ties if t not in named]
-    return fit, found, rounds
+    return found
+
+
+def resumed(
+    comparison: "Comparison",
+    null: Fit,
+    current: Fit,
+    found: list,
+    usable: list,
+    chosen: np.ndarray,
+    seed: int,
+    bar: tqdm.tqdm,
+) -> tuple[Fit, list, list]:
+    """`compose` gone on with from effects that were found with another scatter of poses: fit, found, and the
+    further rounds."""
+    fit = fit_effects(comparison, current.effects, chosen, current)
+    fit, found, rounds, _ = _grown(comparison, fit, found, null, usable, chosen, seed, bar)
+    return fit, _told_apart(found), rounds
+
+
+def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
+    """Fit and Candidates with the best one of every further round, without what is not needed then; rounds;
+    evidence (chosen,) left out before that."""
+    rounds, found = [], list(found)
+    while len(found) < THRESHOLDS["most"]:
+        step = _round(comparison, fit, null, usable, chosen, seed, bar)
+        rounds.append(step)
+        able = [c for c in step if _promising(c)]
+        if not able:
+            break
+        best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
+        _rank(best, step)
+        found, fit = [*found, best], best.fit
+    held = found[-1].held
+    return *_needed(comparison, fit, found, chosen, seed), rounds, held
 
 
 def _instead(comparison, fit, winner, other, chosen, seed):
@@ -183,8 +219,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     out = []
     bar.total += len(short)
     for _, effect, start in short:
-        trial = [*current.effects, (effect, start)]
-        fit = fit_effects(comparison, trial, chosen, current)
+        fit = _refit(comparison, effect, start, chosen, current)
         held = fit.evidence(comparison)[chosen]
         if not _hopeless(held - reference[chosen], out, effect, bool(known)):
             held = _left_out(comparison, fit, chosen, seed)[chosen]
@@ -208,6 +243,29 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
+
+
+def _refit(comparison, effect, start, chosen, current):
+    """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
+    once more: differences do not reach far."""
+    fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
+    if effect.stage not in "SB" and effect.id != "friction":
+        return fit
+    for _ in range(_SOLVED):
+        gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
+        theta = fit.effects[-1][1]
+        if gain < _WORTH or (effect.id in _SETUP and _repeatable(comparison, effect, theta, chosen)):
+            break
+        if not comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen):
+            break
+        fit = fit_effects(comparison, [*current.effects, (effect, theta)], chosen, fit)
+    return fit
+
+
+def _repeatable(comparison, effect, theta, chosen):
+    """Whether a set-up's offset is within what its trials' scatter makes of the mean."""
+    limit = comparison.repeatability / np.sqrt(len(chosen)) * 2
+    return all(abs(theta[n]) * (_LEVER if effect.params[n].unit == "rad" else 1) < limit for n in effect.free)
 
 
 def _hopeless(gain, others, effect, beside) -> bool:
@@ -240,28 +298,34 @@ def _refused(comparison, one, chosen, present) -> list:
     out = [k for k, v in numbers.items() if v <= THRESHOLDS[k]] + (["p"] if one.p >= THRESHOLDS["p"] else [])
     if all(min(abs(v - p.low), abs(v - p.high)) < 1e-3 * p.scale for v, p in params):
         out.append("bound")
-    if present and one.nats <= THRESHOLDS["further"]:
-        out.append("further")
     # What is left of an effect whose true law is a little different looks like those that it is confused
     # with.
     alike = any(one.effect.id in e.confusable or e.id in one.effect.confusable for e in present)
-    if alike and one.energy <= THRESHOLDS["form"]:
+    kin = any(one.effect.id in e.kin or e.id in one.effect.kin for e in present)
+    if present and one.nats <= THRESHOLDS["further"] * (2 if alike or kin else 1):
+        out.append("further")
+    if alike and one.energy <= THRESHOLDS["form"] or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
-    if one.effect.id in _SETUP and all(
-        abs(v) < comparison.repeatability / np.sqrt(len(chosen)) * 2 for v, _ in params
-    ):
+    if one.effect.id in _SETUP and _repeatable(comparison, one.effect, theta, chosen):
         out.append("repeatability")
     return out
 
 
-def _needed(comparison, current, found, chosen):
-    """Without every effect whose removal costs nothing significant."""
-    for item in list(found) if len(found) > 1 else ():
+def _promising(one) -> bool:
+    """Whether an effect may be built upon: `_needed` has the last word, when others no longer hide it."""
+    return not one.refused or (one.refused == ["p"] and one.p < THRESHOLDS["promising"])
+
+
+def _needed(comparison, current, found, chosen, seed):
+    """Without every effect whose removal costs nothing significant on trajectories left out."""
+    for item in sorted(found, key=lambda c: -c.p) if len(found) > 1 or found[0].refused else ():
+        held = _left_out(comparison, current, chosen, seed)[chosen]
         rest = [(e, th) for e, th in current.effects if e.id != item.effect.id]
         reduced = fit_effects(comparison, rest, chosen, current)
-        loss = (current.evidence(comparison) - reduced.evidence(comparison))[chosen]
-        if sign_flip(loss) > THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
+        loss = held - _left_out(comparison, reduced, chosen, seed)[chosen]
+        item.p = sign_flip(loss)
+        if item.p >= THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
             current, found = reduced, [f for f in found if f is not item]
     return current, found

@@ -123,7 +123,8 @@ def fit_effects(
             table[eid][name] = (
                 float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
             )
-        return filled, Nuisance(float(v[0]), 0.0 if sliding else float(v[1]), float(v[2]), float(v[3]))
+        base = Nuisance(*map(float, v[:_N]))
+        return filled, dataclasses.replace(base, log_friction=0.0) if sliding else base
 
     weight = np.ones(len(comparison.trajectories))
 

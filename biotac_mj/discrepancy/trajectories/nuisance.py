@@ -2,19 +2,23 @@
 effect's name.
 
 Modulus and friction; the width of the contact's footprint on the electrodes; how far the answer lies between
-this mesh and another one."""
+this mesh and another one, between the full tier and the condensed one; how thick the film stays where the
+skin lies on the core."""
 
 import dataclasses
 import functools
 
 import numpy as np
 
-__all__ = ["HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
+__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
-# is a finding (`skin_and_setup.Friction`).
-PRIOR = np.array([0.4, 0.1, 0.05, 0.7])
-LOW, HIGH = np.array([-1.5, -0.15, -0.2, -1.0]), np.array([1.5, 0.15, 0.2, 2.0])
+# is a finding (`skin_and_setup.Friction`). The film has 20 to 100 um where 50 are the default
+# (`sensor.film.FilmConduction`).
+PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5])
+LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2])
+HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2])
+BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `simulator.Fields`
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 
@@ -22,19 +26,22 @@ OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
     """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its
-    neighbourhood shows; mesh: 0 this mesh, 1 the other."""
+    neighbourhood shows; mesh: 0 this mesh, 1 the other; tier: 0 full, 1 condensed, where the skin is of the
+    full tier; log_film: log of the factor on the film's least thickness."""
 
     log_modulus: float = 0.0
     log_friction: float = 0.0
     footprint: float = 0.0
     mesh: float = 0.0
+    tier: float = 0.0
+    log_film: float = 0.0
 
     @property
     def modulus(self) -> float:
         return float(np.exp(self.log_modulus))
 
     def vector(self) -> np.ndarray:
-        """(4,)"""
+        """(6,)"""
         return np.array(dataclasses.astuple(self))
 
     def moved(self, **by: float) -> "Nuisance":

@@ -25,7 +25,7 @@ from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
 from ...skin.settings import plain, read_dict, read_material, read_settings
-from .nuisance import KNOWN, OTHER_MESH, Nuisance, widen
+from .nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, widen
 
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
@@ -37,6 +37,8 @@ _SHIFT = 40e-6  # [m] of the poses for differences
 _DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
 _FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
 _RADIUS, _BUBBLE = 0.15, 8e-9
+_NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
+_FILM = 0.5  # of the logarithm of its least thickness
 _UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
@@ -213,46 +215,55 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 13 solutions of the data set, kept in
-        `cache`."""
+        """The skin along the trajectories and its differences: 14 solutions of the data set by the condensed
+        tier, beside one of the simulator's own; kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
+        # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
+        quick = self if self.tier == "condensed" else self._but(tier="condensed")
         with tqdm.tqdm(
-            total=(12 + spheres) * len(trajectories), desc="skin", disable=not progress, leave=False
+            total=(13 + spheres + (quick is not self)) * len(trajectories),
+            desc="skin",
+            disable=not progress or None,
+            leave=False,
         ) as bar:
-            tick = bar.update
+            tick, slopes = bar.update, {}
             base = self.solve(trajectories, progress=tick)
-            slopes = {}
-            # What the whole skin differs by is taken from the condensed tier, whose price is seconds.
-            quick = self if self.tier == "condensed" else self._but(tier="condensed")
-            here = base if quick is self else quick.solve(trajectories)
+            here = base
+            if quick is not self:
+                here = quick.solve(trajectories, progress=tick)
+                slopes["tier"] = _about_rest(_difference(here, base))
             if self.skin in OTHER_MESH:
                 there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
-                slopes["mesh"] = [
-                    {k: (b[k] - b[k][0]) - (a[k] - a[k][0]) for k in a} for a, b in zip(here, there)
-                ]
+                slopes["mesh"] = _about_rest(_difference(there, here))
+            film = read_dict(self.options, "options").get("film") or {}
+            thicker = {"residual_film": np.exp(_FILM) * self._model(0.0, 0.0)[1].residual_film}
+            thicker = quick._but(options=self.options | {"film": {**film, **thicker}})
+            slopes["log_film"] = _about_rest(
+                _difference(thicker.solve(trajectories, progress=tick), here, _FILM)
+            )
             slopes |= quick._uneven(trajectories, here, tick)
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
-                moved = self.solve(
+                moved = quick.solve(
                     trajectories,
                     offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
                     progress=tick,
                 )
-                slopes["xyz"[axis]] = _difference(moved, base, _SHIFT)
-            slopes |= self._bending(trajectories, base, slopes, tick)
+                slopes["xyz"[axis]] = _difference(moved, here, _SHIFT)
+            slopes |= quick._bending(trajectories, here, slopes, tick)
             if spheres:
                 slopes["radius"] = _difference(
-                    self.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
-                    base,
+                    quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
+                    here,
                     _RADIUS,
                 )
-            less, more = (self.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
-            slopes["friction"], slopes["friction2"] = _parabola(less, base, more, *_FRICTION)
+            less, more = (quick.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
+            slopes["friction"], slopes["friction2"] = _parabola(less, here, more, *_FRICTION)
             slopes["bubble"] = _difference(
-                self.solve(trajectories, bubble=_BUBBLE, progress=tick), base, _BUBBLE
+                quick.solve(trajectories, bubble=_BUBBLE, progress=tick), here, _BUBBLE
             )
-        return Fields(base, slopes, trajectories)
+        return Fields(base, slopes, trajectories, here)
 
     def _bending(self, trajectories, base, slopes, tick):
         """What linear differences miss along the press: "press" per m, "bend" per m^2."""
@@ -305,34 +316,30 @@ class Simulator:
         """
         effects = self.effects if effects is None else effects
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
-        base = fields.base if fields is not None else self.solve(trajectories)
+        fields = Fields(self.solve(trajectories), {}, trajectories) if fields is None else fields
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
         before = [(e, th) for e, th in ordered if e.stage in "SB" or e.id == "friction"]
         after = [(e, th) for e, th in ordered if (e, th) not in before]
         session, runs = {}, []
-        first = trajectories[0].tdc
-        for i, t in enumerate(trajectories):
-            run = _begin(i, t, base[i], session, first)
+        for i, begun in enumerate(fields.begun):
+            run = copy.copy(begun)
+            run.session, run.modulus, run.log_friction = session, modulus, nuisance.log_friction
+            run.log_z = begun.log_z.copy()
+            run.stiffness = modulus * begun.stiffness
             run.scale_load(modulus)
-            run.modulus = modulus
-            run.stiffness = modulus * _stiffness(
-                base[i], None if fields is None else [fields.slopes[a][i] for a in "xyz"], t
-            )
-            run.log_friction = nuisance.log_friction
-            if fields is not None:
-                run.answers = {way: fields.slopes[way][i] for way in _MAPS if way in fields.slopes}
             if offsets is not None:
                 run.offset = run.offset + offsets[i]
             for effect, theta in before:
                 effect.apply(run, theta)
             runs.append(run)
-        self._mechanics(trajectories, runs, base, fields, exact, modulus)
+        self._mechanics(trajectories, runs, fields, exact, modulus, before)
+        shares = [(getattr(nuisance, name), name) for name in BETWEEN if name in fields.slopes]
         for i, run in enumerate(runs):
-            if nuisance.mesh and fields is not None and "mesh" in fields.slopes:
-                other = fields.slopes["mesh"][i]
-                run.force = run.force + nuisance.mesh * modulus * other["force"]
-                run.pressure = run.pressure + nuisance.mesh * modulus * other["pressure"]
-                run.log_z = run.log_z + nuisance.mesh * other["log_z"]
+            between = sum(share * fields.stacked[name][i] for share, name in shares if share)
+            if np.ndim(between):
+                run.force = run.force + modulus * between[:, :3]
+                run.pressure = run.pressure + modulus * between[:, 3]
+                run.log_z = run.log_z + between[:, 4:]
             if nuisance.footprint:
                 run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint)
         for run in runs:
@@ -347,7 +354,42 @@ class Simulator:
                     effect.apply(run, theta)
         return runs
 
-    def _mechanics(self, trajectories, runs, base, fields, exact, modulus):
+    def bend(self, fields: "Fields", effects: list, nuisance: Nuisance, which: np.ndarray) -> bool:
+        """Solves the skin of trajectories `which` with the effects in place, and keeps with the fields what
+        their differences miss of the last one: from then on `exact=False` is right at its parameters.
+
+        Returns: whether that was needed; not where it was solved near them already."""
+        effect, theta = effects[-1]
+        there, curve = fields.curves.get(effect.id, ({}, {}))
+        size = {n: p.scale for n, p in effect.params.items()}
+        if set(which) <= set(curve) and sum(
+            ((theta[n] - there[n]) / s) ** 2 for n, s in size.items()
+        ) < _NEAR**2 * sum((there[n] / s) ** 2 for n, s in size.items()):
+            return False
+        some = [fields.trajectories[i] for i in which]
+        quick = self if self.tier == "condensed" else self._but(tier="condensed")
+        fields.curves.pop(effect.id, None)
+        plain = dataclasses.replace(
+            nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0
+        )
+        moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
+        part = Fields(
+            [fields.quick[i] for i in which],
+            {k: [v[i] for i in which] for k, v in fields.slopes.items()},
+            some,
+            curves={
+                k: (th, {j: c[i] for j, i in enumerate(which) if i in c})
+                for k, (th, c) in fields.curves.items()
+            },
+        )
+        near, true = (quick.run(some, part, exact, moving, 1.0, None, plain) for exact in (False, True))
+        fields.curves[effect.id] = (
+            dict(theta),
+            {i: _stack(vars(b)) - _stack(vars(a)) for i, a, b in zip(which, near, true)},
+        )
+        return True
+
+    def _mechanics(self, trajectories, runs, fields, exact, modulus, moving):
         """Force, pressure and ln Z of runs whose object or contact has changed."""
         changed = [
             i
@@ -377,28 +419,32 @@ class Simulator:
                 )
         for i in sorted(set(changed) - set(anew)):
             run = runs[i]
-            change = {k: np.zeros_like(base[i][k]) for k in ("force", "pressure", "log_z")}
+            along = run.offset @ run.heading
+            shift = (
+                [("press", along), ("bend", along**2), *zip("xyz", run.offset.T)] if run.offset.any() else []
+            )
             parts = [
-                ("x", run.offset[:, 0]),
-                ("y", run.offset[:, 1]),
-                ("z", run.offset[:, 2]),
+                *shift,
                 ("radius", run.log_radius),
-                ("press", run.offset @ run.heading),
-                ("bend", (run.offset @ run.heading) ** 2),
                 ("friction", run.log_friction),
                 ("friction2", run.log_friction**2),
                 ("bubble", run.bubble),
             ]
+            change = 0.0
             for name, amount in parts:
-                if name in fields.slopes and (amount.any() if np.ndim(amount) else amount):
-                    for k in change:
-                        slope = fields.slopes[name][i][k]
-                        change[k] = change[k] + (
-                            slope * (amount[:, None] if np.ndim(amount) and slope.ndim > 1 else amount)
-                        )
-            run.force = modulus * (base[i]["force"] + change["force"])
-            run.pressure = modulus * (base[i]["pressure"] + change["pressure"])
-            run.log_z = base[i]["log_z"] + change["log_z"]
+                if name in fields.stacked and np.any(amount):
+                    slope = fields.stacked[name][i]
+                    change = change + slope * (amount[:, None] if np.ndim(amount) else amount)
+            for effect, theta in moving:
+                there, curve = fields.curves.get(effect.id, ({}, {}))
+                if i in curve:
+                    way = [(theta[n] / p.scale, there[n] / p.scale) for n, p in effect.params.items()]
+                    along = sum(a * b for a, b in way) / max(sum(b * b for _, b in way), 1e-12)
+                    change = change + max(along, 0.0) ** 2 * curve[i]
+            if np.ndim(change):
+                run.force = run.force + modulus * change[:, :3]
+                run.pressure = run.pressure + modulus * change[:, 3]
+                run.log_z = run.log_z + change[:, 4:]
 
     # --- YAML  ---
 
@@ -415,11 +461,23 @@ class Simulator:
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
     (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
-    and "bend" per m^2, along the heading beyond those; "mesh": of another mesh, about rest."""
+    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of
+    the condensed tier, "log_film": per log of the film's least thickness.
+
+    quick: base of the condensed tier. curves: effect's id -> (theta, {trajectory: what slopes miss there}),
+    see `Simulator.bend`: of a share s of theta they miss s^2 of it."""
 
     base: list
     slopes: dict
     trajectories: list
+    quick: list | None = None
+    curves: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        self.quick = self.base if self.quick is None else self.quick
+        first = self.trajectories[0].tdc
+        self.stacked = {k: [_stack(one) for one in v] for k, v in self.slopes.items()}
+        self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
 
 
 def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
@@ -434,36 +492,43 @@ def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) 
     return tool, pos
 
 
-def _begin(order, t, base, session, first_tdc):
+def _stack(one):
+    """(n, 23) force, pressure and ln Z of a solution."""
+    return np.column_stack([one["force"], one["pressure"], one["log_z"]])
+
+
+def _begin(order, t, base, slopes, first_tdc):
     from ...sensor.channels import temperature_from_counts
 
     warm = None
     if t.tdc is not None and first_tdc is not None:
         warm = temperature_from_counts(t.tdc) - temperature_from_counts(first_tdc[0])
-    touch = int(np.argmax(t.depth))
     return Run(
         time=t.time,
         clock=t.clock + t.time,
         tool=t.tool,
         heading=t.heading,
         depth=t.depth,
-        place=t.pos[touch],
+        place=t.pos[int(np.argmax(t.depth))],
         order=order,
         offset=np.zeros((len(t.time), 3)),
-        force=base["force"].copy(),
-        pressure=base["pressure"].copy(),
-        log_z=base["log_z"].copy(),
+        force=base["force"],
+        pressure=base["pressure"],
+        log_z=base["log_z"],
         temperature=warm,
-        session=session,
-        rest_log_z=base["log_z"][0].copy(),
+        session={},
+        rest_log_z=base["log_z"][0],
+        stiffness=_stiffness(base, slopes, t, order),
+        answers={way: slopes[way][order] for way in _MAPS if way in slopes},
+        pos=t.pos,
     )
 
 
-def _stiffness(base, slopes, t):
+def _stiffness(base, slopes, t, order):
     """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
-    if slopes is None:
+    if "x" not in slopes:
         return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
-    along = sum(h * s["force"] for h, s in zip(t.heading, slopes))
+    along = sum(h * slopes[x][order]["force"] for h, x in zip(t.heading, "xyz"))
     return np.maximum(-along @ t.heading, 0)
 
 
@@ -481,8 +546,12 @@ def _impedance(film, vert_xpos):
     return np.array(rows)
 
 
-def _difference(moved, base, by):
+def _difference(moved, base, by=1.0):
     return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+
+
+def _about_rest(slopes):
+    return [{k: v - v[0] for k, v in one.items()} for one in slopes]
 
 
 def _parabola(before, base, after, low, high):

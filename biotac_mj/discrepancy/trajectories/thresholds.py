@@ -1,6 +1,7 @@
 """Thresholds of acceptance and abstention, and the confidence of a name: constants, with their hash.
 
 Set on 155 practice cases (benchmarks/discrepancy_calibrate.py) before a blind one was drawn.
+`promising`, `partly` and `further` came later, from cases of another author (docs/lab/discrepancy.md).
 """
 
 import hashlib
@@ -12,11 +13,13 @@ __all__ = ["CONFIDENCE", "THRESHOLDS", "confidence", "terms", "threshold_hash"]
 
 THRESHOLDS = {
     "p": 0.02,  # sign flips over trajectories
+    "promising": 0.1,  # the same while others that are there may hide an effect
     "gain": 0.7,  # [nats per trajectory] mean gain of evidence on trajectories left out
-    "further": 2.0,  # the same for an effect beside others
+    "further": 1.5,  # the same for an effect beside others; twice that beside one that it is confused with
     "share": 0.15,  # of the closable log mean square that one effect has to close
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there
+    "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
     "named": 0.8,  # of the closable log mean square that all have to close, else the rest is unknown
     # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
     "significant": 1.1,

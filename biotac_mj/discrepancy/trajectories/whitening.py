@@ -95,13 +95,15 @@ class Comparison:
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
             self._basis.append(np.linalg.svd(J, full_matrices=False))
 
-    def calibrated(self, nuisance: Nuisance, chosen: np.ndarray) -> "Comparison":
-        """The same about a base model that was fitted to the chosen trajectories: its modulus, and the
-        scatter of their poses where it is larger than stated."""
-        new = dataclasses.replace(self, modulus=nuisance.modulus)
-        poses = new.poses([], nuisance)[chosen]
+    def calibrated(self, nuisance: Nuisance) -> "Comparison":
+        """The same about a base model whose modulus was fitted."""
+        return dataclasses.replace(self, modulus=nuisance.modulus)
+
+    def scatter(self, effects: list, nuisance: Nuisance, chosen: np.ndarray) -> float:
+        """[m] by which the chosen poses scatter beside these effects, at least what is stated."""
+        poses = self.poses(effects, nuisance)[chosen]
         scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
-        return new if scatter < self.repeatability else dataclasses.replace(new, repeatability=float(scatter))
+        return max(float(scatter), self.repeatability)
 
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""

@@ -9,7 +9,7 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
-from .composition import compose
+from .composition import compose, resumed
 from .fitting import Fit, fit_effects
 from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
@@ -22,6 +22,8 @@ from .whitening import REPEATABILITY, Comparison
 if typing.TYPE_CHECKING:
     from .simulator import Fields
     from .trajectory import Trajectory
+
+_LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
 
@@ -110,16 +112,42 @@ def diagnose(
             notes.append(f"{effect.name} cannot be known: {why}")
         else:
             usable.append(effect.among([data[i] for i in chosen]))
-    with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress, leave=False) as bar:
+    with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress or None, leave=False) as bar:
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
-        comparison = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance, chosen)
+        stated = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance)
         bar.update()
-        null = fit_effects(comparison, [], chosen)
+        comparison, null, current, found, rounds = _explained(stated, usable, chosen, seed, bar)
         bar.update()
-        current, found, rounds = compose(comparison, null, usable, chosen, seed, bar)
         report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable)
         bar.update()
     return report
+
+
+def _explained(stated, usable, chosen, seed, bar):
+    """Comparison with the scatter of poses that is left beside the effects, and what `compose` says with it.
+
+    What is missing in the model looks like scatter, and scatter hides it: where there is more than stated,
+    more is looked for with what is left beside the effects that were found; where none was, all with what was
+    stated. That counts where the scatter is gone then."""
+
+    def begun(scatter):
+        comparison = dataclasses.replace(stated, repeatability=scatter)
+        return comparison, fit_effects(comparison, [], chosen)
+
+    base = fit_effects(stated, [], chosen)
+    first = begun(stated.scatter([], base.nuisance, chosen))
+    current, found, rounds = compose(*first, usable, chosen, seed, bar)
+    left = stated.scatter(current.effects, current.nuisance, chosen) if found else stated.repeatability
+    if first[0].repeatability <= _LESS * left:
+        return *first, current, found, rounds
+    second = begun(left)
+    if found:
+        fit, now, more = resumed(*second, current, found, usable, chosen, seed, bar)
+        return *second, fit, now, rounds + more
+    fit, now, more = compose(*second, usable, chosen, seed, bar)
+    if now and stated.scatter(fit.effects, fit.nuisance, chosen) <= _LESS * left:
+        return *second, fit, now, more
+    return *first, current, found, rounds
 
 
 def _levels(comparison, fit, chosen) -> dict:
@@ -147,6 +175,11 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
     left = _excess(square[1])
     inside = 1 - left / max(_excess(square[0]), left, 1e-9)
+    if found and inside < THRESHOLDS["partly"] and _wrong(after):
+        nearest = " and ".join(item.effect.name for item in found)
+        notes = [*notes, f"{nearest} would explain {inside:.0%} of it: too little for a name"]
+        current, found, after, square[1] = null, [], before, square[0]
+        left, inside = _excess(square[0]), 0.0
     names = {e.id: e.name for e in usable}
     effects = [
         _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
@@ -271,7 +304,11 @@ def _base(comparison, fit, chosen) -> list:
             f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial: so much is "
             "taken for granted, and smaller effects of the set-up stay unseen"
         )
-    if abs(nuisance.footprint) > 0.02:
+    if abs(nuisance.log_film) > 0.2:
+        notes.append(
+            f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
+        )
+    if abs(nuisance.footprint) > 0.05:
         notes.append(
             f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
             "calibrate before looking for small effects"
