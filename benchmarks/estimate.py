@@ -1,11 +1,11 @@
 """Contacts estimated from electrodes, on random presses of foreign synthetic sensors: another mesh, law and
 modulus than the simulation that is inverted, liquid in three dimensions, gains and cross-talk of their own.
 
-    python benchmarks/estimate.py --json OUT
+    python benchmarks/estimate.py --json OUT              # presses of sensors 1 to 20, and the table
+    python benchmarks/estimate.py --json OUT --first 101 --sensors 4 --fit   # the spread of sensors, again
 
-Goes on where it was stopped. Beside the inversion of the simulator, which knows none of these sensors, stands
-the network of `biotac contact-patch`, as it comes. Forces go with the modulus, which differs: so their errors
-are stated as they are, and with one factor for each sensor, from its other presses."""
+Goes on where it was stopped. The inversion knows nothing of a sensor, or ten labelled touches of it. Beside
+it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten touches."""
 
 import argparse
 import json
@@ -17,17 +17,24 @@ import numpy as np
 from biotac_mj.data.plan import plan_motions
 from biotac_mj.data.schema import nodes_of
 from biotac_mj.data.synthetic_sensor import SyntheticSensor
-from biotac_mj.differentiable import Estimator
+from biotac_mj.differentiable import Estimator, Touch, belief, change_of, estimate, pressure_change
 from biotac_mj.geometry import load_skin
 from biotac_mj.learning.patch import estimate as estimate_by_network
 from biotac_mj.learning.training.inverse import contact_centre
 
 INDENTER = "sphere_7mm"
 LEAST = 0.1  # [N] of a press that counts: less is a touch
+LABELLED, TOUCHES = 1000, 10  # the first labelled press's number, and how many there are
+CONFIDENCE = 0.95
+# the constants of `belief` that --fit seeks, by their ln
+SPREADS = (
+    "_GAIN", "_NEAR", "_SHARE", "_SHIFT", "_EACH", "_FLOOR", "_FILL", "_PRESSURE", "_MODULUS", "_TILT",
+    "_OFF", "_LEVEL", "_ABSOLUTE", "_COMMON", "_KILOPASCAL", "FORCE",
+)  # fmt: skip
 
 
-def press(sensor: SyntheticSensor, number: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """A random press: counts (19,) of it and of the rest before, force [N] and centre (3,) [m]."""
+def press(sensor: SyntheticSensor, number: int) -> dict:
+    """A random press: counts of it and of the rest before (20,), force [N] and centre (3,) [m]."""
     geometry = sensor.model.geometry
     motion = plan_motions(geometry, INDENTER, [[sensor.seed, number]], 8, ("press",))[0]
     fields = sensor.simulate(INDENTER, [motion])
@@ -37,73 +44,166 @@ def press(sensor: SyntheticSensor, number: int) -> tuple[np.ndarray, np.ndarray,
     counts, _ = sensor.meter().measure(x, moment, fields.pressure[0, at], 3600.0, number)
     felt = np.linalg.norm(fields.contact_force[0, at[1]], axis=1)
     centre = contact_centre(felt[None], geometry.vert[nodes_of(geometry)])[0]
-    return counts[1, :19], counts[0, :19], float(force[at[1]]), centre
-
-
-def measure(sensor: SyntheticSensor, number: int, estimator: Estimator) -> dict:
-    """One press by both."""
-    counts, rest, force, centre = press(sensor, number)
-    row = {"sensor": sensor.seed, "number": number, "force_N": force}
-    if force < LEAST:
-        return row
-    begin = time.process_time()
-    try:
-        found = estimator(counts, rest)
-    except ValueError as error:
-        return row | {"refused": str(error)}
-    skin = load_skin("default")
-    _, felt = estimate_by_network(counts[None], rest, skin)
-    place = contact_centre(felt, skin.vert[np.unique(skin.outer_face)])[0]
-    off = np.abs(found.centre - centre)
-    return row | {
-        "seconds": time.process_time() - begin,
-        "centre_mm": 1e3 * float(np.linalg.norm(found.centre - centre)),
-        "estimated_N": found.size,
-        "within": [bool(w) for w in off < found.centre_error] + [abs(found.size - force) < found.size_error],
-        "missed": found.missed, "lost": found.lost, "settled": found.settled,
-        "network_centre_mm": 1e3 * float(np.linalg.norm(place - centre)),
-        "network_N": float(felt.sum()),
+    return {
+        "sensor": sensor.seed, "number": number, "rest": counts[0, :20].tolist(),
+        "counts": counts[1, :20].tolist(), "force_N": float(force[at[1]]), "centre": centre.tolist(),
     }  # fmt: skip
 
 
-def summary(rows: list) -> dict:
-    """Medians of errors, of both."""
-    rows = [row for row in rows if "estimated_N" in row]
-    sensor, force = np.array([row["sensor"] for row in rows]), np.array([row["force_N"] for row in rows])
-    out = {"presses": len(rows), "sensors": len(set(sensor)), "median_force_N": float(np.median(force))}
-    out["within"] = np.mean([row["within"] for row in rows], 0).tolist()
-    for name, centre, size in (
-        ("inversion", "centre_mm", "estimated_N"), ("network", "network_centre_mm", "network_N")
-    ):  # fmt: skip
-        ratio = np.array([row[size] for row in rows]) / force
-        others = [np.delete(ratio, i)[np.delete(sensor, i) == s] for i, s in enumerate(sensor)]
-        factor = np.array([np.median(part) if len(part) else 1.0 for part in others])
-        out[name] = {
-            "centre_mm": float(np.nanmedian([row[centre] for row in rows])),
-            "force_percent": 100 * float(np.median(np.abs(ratio - 1))),
-            "force_percent_one_factor": 100 * float(np.median(np.abs(ratio / factor - 1))),
+def simulate(presses: list, sensors: range, number: int, save) -> None:
+    """Appends what is missing: so many presses of each sensor, and its labelled ones."""
+    there = {(row["sensor"], row["number"]) for row in presses}
+    for seed in sensors:
+        wanted = [*range(number), *range(LABELLED, LABELLED + TOUCHES)]
+        missing = [n for n in wanted if (seed, n) not in there]
+        sensor = SyntheticSensor(seed, "default") if missing else None
+        for n in missing:
+            presses.append(press(sensor, n))
+            save()
+
+
+def touch_of(row: dict) -> Touch:
+    """A press as one that is known."""
+    counts, rest = np.array(row["counts"]), np.array(row["rest"])
+    change = change_of(counts[:19], rest[:19])
+    return Touch(change, pressure_change(counts[19], rest[19]), row["force_N"], np.array(row["centre"]))
+
+
+def regress(known: list[Touch], asked: list[Touch], width: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and forces by ridge regression on ln Z and pressure; width: of a Gaussian kernel, None is
+    linear. The penalty is the one that serves best when each touch in turn is left out."""
+
+    def seen(touches):
+        return np.array([np.append(touch.change, 0.2 * touch.pressure) for touch in touches])
+
+    def kernel(a, b):
+        return a @ b.T if width is None else np.exp(-0.5 * ((a[:, None] - b) ** 2).sum(-1) / width**2)
+
+    x, y = seen(known), np.array([[np.log(t.force), *(1e3 * t.centre / 5)] for t in known])
+    about, gram, best = y.mean(0), kernel(x, x), None
+    for penalty in (1e-3, 1e-2, 1e-1, 1.0):
+        inverse = np.linalg.inv(gram + penalty * np.eye(len(x)))
+        out = ((inverse @ (y - about) / np.diag(inverse)[:, None]) ** 2).sum()
+        if best is None or out < best[0]:
+            best = out, about + kernel(seen(asked), x) @ inverse @ (y - about)
+    return 5e-3 * best[1][:, 1:], np.exp(best[1][:, 0])
+
+
+def evaluate(presses: list, estimator: Estimator) -> dict:
+    """Errors of all ways."""
+    skin = load_skin("default")
+    nodes = skin.vert[np.unique(skin.outer_face)]
+    off, ratio, within, wide, half = {}, {}, {}, {}, {}
+    begin, forces = time.process_time(), []
+
+    def note(way, centre, force, touches):
+        off.setdefault(way, []).extend(np.linalg.norm(np.array(centre) - [t.centre for t in touches], axis=1))
+        ratio.setdefault(way, []).extend(force / np.array([t.force for t in touches]))
+
+    for seed in sorted({row["sensor"] for row in presses}):
+        rows = [row for row in presses if row["sensor"] == seed and row["force_N"] > LEAST]
+        asked, known = ([r for r in rows if (r["number"] >= LABELLED) == w] for w in (False, True))
+        touches, labelled = [touch_of(row) for row in asked], [touch_of(row) for row in known]
+        forces += [touch.force for touch in touches]
+        for way, of in (("nothing known", None), ("ten touches known", estimator.learn(labelled))):
+            found = []
+            for row, touch in zip(asked, touches):
+                counts, rest = np.array(row["counts"]), np.array(row["rest"])
+                one = estimator(counts[:19], rest[:19], (counts[19], rest[19]), of)
+                found.append(one)
+                errors = np.append(np.log(touch.force / one.size), touch.centre - one.centre)
+                widths = np.append(np.log(one.high / one.size), one.centre_error)
+                half.setdefault(way, []).append(widths)
+                within.setdefault(way, []).append(np.abs(errors) < widths)
+                wide.setdefault(way, []).append(np.abs(errors) / widths * np.repeat(estimate.WIDE, (1, 3)))
+            note(way, [one.centre for one in found], [one.size for one in found], touches)
+        for way, width in (("linear regression", None), ("kernel regression", 0.5)):
+            note(way, *regress(labelled, touches, width), touches)
+        patches = [
+            estimate_by_network(np.array(r["counts"])[None, :19], np.array(r["rest"])[:19], skin)[1]
+            for r in asked
+        ]
+        note(
+            "network",
+            [contact_centre(felt, nodes)[0] for felt in patches],
+            [f.sum() for f in patches],
+            touches,
+        )
+    out = {"presses": len(forces), "median_force_N": float(np.median(forces)), "ways": {}}
+    for way in off:
+        one = out["ways"][way] = {
+            "centre_mm": [1e3 * float(np.nanpercentile(off[way], q)) for q in (25, 50, 75)],
+            "force_percent": [
+                100 * float(np.percentile(np.abs(np.array(ratio[way]) - 1), q)) for q in (25, 50, 75)
+            ],
         }
-    return out
+        if way in within:
+            one["within"] = np.mean(within[way], 0).tolist()  # force, centre along x, y, z
+            widths = np.median(half[way], 0)
+            one["median_interval"] = {
+                "force_factor": np.exp(widths[0]),
+                "centre_mm": (1e3 * widths[1:]).tolist(),
+            }
+            far = np.array(wide[way])
+            one["widths_that_hold"] = [
+                float(np.quantile(part, CONFIDENCE)) for part in (far[:, 0], far[:, 1:])
+            ]
+    return out | {"seconds": time.process_time() - begin}
+
+
+def fit(presses: list, estimator: Estimator) -> dict:
+    """The spreads under which the presses, where they were and with the force they had, are likeliest."""
+    table, touches = estimator.presses, [touch_of(row) for row in presses if row["force_N"] > LEAST]
+    off = [np.linalg.norm(table.outcome[:, 1:4] - touch.centre, axis=1) for touch in touches]
+    among = np.unique(np.concatenate([np.flatnonzero(d < belief.AWAY) for d in off]))
+
+    def cost():
+        posterior, total = belief.Posterior(table, estimator.geometry, belief.believe(), True, among), 0.0
+        for touch, d in zip(touches, off):
+            near = d[among] < belief.AWAY
+            if near.any():
+                likely = belief.likelihood(posterior, touch, belief.believe())[0][near]
+                total -= likely.max() + np.log(np.exp(likely - likely.max()).mean())
+        return total / len(touches)
+
+    best, step = cost(), 0.4
+    while step > 0.1:
+        before = best
+        for name in SPREADS:
+            here = getattr(belief, name)
+            for factor in (np.exp(step), np.exp(-step)):
+                setattr(belief, name, here * factor)
+                there = cost()
+                if there < best - 1e-4:
+                    best = there
+                    break
+                setattr(belief, name, here)
+        if before - best < 1e-2:
+            step /= 2
+    return {"cost": best} | {name: float(getattr(belief, name)) for name in SPREADS}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parser.add_argument("--presses", type=int, default=200)
-    parser.add_argument("--sensors", type=int, default=4)
-    parser.add_argument("--sensor-skin", default="default")
+    parser.add_argument("--presses", type=int, default=10, help="of each sensor")
+    parser.add_argument("--first", type=int, default=1, help="sensor")
+    parser.add_argument("--sensors", type=int, default=20)
+    parser.add_argument("--fit", action="store_true")
     given = parser.parse_args()
-    rows = json.loads(given.json.read_text())["rows"] if given.json.exists() else []
-    estimator, sensors = Estimator(load_skin("coarse"), INDENTER), {}
-    for k in range(len(rows), given.presses):
-        seed, number = 1 + k % given.sensors, k // given.sensors
-        if seed not in sensors:
-            sensors[seed] = SyntheticSensor(seed, given.sensor_skin)
-        rows.append(measure(sensors[seed], number, estimator))
-        given.json.write_text(json.dumps({"rows": rows}, indent=1))
-    out = summary(rows)
-    given.json.write_text(json.dumps({"rows": rows, "summary": out}, indent=1))
-    print(json.dumps(out, indent=1))
+    kept = json.loads(given.json.read_text()) if given.json.exists() else {"presses": []}
+
+    def save():
+        given.json.write_text(json.dumps(kept, indent=1))
+
+    sensors = range(given.first, given.first + given.sensors)
+    simulate(kept["presses"], sensors, given.presses, save)
+    estimator = Estimator(load_skin("coarse"), INDENTER)
+    presses = [row for row in kept["presses"] if row["sensor"] in sensors]
+    name = "fit" if given.fit else "summary"
+    kept[name] = (fit if given.fit else evaluate)(presses, estimator)
+    save()
+    print(json.dumps(kept[name], indent=1))
 
 
 if __name__ == "__main__":

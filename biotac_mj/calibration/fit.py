@@ -271,7 +271,7 @@ def calibrate(
     if not scale_force > 0:
         raise ValueError(f"indentation {indentation.name!r} has no force: measure it, or simulate it first")
 
-    bar = tqdm.tqdm(desc="calibrate", unit="batch", disable=not progress, leave=False)
+    bar = tqdm.tqdm(desc="calibrate", unit="batch", disable=not progress or None, leave=False)
     cache = {}
 
     def evaluate(scaled):

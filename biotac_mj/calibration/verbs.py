@@ -197,4 +197,4 @@ def _measured(text):
 
 
 def _bar(name, total, quiet):
-    return tqdm.tqdm(total=total, desc=name, unit="indentation", disable=quiet, leave=False)
+    return tqdm.tqdm(total=total, desc=name, unit="indentation", disable=quiet or None, leave=False)

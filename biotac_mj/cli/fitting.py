@@ -219,6 +219,13 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         "--row", type=int, nargs="+", help="which rows (default: the one that differs most from rest)"
     )
     verb.add_argument(
+        "--known",
+        metavar="FILE",
+        help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, --rest rows "
+        "first: its touches teach what is this sensor's own",
+    )
+    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them (10)")
+    verb.add_argument(
         "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
     )
     verb.add_argument("--skin", default="coarse", help=f"mesh: {', '.join(SKINS)}, or a file")

@@ -1,7 +1,8 @@
 """Gradients through rubber, liquid and film (extra `learning`, which has PyTorch)."""
 
+from .belief import Belief, Touch
 from .counts import electrode_counts, pdc_counts
-from .estimate import Estimate, Estimator
+from .estimate import Estimate, Estimator, change_of, pressure_change
 from .film import impedance
 from .fit import calibrate
 from .press import PARAMETERS, Pressed, press, relative_pose
@@ -9,14 +10,18 @@ from .skin import Skin
 
 __all__ = [
     "PARAMETERS",
+    "Belief",
     "Estimate",
     "Estimator",
     "Pressed",
     "Skin",
+    "Touch",
     "calibrate",
+    "change_of",
     "electrode_counts",
     "impedance",
     "pdc_counts",
     "press",
+    "pressure_change",
     "relative_pose",
 ]

@@ -20,7 +20,8 @@ class Changes:
 
     Attributes:
       touched, parted: began, ceased to touch. slipped, stuck: began, ceased to slip.
-      lost: 1 where the step found no balance: its gradient means nothing.
+      lost: 1 where the step found no balance, or only in parts, of which friction remembers the last: its
+        gradient means little.
     """
 
     touched: int = 0
@@ -110,7 +111,7 @@ def _advance(skin, geoms, before):
     geoms.advance()
     slips = (outer.trial_anchor.numpy()[seen.sample, 0] != seen.stick).any(1)
     touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
-    changes = Changes(lost=int(not data.converged[0]))
+    changes = Changes(lost=int(not data.converged[0] or data.worlds.stride.numpy()[0] > 0))
     if before is not None:
         both = np.intersect1d(touches, before.touches)
         changes = Changes(
