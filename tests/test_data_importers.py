@@ -204,6 +204,13 @@ def test_the_command(tmp_path, capsys):
     )
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
     assert "holds a set already" in capsys.readouterr().err
+    pytest.importorskip("torch")
+    assert (
+        cli.main(["train", out, "--out", str(tmp_path / "trained")]) == 2
+    )  # nothing says how the skin moved
+    assert (
+        "has no column displacement, only" in capsys.readouterr().err and not (tmp_path / "trained").exists()
+    )
 
 
 def test_what_was_not_recorded_stays_away(tmp_path):

@@ -219,7 +219,16 @@ def test_what_cannot_be_exported_is_named(tmp_path):
             export_lerobot(data, tmp_path / "o", progress=False)
         with pytest.raises(ValueError, match="no column 'measured_counts'"):
             export_lerobot(data, tmp_path / "o", "measured_counts", progress=False)
+    row = {name: value[:1] for name, value in full.items()}
+    write_shard(
+        shard_path(tmp_path / "r", 0), [Interaction("a", "x", "press", "test", 0, {}, np.zeros(1), **row)]
+    )
+    with TactileSet(tmp_path / "r") as data, pytest.raises(ValueError, match="one row .* too few .* --rate"):
+        export_lerobot(data, tmp_path / "o", progress=False)
     assert not (tmp_path / "o").exists() and not list(tmp_path.glob(".lerobot-*"))
+    with TactileSet(tmp_path / "r") as data:
+        export_lerobot(data, tmp_path / "o", rate=100, progress=False)  # as the refusal says
+    assert json.loads((tmp_path / "o/meta/info.json").read_text())["total_frames"] == 1
 
 
 def test_lerobot_reads_it(exported, monkeypatch):

@@ -63,3 +63,43 @@ def test_paired_test_sees_what_medians_hide():
     assert paired_test(hard, hard + np.where(swapped, 1, -1) * rng.uniform(0.5, 1, 40))["p"] > 0.05
     with pytest.raises(ValueError, match="at least five"):
         paired_test([1, 2], [1, 2])
+
+
+@pytest.fixture
+def claim(repo, monkeypatch):
+    pytest.importorskip("torch")
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import claim
+
+    return claim
+
+
+@pytest.mark.parametrize("labelled", [64, 258, 512])
+def test_nobody_sees_what_judges_the_claim(claim, labelled):
+    objects = np.tile(["ring_7mm", "cube_14mm", "sphere_7mm"], 400)
+    sensor = (np.arange(1200) >= 1100).astype(int)
+    found = claim.members(objects, sensor, ["trajectory", "ring_7mm"], labelled)
+    assert len(found) == 10 and set(found[0].judge) == {"trajectory", "sensor"}
+    for one in found:
+        parts = [one.train, one.choose, one.unpaired, *one.judge.values()]
+        every = np.concatenate(parts)
+        assert len(np.unique(every)) == len(every) and len(one.train) == labelled and len(one.choose) == 65
+        assert (sensor[np.concatenate(parts[:3])] == 0).all()
+        if one.split != "trajectory":
+            assert (objects[one.judge[one.split]] == one.split).all()
+            assert one.split not in objects[np.concatenate(parts[:3])]
+
+
+def test_networks_side_by_side_are_networks(claim):
+    import torch
+
+    from biotac_mj.learning.networks.electrode_vae import mlp
+
+    x = torch.randn(2, 5, 4)
+    side = claim.Side(lambda: mlp([4, 8, 3], 0.5), [3, 4], "cpu", 0.1)
+    side.base.eval()
+    for k, seed in enumerate((3, 4)):
+        torch.manual_seed(seed)
+        alone = mlp([4, 8, 3], 0.5).eval()
+        torch.testing.assert_close(side(x)[k], alone(x[k]))
+    assert {layer.p for layer in side.base if isinstance(layer, torch.nn.Dropout)} == {0.1}

@@ -3,6 +3,7 @@ wrong with the input."""
 
 import json
 import shutil
+import sys
 
 import h5py
 import mujoco
@@ -135,7 +136,8 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     assert not kept.exists()
 
 
-def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, capsys):
+def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False, only=("pod_log",))
     said, bar = capsys.readouterr()
     assert "80 interactions" in said and "minutes on one core" in said

@@ -29,6 +29,22 @@ def agree(found, wanted, fields, atol=1e-6):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=atol, err_msg=name)
 
 
+@pytest.mark.parametrize(("order", "said"), [(slice(None), False), (slice(None, None, -1), True)])
+def test_columns_in_another_order_are_said(order, said):
+    one = dataclasses.replace(ONE, electrodes=ONE.electrodes[:, order])
+    assert any("rest levels are unlike" in line for line in findings(one)) == said
+
+
+@pytest.mark.parametrize("date", ["2026-01-01T00:00:{:06.3f}Z", "2026-01-01 00:00:{:06.3f}"])
+def test_a_clock_of_dates(tmp_path, date):
+    head, *rows = (["time", *(f"e{i}" for i in range(1, 20))], *ONE.electrodes[:9].astype(int).tolist())
+    words = [",".join(map(str, [date.format(0.01 * k), *row])) for k, row in enumerate(rows)]
+    (tmp_path / "r.csv").write_text("\n".join([",".join(head), *words]))
+    one = load_one(tmp_path / "r.csv")[0]
+    assert one.rate_source == "the file's times"
+    np.testing.assert_allclose(one.time - one.time[0], 0.01 * np.arange(9), atol=1e-6)
+
+
 def test_what_is_written_is_read(tmp_path):
     other = Recording(
         np.arange(3.0), np.full((3, 19), -5.0), name="tared", units={"electrodes": "tared counts"}

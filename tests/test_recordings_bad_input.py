@@ -149,6 +149,10 @@ def native():
     yield Row(
         "evaluate rec.h5 --sensor jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
     )
+    yield Row("evaluate e.txt --save m.safetensors --quiet", "no model can be kept: give --force")
+    short = lines(lambda v: v[:1])
+    yield Row("evaluate e.txt --quiet", "e has 1 rows: at least 400 are needed", "e.txt", short)
+    yield Row("predict m.safetensors e.txt", "`biotac evaluate --save` wrote")
     yield Row("evaluate trained --sensor a", "--sensor goes with --electrodes")
 
 
@@ -204,6 +208,13 @@ def csv():
     yield Row(CSV, "nothing in its header is known of a BioTac (a, b)", "r.csv", text("a,b\n1,2\n1,2\n"))
     yield Row(CSV, "line 6: e3 is 'x'", "r.csv", column("e3", lambda i, v: "x" if i == 4 else v))
     yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", column("e3", lambda i, v: "" if i == 0 else v))
+    twice = replaced(",e7,", ",e8,")
+    yield Row(CSV, "r.csv has several columns called e8: rename", "r.csv", twice)
+    both = replaced(",e7,", ",ele8,")
+    yield Row(CSV, "r.csv has two columns for electrodes 8, ele8 and e8", "r.csv", both)
+    yield Row(CSV, "line 2: no number in it", "r.csv", lines(lambda v: ["made by hand", *v]))
+    yield Row(CSV, "line 5: no number in it", "r.csv", lines(lambda v: [*v[:4], v[0], *v[4:]]))
+    yield Row(CSV, "line 2: time is 'noon'", "r.csv", column("time", lambda i, v: "noon"))
     yield Row(CSV, "line 2: time is 'nan'", "r.csv", column("time", lambda i, v: "nan" if i == 0 else v))
     yield Row(CSV, "is no clock", "r.csv", column("time", lambda i, v: "7"))
     yield Row(CSV, "is no clock", "r.csv", column("time", lambda i, v: f"{7 - 1e-3 * i}"))

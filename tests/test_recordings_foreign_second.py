@@ -133,3 +133,12 @@ def test_the_fourth_author_shares_nothing(second):
     used = {pair for _, effects, _ in fourth.PLAN for pair in effects}
     assert used == {(kind, form) for kind, forms in fourth.EFFECTS.items() for form in range(len(forms))}
     assert {kind for kind, _ in used} <= set(second.ACCEPTED)
+
+
+def test_the_fifth_author_shares_nothing(second):
+    text = (BENCHMARKS / "recordings_foreign_fifth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    fifth = importlib.import_module("recordings_foreign_fifth")
+    plan = fifth.plan()
+    assert len({piece["id"] for piece in plan}) == len(plan) == 153
+    assert {kind for piece in plan for kind, _ in piece["effects"]} == set(fifth.LAWS) <= set(second.ACCEPTED)

@@ -53,8 +53,8 @@ def export_lerobot(
     Episodes are in the order train, validation, test, and meta/info.json has the set's splits.
 
     Raises:
-      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, or a folder
-        that is there.
+      ValueError: no poses or counts in the set, nothing to export, time steps that are not even, one row
+        alone where no rate is given, or a folder that is there.
       ImportError: no pyarrow; the text says how to get it.
     """
     _pyarrow()
@@ -132,6 +132,8 @@ class _Export:
         # a real clock shakes; half a step off, a row was dropped
         shaken = 0.5 * np.median(step) if self.recorded and len(step) else 1e-4
         even = len(step) > 0 and np.ptp(step) <= shaken
+        if not len(step) and wanted is None:
+            raise ValueError("one row is too few to tell the frame rate by: give it with --rate")
         if not even and wanted is None and not (self.recorded and len(step)):
             raise ValueError(
                 "the time steps of the set are not even: LeRobot's layout has one frame rate; "
@@ -148,7 +150,9 @@ class _Export:
         pa, rows, episodes, moments = _pyarrow(), [], [], []
         first, file_index, size = 0, 0, 0
         for number, i in enumerate(
-            tqdm.tqdm(self.chosen, desc="export", unit="interaction", disable=not progress, leave=False)
+            tqdm.tqdm(
+                self.chosen, desc="export", unit="interaction", disable=not progress or None, leave=False
+            )
         ):
             columns = self._episode(number, int(i), first)
             n = len(columns["index"])

@@ -352,6 +352,11 @@ def _evaluate_recording(args):
     from .instants.real import evaluate_recording
 
     recording, notes = load_one(args.electrodes, args.sensor, force=args.force)
+    examples = None
+    if args.save:
+        from .instants.examples import from_recording
+
+        examples = from_recording(recording)  # refuses before the work what cannot be kept after it
     result = evaluate_recording(
         recording,
         args.json,
@@ -381,8 +386,7 @@ def _evaluate_recording(args):
     for note in [*notes, *result["notes"]]:
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")
-    if args.save:
-        from .instants.examples import from_recording
+    if examples:
         from .instants.reader import judge_in_time
 
-        _save_reader(args, *judge_in_time(from_recording(recording), args.fraction, args.seed))
+        _save_reader(args, *judge_in_time(examples, args.fraction, args.seed))

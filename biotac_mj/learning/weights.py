@@ -133,9 +133,7 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """
     from safetensors import safe_open
 
-    remedy = (
-        "give a file that `biotac train` wrote, forward-SPLIT or inverse-SPLIT.safetensors, or copy it again"
-    )
+    remedy = "give a *.safetensors that `biotac train` or `biotac evaluate --save` wrote, or copy it again"
     with reading(path, "file of weights", remedy), safe_open(str(path), framework="pt") as file:
         meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
         tensors = {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}

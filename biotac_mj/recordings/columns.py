@@ -1,13 +1,16 @@
 """Logs as text: columns of numbers, one row per sample, perhaps with names."""
 
 import dataclasses
+import datetime
 import gzip
 import pathlib
+import re
 import zlib
 
 import numpy as np
 
 from ..reading import Unfit
+from .names import is_time, place_of
 
 __all__ = ["Table", "open_bytes", "parse_table", "read_columns", "read_table"]
 
@@ -61,6 +64,21 @@ class Table:
             )
         return value
 
+    def clock(self, column: int, name: str) -> np.ndarray:
+        """(n,) of this column: numbers, or dates (ISO 8601) as seconds since 1970, UTC where they do not say.
+
+        Raises:
+          ValueError: as `numbers`.
+        """
+        try:
+            dates = [datetime.datetime.fromisoformat(row[column].replace(",", ".")) for row in self.cells]
+        except ValueError:
+            dates = []
+        if not dates or _is_number(self.cells[0][column]):
+            return self.numbers([column], [name])[:, 0]
+        zone = datetime.UTC
+        return np.array([(d if d.tzinfo else d.replace(tzinfo=zone)).timestamp() for d in dates])
+
 
 def open_bytes(path: pathlib.Path | str) -> bytes:
     """A file, gzipped or not.
@@ -89,9 +107,8 @@ def read_table(path: pathlib.Path | str, needed: str = "columns of numbers") -> 
 
 
 def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns of numbers") -> Table:
-    """A text file of numbers, blanks, tabs, commas or semicolons between them (with semicolons, numbers
-    may have
-    decimal commas); lines that begin with # or % are comments.
+    """A text file of numbers, blanks, tabs, commas, semicolons or bars between them; lines that begin with #
+    or % are comments. Numbers may have decimal commas, between commas if they are quoted.
 
     A header is one line without any number, or the last comment before the numbers if it has a word for each.
 
@@ -99,7 +116,8 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
       needed: what the file should hold, for the text of errors.
 
     Raises:
-      ValueError: no text, no rows, or rows of different length.
+      ValueError: no text, no rows, rows of different length or of another one than the header's, or one
+        without any number.
     """
     path = pathlib.Path(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -117,11 +135,11 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
             rows.append((i, line))
     if not rows:
         raise ValueError(f"{path} is empty: {needed}, one row per sample, are needed")
-    mark = next((mark for mark in (";", ",") if mark in rows[-1][1]), None)
+    mark = _mark(rows[-1][1])
     split = [(i, _words(line, mark)) for i, line in rows]
     names = None
     if not any(map(_is_number, split[0][1])):
-        names = [_name(word) for word in split.pop(0)[1]]
+        names = [_name(word) or f"column {k}" for k, word in enumerate(split.pop(0)[1], 1)]
         if not split:
             raise ValueError(f"{path} is empty: it has a header and no rows; one for each sample is needed")
     elif [word for word in split[0][1] if word] in _numberings(len(split[0][1])) and len(split) > 1:
@@ -138,7 +156,17 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         and not any(map(_is_number, _words(comment, mark)))
     ):
         names = [_name(word) for word in _words(comment, mark)]
+    if names and len(names) != width and any(place_of(name) or is_time(name) for name in names):
+        raise Unfit(
+            f"{path}, line {split[0][0]}: {width} columns, and the header names {len(names)}: "
+            "which is which? Name every column, also one that counts the rows, and no other"
+        )
     for (i, _), row in zip(split, cells):
+        if names and not any(map(_is_number, row)) and any(row):
+            raise Unfit(
+                f"{path}, line {i}: no number in it: remove all lines but one of the header; a clock's unit "
+                "is part of its name, as in time_ms"
+            )
         if len(row) != width:
             raise Unfit(
                 f"{path}, line {i}: {len(row)} columns, {width} are needed as in line {split[0][0]}: was the "
@@ -185,14 +213,23 @@ def _numberings(width):
     ]
 
 
+def _mark(line):
+    """What stands between the numbers of a line; None: blanks or tabs."""
+    line = re.sub('"[^"]*"', "", line)
+    number = re.compile(r"[-+]?(\d+(,\d+)?|\d*\.\d+|\d+\.)(e[-+]?\d+)?|nan", re.I)
+    decimals = all(map(number.fullmatch, line.split()))
+    marks = ";|" if decimals and len(line.split()) > 1 else ";|,"
+    return next((mark for mark in marks if mark in line), None)
+
+
 def _words(line, mark):
-    if mark is None:
-        return line.split()
-    return [word.strip().replace(",", ".") if mark == ";" else word.strip() for word in line.split(mark)]
+    if '"' in line:
+        line = "".join(part.replace(",", ".") if k % 2 else part for k, part in enumerate(line.split('"')))
+    return [word.strip() if mark == "," else word.strip().replace(",", ".") for word in line.split(mark)]
 
 
 def _name(word):
-    return word.strip("\"'% #")
+    return word.strip("'% #")
 
 
 def _number(text):

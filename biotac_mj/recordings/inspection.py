@@ -4,7 +4,7 @@ stuck."""
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, FIELDS, Recording
+from .recording import CHANNELS, FIELDS, REST_LIKE, Recording
 
 __all__ = ["findings"]
 
@@ -84,6 +84,11 @@ def _stuck(recording):
         full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")
+    if recording.rest_correlation < REST_LIKE:
+        out.append(
+            f"rest levels are unlike published BioTacs' (correlation {recording.rest_correlation:.2f}): "
+            "is this another sensor, or are the columns in another order than e1..e19?"
+        )
     return out
 
 

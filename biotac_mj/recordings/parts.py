@@ -60,7 +60,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
     Raises:
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
     """
-    notes, time, left, found = list(notes or ()), None, [], {}
+    notes, time, left, found, called = list(notes or ()), None, [], {}, {}
     for name, value in columns.items():
         place = place_of(name)
         if place is None and is_time(name) and time is None:
@@ -68,7 +68,13 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         elif place is None:
             left.append(name)
         else:
-            found.setdefault(place.sensor, {}).setdefault(place.field, {})[place] = np.asarray(value, float)
+            pieces = found.setdefault(place.sensor, {}).setdefault(place.field, {})
+            if place in pieces:
+                what = f"{place.field} {'' if place.column is None else place.column}".strip()
+                raise ValueError(
+                    f"{source} has two columns for {what}, {called[place]} and {name}: rename one of them"
+                )
+            pieces[place], called[place] = np.asarray(value, float), name
     if not found:
         names = ", ".join(list(columns)[:8])
         raise ValueError(

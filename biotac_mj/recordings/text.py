@@ -48,12 +48,16 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
 
 def _named(table, role):
     """A table with a header. Cells of forces and poses may be empty: not measured in this row."""
-    columns = {}
+    columns, known = {}, [name for name in table.names if place_of(name) or is_time(name)]
+    twice = [name for name in dict.fromkeys(known) if known.count(name) > 1]
+    if twice:
+        raise ValueError(f"{table.path} has several columns called {', '.join(twice)}: rename or remove them")
     for k, name in enumerate(table.names):
         place = place_of(name)
-        known = place is not None or is_time(name)
-        gaps = place is not None and place.field != "electrodes"
-        columns[name] = table.numbers([k], [name], gaps)[:, 0] if known else ()
+        if place is not None:
+            columns[name] = table.numbers([k], [name], gaps=place.field != "electrodes")[:, 0]
+        else:
+            columns[name] = table.clock(k, name) if name in known else ()
     parts = make_parts(table.path.name, columns)
     if role and not any(role in part.fields for part in parts):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")

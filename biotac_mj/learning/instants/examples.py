@@ -50,7 +50,10 @@ def from_recording(recording: Recording) -> Examples:
     found = {"force": recording.force, "place": recording.contact_pos}
     targets = {name: value for name, value in found.items() if value is not None}
     if not targets:
-        raise ValueError(f"{recording.name} has neither force nor contact place: there is nothing to learn")
+        raise ValueError(
+            f"{recording.name} has neither force nor contact place, so that no model can be kept: "
+            "give --force, or leave --save out"
+        )
     owner = np.arange(len(counts)) * _BLOCKS // len(counts)
     return Examples(counts, counts, owner, targets, False, recording.name, False)
 

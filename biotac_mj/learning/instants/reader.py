@@ -23,7 +23,7 @@ __all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "j
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": tuple(ELECTRODES)}
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _CODE = 8
-_SPACES = ("rows", "pressed", "level")  # of electrodes, of them and PDC, of rests
+_SPACES = ("rows", "level")  # of electrodes, of rests
 _FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
 _RIDGE = (1e-4, 1e-3, 1e-2, 1e-1)
 
@@ -112,9 +112,10 @@ class Reader:
 
     def _strange(self, x, pdc):
         """(n,) novelty of rows, whatever their rest."""
-        space = "rows" if pdc is None or "pressed" not in self._known else "pressed"
-        seen = even(x - self.tensors["centre"], pdc if space == "pressed" else None)
-        return self._known[space](seen) / self.tensors[f"{space}.usual"]
+        seen = even(x - self.tensors["centre"])
+        if pdc is None or "pressed.usual" not in self.tensors:
+            return self._known["rows"](seen) / self.tensors["rows.usual"]
+        return self._known["rows"](seen, pdc) / self.tensors["pressed.usual"]
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
@@ -178,19 +179,19 @@ def fit_reader(
     x = data.log_change
     tensors = _components(x[fit])
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
-    one = np.ones(len(x), bool)
-    spaces = {"rows": (even(x - tensors["centre"]), one)}
-    if data.pdc is not None:
-        spaces["pressed"] = even(x - tensors["centre"], data.pdc), one
+    seen, pressed = even(x - tensors["centre"]), data.pdc is not None
+    known = {"rows": Known.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)}
+    usual = {"rows": np.quantile(known["rows"](seen[aside]), 0.95)}
+    if pressed:
+        usual["pressed"] = np.quantile(known["rows"](seen[aside], data.pdc[aside]), 0.95)
     if data.tared:  # one rest of each trajectory
         first = np.isin(np.arange(len(x)), np.unique(data.owner, return_index=True)[1])
-        spaces["level"] = log_impedance(data.tare), first
-    for name, (rows, taken) in spaces.items():
-        known = Known.fit(rows[fit & taken], data.owner[fit & taken], seed)
-        tensors |= {f"{name}.{f.name}": getattr(known, f.name) for f in dataclasses.fields(Known)}
-        usual = known(rows[aside & taken])
-        usual = max(usual.max(), 1.0) if name == "level" else np.quantile(usual, 0.95)
-        tensors[f"{name}.usual"] = np.array(usual)
+        rest = log_impedance(data.tare)
+        known["level"] = Known.fit(rest[fit & first], data.owner[fit & first], seed=seed)
+        usual["level"] = max(known["level"](rest[aside & first]).max(), 1.0)
+    for name, one in known.items():
+        tensors |= {f"{name}.{f.name}": getattr(one, f.name) for f in dataclasses.fields(Known)}
+    tensors |= {f"{name}.usual": np.array(value) for name, value in usual.items()}
     kinds = [Terms.fit(x[fit], seed=seed, **kind) for kind in KINDS]
     for k, terms in enumerate(kinds):
         tensors |= {f"terms.{k}.{f.name}": getattr(terms, f.name) for f in dataclasses.fields(Terms)}

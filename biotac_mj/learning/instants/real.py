@@ -9,7 +9,7 @@ import numpy as np
 
 from ...files import replacing
 from ...recordings.recording import Recording
-from ...sensor.channels import FULL_SCALE
+from ...sensor.channels import FULL_SCALE, log_impedance
 from .force import TRIALS, fit_force, ridge
 from .transfer import TOUCHES, label, touches_of_force, transfer_force
 
@@ -63,11 +63,10 @@ def evaluate_recording(
         if share > 0.001
     ]
     steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS)) if network else 0
-    look = dict(disable=not progress, leave=False)
-    with tqdm(total=2 * steps, desc="evaluate: codes", **look) as bar:
+    with tqdm(total=2 * steps, desc="evaluate: codes", disable=not progress or None, leave=False) as bar:
         reconstruction, traces = _reconstruction(counts, ntrain, seed, steps, bar)
     result = {
-        "schema": "biotac_mj.learning.recording/2",
+        "schema": "biotac_mj.learning.recording/3",
         "recording": recording.name,
         "source": recording.source,
         "rows": n,
@@ -82,7 +81,7 @@ def evaluate_recording(
         raise ValueError(f"{known.name} and {recording.name}: both need forces; give them at `biotac import`")
     if recording.force is not None:
         # a bar of its own: a step of the networks is no measure of how long a trial takes
-        with tqdm(total=TRIALS, desc="evaluate: force", **look) as bar:
+        with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
             result["force_regression"], predicted = _force(
                 counts, recording.force, ntrain, seed, network, bar
             )
@@ -112,12 +111,12 @@ def _usable(recording):
             notes.append(f"{(~there).sum()} rows without force were left out")
             recording = recording.rows(there)
     counts, assumed = recording.counts()
-    if not np.ptp(counts, axis=0).any():
-        raise ValueError(f"{recording.name}: no channel changes: this is not a recording of a touch")
     if len(counts) < _SHORTEST:
         raise ValueError(
             f"{recording.name} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time"
         )
+    if not np.ptp(counts, axis=0).any():
+        raise ValueError(f"{recording.name}: no channel changes: this is not a recording of a touch")
     return recording, counts, notes + assumed
 
 
@@ -135,11 +134,11 @@ def _rms(error):
 def _reconstruction(counts, ntrain, seed, steps, bar):
     mean = counts[:ntrain].mean(0)
     centred = counts - mean
-    axes = np.linalg.eigh(centred[:ntrain].T @ centred[:ntrain])[1][:, ::-1][:, :8].T
+    axes = _axes(centred[:ntrain])
     rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": centred @ axes.T @ axes + mean}
     if steps:
-        for name, linear in (("electrode_vae", None), ("electrode_vae_linear_start", axes)):
-            rows[name] = np.clip(_vae(counts, mean, ntrain, linear, seed, steps, bar), 0, FULL_SCALE)
+        for name, vae in (("electrode_vae", True), ("electrode_code", False)):
+            rows[name] = np.clip(_through_code(counts, ntrain, vae, seed, steps, bar), 0, FULL_SCALE)
     table = {
         name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])}
         for name, y in rows.items()
@@ -160,31 +159,49 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
     }, rows[best]
 
 
-def _vae(counts, mean, ntrain, linear, seed, steps, bar):
-    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows in so many steps."""
+def _through_code(counts, ntrain, vae, seed, steps, bar):
+    """(n, 19) counts through a code of 8, the network fitted on the first ntrain rows in so many steps.
+
+    vae: the paper's, on counts. Otherwise the code is no sample, and ln Z goes in and comes out, where
+    warm-up is a straight line, beginning as principal components; its error is that of the counts."""
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
 
     torch.manual_seed(seed)
     size = counts[:ntrain].std()  # one scale for all: an error counts alike in every channel
-    x = torch.tensor((counts - mean) / size, dtype=torch.float32)
-    # What a common change of ln Z does to counts: dE = -E (1 - E / 4095) d ln Z.
-    common = torch.tensor(-counts * (1 - counts / FULL_SCALE) / size, dtype=torch.float32)
-    net = ElectrodeVAE(linear=None if linear is None else torch.tensor(linear.copy(), dtype=torch.float32))
+    steep = -counts * (1 - counts / FULL_SCALE) / size  # what a common change of ln Z does to counts
+    tensor = lambda value: torch.tensor(value, dtype=torch.float32)  # noqa: E731
+    if vae:
+        net, x, common = ElectrodeVAE(), tensor((counts - counts[:ntrain].mean(0)) / size), tensor(steep)
+        read = lambda y: y  # noqa: E731
+    else:
+        log_z, slope = log_impedance(counts), steep[:ntrain].mean(0)
+        mean = log_z[:ntrain].mean(0)
+        rows = (log_z - mean) * slope
+        net, x = ElectrodeVAE(linear=tensor(_axes(rows[:ntrain]))), tensor(rows)
+        common, mean, slope = tensor(np.broadcast_to(slope, rows.shape).copy()), tensor(mean), tensor(slope)
+        read = lambda y: FULL_SCALE / size / (1 + torch.exp(mean + y / slope))  # noqa: E731
     optimizer = torch.optim.Adam(net.parameters(), 2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
     for _ in range(steps):
         row = torch.randint(ntrain, (_BATCH,))
         y = x[row] + _GAIN * torch.randn(_BATCH, 1) * common[row]
-        got, code, log_variance = net(y)
-        divergence = 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
-        loss = ((got - y) ** 2).sum(1).mean() + _KL * divergence
+        code, log_variance = net.encode(y)
+        sample = code + torch.randn_like(code) * torch.exp(0.5 * log_variance) if vae else code
+        loss = ((read(net.decode(sample)) - read(y)) ** 2).sum(1).mean()
+        if vae:
+            loss = loss + _KL * 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
         optimizer.zero_grad(set_to_none=True), loss.backward(), optimizer.step(), schedule.step()
         bar.update()
     net.eval()
     with torch.no_grad():
-        return net(x)[0].numpy() * size + mean
+        return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
+
+
+def _axes(rows, count=8):
+    """(count, 19) principal components of centred rows (n, 19)."""
+    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.copy()
 
 
 def _force(counts, force, ntrain, seed, network, bar):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import typing
 
 import numpy as np
 import torch
@@ -9,7 +10,10 @@ from numpy.typing import ArrayLike
 
 from ...sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
 
-__all__ = ["Arrays", "load_arrays"]
+if typing.TYPE_CHECKING:
+    from ...data import TactileSet
+
+__all__ = ["Arrays", "check_columns", "load_arrays"]
 
 
 @dataclasses.dataclass
@@ -82,6 +86,16 @@ class Arrays:
         return torch.as_tensor(value, dtype=torch.float32, device=self.device)
 
 
+def check_columns(data: "TactileSet") -> None:
+    """Raises ValueError where a set lacks what is learned from."""
+    for name in ("displacement", "counts", "measured_counts", "contact_force"):
+        if name not in data.columns:
+            raise ValueError(
+                f"{data.path} has no column {name}, only {', '.join(data.columns)}: a set with "
+                "deformed skin and readings comes from `biotac generate --labelled N`, or `biotac resimulate`"
+            )
+
+
 def load_arrays(
     path: pathlib.Path | str, device: torch.device | str = "cpu", limit: int | None = None
 ) -> Arrays:
@@ -98,12 +112,7 @@ def load_arrays(
     from ...data import TactileSet
 
     with TactileSet(path) as data:
-        for name in ("displacement", "counts", "measured_counts", "contact_force"):
-            if name not in data.columns:
-                raise ValueError(
-                    f"{path} has no column {name}, only {', '.join(data.columns)}: "
-                    "make a set with `biotac generate --labelled N`"
-                )
+        check_columns(data)
         for file in data._files:
             channels = [c.decode() if isinstance(c, bytes) else str(c) for c in file.attrs["channels"]]
             if tuple(channels) != CHANNELS:

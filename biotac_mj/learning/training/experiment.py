@@ -21,7 +21,7 @@ from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
 from ..instants.force import ridge
 from ..weights import save_forward, save_inverse
-from .arrays import load_arrays
+from .arrays import check_columns, load_arrays
 from .config import LearningConfig
 from .features import Pod
 from .fitting import Watch
@@ -94,6 +94,7 @@ def train_all(
     if not tasks:
         return
     with TactileSet(path) as data:
+        check_columns(data)
         count = min(len(data), limit or len(data))
     for split in splits:
         division_of(path, split, 0, count)  # refuses what cannot be divided
