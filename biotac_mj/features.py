@@ -252,12 +252,13 @@ _READINGS = (
      "attach, condensed, batch; `converged` in generate"),
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
-    ("rounds that are accelerated; a skin that follows along the core what is too deep for it; nothing lent "
-     "at first touch", "yes", "attach, condensed; batches have none of these"),
+    ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
+     "attach, condensed, batch: one rule (`coupling/rules.py`)"),
+    ("a skin that follows along the core what is too deep for it", "yes", "condensed"),
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
-     "the core; one that cannot move on begins anew; what was stored by bodies that are put into it is open "
-     "until a balance is found", "yes",
-     "attach (on the CPU), condensed; batch and CUDA: by the force along the way"),
+     "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
+     "attach (on the CPU), condensed, batch; attach on CUDA: by the force along the way"),
+    ("a skin that cannot move on begins anew", "yes", "attach, condensed"),
     ("contact's exact stiffness near balance (curvature of geoms, turn of the slip)", "yes",
      "condensed alone: conjugate gradients of the full tier take a symmetric one, on all its paths"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
@@ -311,7 +312,8 @@ _GRADIENTS = [
     ("fits: slopes by these gradients, else by differences, said in the output",
      "`biotac calibrate`, `biotac compare`", "yes; not the refits of `diagnose`"),
     ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
-     "one geom that comes straight; attitude and drag are not sought"),
+     "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
+     "labelled touches of the sensor by `--known`"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
     ("rubber with prony, mullins or hysteresis; contact_law; implicit dynamics", "`Skin`", "refused by name"),
     ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),

@@ -77,7 +77,7 @@ def run_tasks(
     """
     tasks, folder = list(tasks), pathlib.Path(folder)
     total = sum(task.size for task in tasks)
-    with tqdm.tqdm(total=total, desc=name, unit=unit, disable=not progress, leave=False) as bar:
+    with tqdm.tqdm(total=total, desc=name, unit=unit, disable=not progress or None, leave=False) as bar:
 
         def say(news):
             if not isinstance(news, str):

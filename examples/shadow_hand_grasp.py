@@ -312,7 +312,7 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
     thumb = np.array([f == "th" for f in FINGERS])
     closing, log = np.zeros(5), {key: [] for key in ("time", "height", "counts", "pdc", "force")}
     z, steps = model.actuator("z").id, round((CLOSE + SQUEEZE + LIFT + HOLD) / TIMESTEP)
-    for i in tqdm(range(steps), desc=name, disable=not progress):
+    for i in tqdm(range(steps), desc=name, disable=not progress or None):
         pdc = np.array([h.read(data, "pdc")[0] for h in handles.values()])
         if data.time < CLOSE:  # who feels the object waits for the others
             closing += np.where(pdc - rest < FELT, 0.7 * TIMESTEP / CLOSE, 0.0)

@@ -727,7 +727,7 @@ def numbers():
         yield Row(f"press --speed {speed}", "10000 mm/s at most")
     for verb in ("import --out out", "show --out out", "evaluate --electrodes", "resimulate --out out"):
         yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
-    yield Row("press --location 1 2 3 4", "location")
+    yield Row("press --location 1 2 3 4", "--location has 4 numbers: give X [mm], X [mm] and ANGLE")
     yield Row("press --skin coarse --location 40", "no skin at x = 40 mm")
     yield Row("press --skin coarse --direction 0 -1 0", "leaves the skin")
     yield Row("press --direction 0 0 0", "is no direction")

@@ -1,6 +1,7 @@
 """The package's structure: no module imports itself by way of others, and every folder imports only what the
 table of docs/design.md allows."""
 
+import ast
 import collections
 
 import pytest
@@ -70,6 +71,18 @@ def test_folders_import_only_what_lies_below_them(graph):
             if _folder(other) not in {folder, *allowed} and other.removeprefix("biotac_mj.") not in allowed:
                 wrong[folder].add(f"{name} imports {other}")
     assert not wrong, "\n".join(line for lines in wrong.values() for line in sorted(lines))
+
+
+def test_no_bar_is_drawn_where_no_terminal_is():
+    """tqdm looks itself where `disable` is None."""
+    bars = [
+        (name, {k.arg: ast.unparse(k.value) for k in node.keywords}.get("disable", "False"))
+        for name, path in modules().items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("tqdm", "tqdm.tqdm", "tqdm.trange")
+    ]
+    wrong = [f"{name}: disable={said}" for name, said in bars if not said.endswith(("None", "True"))]
+    assert len(bars) > 10 and not wrong, "\n".join(wrong)
 
 
 def _folder(name):

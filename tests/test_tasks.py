@@ -377,6 +377,15 @@ def test_example_puts_it_on_an_existing_model(repo, capsys):
             "unknown preset observe='touch': choose one of tactile",
         ),
         (
+            lambda: load("gripper", "hold", task_kwargs={"observ": "none"}),
+            "task_kwargs of Hold has 'observ': did you mean 'observe'? choose from observe, "
+            "physics_timestep, biotac, random, time_limit",
+        ),
+        (
+            lambda: load("finger", "explore", task_kwargs={"object": ["box"]}),
+            "task_kwargs of Explore has 'object': did you mean 'objects'? choose from objects, observe",
+        ),
+        (
             lambda: load("finger", "explore", task_kwargs={"objects": ["peg"]}),
             "no object 'peg': choose from sphere_3-5mm",
         ),

@@ -13,6 +13,9 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
     """Defaults where they say something."""
 
     def _get_help_string(self, action):
+        if isinstance(action.default, list):
+            words = (f"{v:g}" if isinstance(v, float) else str(v) for v in action.default)
+            return f"{action.help} (default: {' '.join(words)})"
         return action.help if action.default in (None, False, True) else super()._get_help_string(action)
 
 

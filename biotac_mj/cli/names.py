@@ -30,7 +30,7 @@ INDENTER_HELP = (
     "ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres"
 )
 LOCATION_HELP = (
-    "where: X; or X ANGLE, around the finger in degrees, 0 on the pad's midline, positive towards +z; or X "
-    "Y Z, moved to the nearest point "
-    "of the skin. BioTac frame: tip at -x, pad at -y, nail at +y"
+    "where: X in mm; or X in mm and ANGLE, around the finger in degrees, 0 on the pad's midline, positive "
+    "towards +z; or X Y Z in mm, moved to the nearest point of the skin. BioTac frame: tip at -x, "
+    "pad at -y, nail at +y"
 )

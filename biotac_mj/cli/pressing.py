@@ -20,7 +20,12 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=INDENTER_HELP)
     verb.add_argument(
-        "--location", type=real(-1e3, 1e3), nargs="+", default=[-12.0], metavar="MM", help=LOCATION_HELP
+        "--location",
+        type=real(-1e3, 1e3),
+        nargs="+",
+        default=[-12.0],
+        metavar=("X", "ANGLE | Y Z"),
+        help=LOCATION_HELP,
     )
     verb.add_argument(
         "--direction",
@@ -88,6 +93,11 @@ def _press(args):
     from ..press import PressOptions, press, render, report
     from ..press.record import write_readings, write_skin
 
+    if len(args.location) > 3:
+        raise ValueError(
+            f"--location has {len(args.location)} numbers: give X [mm], X [mm] and ANGLE [degrees], or X Y Z "
+            "[mm]"
+        )
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]

@@ -134,7 +134,7 @@ def plate_states(
     model = SkinModel(geometry, material, options)
     ways = np.array([(roll, *way) for roll in grid.roll for way in grid.ways])
     parts = []
-    for pitch in tqdm(grid.pitch, desc="states of a plate", unit="pitch", disable=quiet):
+    for pitch in tqdm(grid.pitch, desc="states of a plate", unit="pitch", disable=quiet or None):
 
         def make(pitch=pitch):
             axes = np.array([frame(pitch, roll) for roll in ways[:, 0]])

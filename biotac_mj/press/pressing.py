@@ -59,7 +59,7 @@ def press(
         data = mujoco.MjData(model)
     rows, picture, seconds = [], None, 0.0
     last = len(path.depth) - 1
-    for step in tqdm.trange(last + 1, desc="press", unit="step", disable=not progress, leave=False):
+    for step in tqdm.trange(last + 1, desc="press", unit="step", disable=not progress or None, leave=False):
         travel = np.array([path.depth[step], path.slid[step]])
         begin = time.perf_counter()
         if options.two_way:

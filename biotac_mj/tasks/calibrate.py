@@ -109,7 +109,7 @@ def _explore(folder, episodes, biotac):
                 folder / f"explore_{OBJECTS[k]}_{i}.npz",
                 lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k], biotac),
             )[0]
-            for k, i in tqdm(rows, desc="explore")
+            for k, i in tqdm(rows, desc="explore", disable=None)
         ]
     )
     label, fold = np.array([k for k, _ in rows]), np.array([i for _, i in rows]) % 4
@@ -171,6 +171,7 @@ def main(arguments: list[str] | None = None) -> None:
                 for i, task in tqdm(
                     [(i, t) for i in range(options.episodes * _TIMES.get(name, 1)) for t in groups[name]],
                     desc=name,
+                    disable=None,
                 )
             ]
             touch, hidden = (np.concatenate([m[j] for m in made]) for j in range(2))

@@ -2,12 +2,14 @@
 
 import functools
 import importlib
+import inspect
 import typing
 
 import numpy as np
 
 from .. import plugin
 from ..coupling.config import real
+from ..fields import refuse_unknown
 
 if typing.TYPE_CHECKING:
     from dm_control import composer
@@ -34,6 +36,19 @@ def _environment_class():
     return Environment
 
 
+def _settings(task):
+    """Names of what a task's class takes: its own, and those of the classes that it hands the rest on to."""
+    kinds, names = [k for k in task.__mro__ if "__init__" in vars(k)], []
+    for kind in kinds:
+        own = list(inspect.signature(kind.__init__).parameters.values())[1:]
+        named = [p for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        # what a base class must be given, its child gives
+        names += [p.name for p in named if kind is kinds[0] or p.default is not p.empty]
+        if not any(p.kind is p.VAR_KEYWORD for p in own):
+            break
+    return names
+
+
 def environment(
     task: "type[TouchTask]",
     environment_kwargs: dict | None = None,
@@ -50,9 +65,9 @@ def environment(
       environment_kwargs: further arguments of `composer.Environment`.
 
     Raises:
-      ValueError: a setting that cannot be; TypeError: one that the task does not have.
+      ValueError: a setting that cannot be, or one that the task does not have.
     """
-
+    refuse_unknown(settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}")
     if time_limit is not None:
         real("time_limit", time_limit, 0.0)
     made = task(**settings)
@@ -105,7 +120,7 @@ def load(
       environment_kwargs: further arguments of `composer.Environment`.
 
     Raises:
-      ValueError: no such domain or task.
+      ValueError: no such domain or task, or a setting that the task does not have.
     """
     suite = _domain(domain_name).SUITE
     if task_name not in suite:
